@@ -1,0 +1,176 @@
+"""Every setting of the package and its default; nothing else in the package repeats one.
+
+The node declares its ROS parameters by walking these classes, so the names, descriptions and
+ranges here are what users see in ``ros2 param describe``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
+from typing import Any
+
+from rs_localizer.core.camera import ScanDirection
+
+
+class PoseTime(StrEnum):
+    """The moment for which the pose is published."""
+
+    STAMP = "stamp"
+    MID_FRAME = "mid_frame"
+
+
+SOLVER_NAMES = (
+    "p3p",
+    "r6p",
+    "r6p_vc_wt",
+    "r6p_vct_w",
+    "r6p_vct_wt",
+    "r6p_vcwt",
+    "r9p",
+    "joint",
+)
+
+
+def setting(
+    default: Any,
+    description: str,
+    *,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+    read_only: bool = False,
+) -> Any:
+    """A dataclass field with what a user needs to know of it (ranges include their ends)."""
+    return field(
+        default=default,
+        metadata={
+            "description": description,
+            "minimum": minimum,
+            "maximum": maximum,
+            "choices": choices,
+            "read_only": read_only,
+        },
+    )
+
+
+def _check(config: Any, prefix: str = "") -> None:
+    """Raise ``ValueError`` for the first setting whose type, range or choice is wrong."""
+    for item in fields(config):
+        if not item.metadata:
+            continue
+        name, value, default = prefix + item.name, getattr(config, item.name), item.default
+        if isinstance(default, bool):
+            valid = isinstance(value, bool)
+        elif isinstance(default, int):
+            valid = isinstance(value, int) and not isinstance(value, bool)
+        elif isinstance(default, float):
+            valid = isinstance(value, (int, float)) and not isinstance(value, bool)
+        else:
+            valid = isinstance(value, str)
+        if not valid:
+            raise ValueError(f"{name} must be of type {type(default).__name__}, got {value!r}")
+        choices = item.metadata["choices"]
+        if choices and value not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}")
+        low, high = item.metadata["minimum"], item.metadata["maximum"]
+        if low is not None and not (low <= value <= high):
+            raise ValueError(f"{name} must lie between {low} and {high}, got {value!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityPrior:
+    """Standard deviations of the zero-mean velocity prior; 0 switches a prior off."""
+
+    angular: float = setting(
+        math.radians(10.0),
+        "Standard deviation of the camera's rotation during one readout, in rad; 0: no prior",
+        minimum=0.0,
+        maximum=10.0,
+    )
+    linear: float = setting(
+        0.1,
+        "Standard deviation of the camera's travel during one readout, in m; 0: no prior",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+
+    def __post_init__(self) -> None:
+        _check(self, "velocity_prior.")
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizerConfig:
+    """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
+
+    solver: str = setting(
+        "r6p_vcwt",
+        "Minimal solver that generates the hypotheses",
+        choices=SOLVER_NAMES,
+    )
+    solver_iterations: int = setting(
+        5, "Iterations of the iterative linear solvers", minimum=1, maximum=100
+    )
+    inlier_threshold: float = setting(
+        2.0,
+        "Largest reprojection error of an inlier, in raw image pixels",
+        minimum=0.01,
+        maximum=1000.0,
+    )
+    max_iterations: int = setting(
+        1000, "Most minimal samples to draw for one frame", minimum=1, maximum=1_000_000
+    )
+    confidence: float = setting(
+        0.99,
+        "Probability of having drawn an all-inlier sample at which the search stops",
+        minimum=0.0,
+        maximum=0.999999,
+    )
+    min_inliers: int = setting(
+        12, "Fewest inliers of a pose that is accepted", minimum=7, maximum=1_000_000
+    )
+    seed: int = setting(
+        0, "Seed of the random samples; every frame starts from it", minimum=0, maximum=2**31 - 1
+    )
+    velocity_prior: VelocityPrior = field(default_factory=VelocityPrior)
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if not isinstance(self.velocity_prior, VelocityPrior):
+            raise ValueError(
+                f"velocity_prior must be a VelocityPrior, got {self.velocity_prior!r}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class NodeConfig(LocalizerConfig):
+    """Settings of the node and of the offline replay: the localizer's, the shutter's, the times."""
+
+    readout_time: float = setting(
+        0.0,
+        "Time from the first to the last row of the full sensor image, in s; "
+        "0: unknown, then no twist is published",
+        minimum=0.0,
+        maximum=0.2,
+    )
+    scan_direction: str = setting(
+        ScanDirection.TOP_TO_BOTTOM.value,
+        "Direction in which the shutter moves over the raw image",
+        choices=tuple(direction.value for direction in ScanDirection),
+    )
+    stamp_offset: float = setting(
+        0.0,
+        "Time from header.stamp to the middle of the exposure of the first row, in s",
+        minimum=-10.0,
+        maximum=10.0,
+    )
+    pose_time: str = setting(
+        PoseTime.STAMP.value,
+        "stamp: the pose is valid at the input's stamp; mid_frame: the output's stamp is moved to "
+        "the exposure of the middle row",
+        choices=tuple(time.value for time in PoseTime),
+    )
+    autostart: bool = setting(
+        True, "Configure and activate the node at start", read_only=True
+    )

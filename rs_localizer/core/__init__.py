@@ -1,0 +1,1 @@
+"""Geometry, camera and estimation; imports NumPy, Numba and OpenCV, never ROS."""

@@ -1,0 +1,252 @@
+"""Camera: raw pixels to bearings and row times, and back.
+
+A raw pixel is what the driver delivers: distorted, with the centre of the first pixel at (0, 0),
+possibly binned and cropped. Its bearing comes from the undistorted position, its row time from
+the raw row of the full sensor: distortion moves light between rows, not rows in time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import cv2
+import numpy as np
+
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+
+
+class ScanDirection(StrEnum):
+    """The direction in which the shutter moves over the raw image."""
+
+    TOP_TO_BOTTOM = "top_to_bottom"
+    BOTTOM_TO_TOP = "bottom_to_top"
+    LEFT_TO_RIGHT = "left_to_right"
+    RIGHT_TO_LEFT = "right_to_left"
+
+
+class DistortionModel(StrEnum):
+    """Distortion models of sensor_msgs/CameraInfo that are supported."""
+
+    PLUMB_BOB = "plumb_bob"
+    RATIONAL_POLYNOMIAL = "rational_polynomial"
+    EQUIDISTANT = "equidistant"
+
+
+# How many coefficients each model may have (OpenCV's orders).
+_COEFFICIENTS = {
+    DistortionModel.PLUMB_BOB: (0, 4, 5),
+    DistortionModel.RATIONAL_POLYNOMIAL: (0, 8, 12, 14),
+    DistortionModel.EQUIDISTANT: (0, 4),
+}
+# OpenCV's own default of five iterations leaves errors of pixels at the rim of wide lenses.
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+# A pixel that does not come back to itself has no bearing: it lies beyond the model's range.
+_ROUND_TRIP_TOLERANCE = 1e-3
+# Step of the numerical derivative of the distortion, in normalized image coordinates.
+_DERIVATIVE_STEP = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Roi:
+    """The part of the sensor that is delivered, in pixels of the full sensor."""
+
+    x_offset: int
+    y_offset: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A calibrated camera with its shutter.
+
+    Args:
+        width, height: size of the full sensor image to which K belongs, pixels.
+        K: (3,3) intrinsic matrix without skew.
+        D: distortion coefficients in OpenCV's order (empty: none).
+        distortion_model: ``plumb_bob``, ``rational_polynomial`` or ``equidistant``.
+        readout_time: s from the first to the last row of the full sensor; 0 = unknown.
+        scan_direction: see :class:`ScanDirection`.
+        binning: sensor pixels per delivered pixel, (x, y).
+        roi: the delivered part of the sensor; None = all.
+
+    Raises:
+        ValueError: for an uncalibrated or impossible camera, saying what was found.
+
+    A delivered pixel ``p`` is ``p * binning + roi offset`` on the sensor, as in ROS'
+    image_geometry.
+    """
+
+    width: int
+    height: int
+    K: Array
+    D: Array = field(default_factory=lambda: np.zeros(0))
+    distortion_model: str = DistortionModel.PLUMB_BOB
+    readout_time: float = 0.0
+    scan_direction: str = ScanDirection.TOP_TO_BOTTOM
+    binning: tuple[int, int] = (1, 1)
+    roi: Roi | None = None
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__  # the dataclass is frozen; this is its constructor
+        K = np.array(self.K, dtype=np.float64)
+        D = np.array(self.D, dtype=np.float64).ravel()
+        if K.shape != (3, 3) or not np.all(np.isfinite(K)):
+            raise ValueError(f"K must be a finite 3x3 matrix, got {K.tolist()}")
+        if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
+            raise ValueError(
+                f"the camera is not calibrated: focal lengths are {K[0, 0]:g}, {K[1, 1]:g}"
+            )
+        if K[0, 1] != 0.0 or K[1, 0] != 0.0 or np.any(K[2] != (0.0, 0.0, 1.0)):
+            raise ValueError(f"K must have no skew and a last row 0 0 1, got {K.tolist()}")
+        try:
+            model = DistortionModel(self.distortion_model)
+        except ValueError:
+            raise ValueError(
+                f"distortion_model must be one of {', '.join(DistortionModel)}; "
+                f"got {self.distortion_model!r}"
+            ) from None
+        if len(D) not in _COEFFICIENTS[model]:
+            raise ValueError(
+                f"{model} takes {' or '.join(map(str, _COEFFICIENTS[model]))} coefficients, "
+                f"got {len(D)}"
+            )
+        if not np.all(np.isfinite(D)):
+            raise ValueError(f"D must be finite, got {D.tolist()}")
+        try:
+            direction = ScanDirection(self.scan_direction)
+        except ValueError:
+            raise ValueError(
+                f"scan_direction must be one of {', '.join(ScanDirection)}; "
+                f"got {self.scan_direction!r}"
+            ) from None
+        if self.width < 2 or self.height < 2:
+            raise ValueError(f"the image must be at least 2x2, got {self.width}x{self.height}")
+        if not 0.0 <= self.readout_time < np.inf:
+            raise ValueError(f"readout_time must be 0 or more seconds, got {self.readout_time}")
+        if min(self.binning) < 1:
+            raise ValueError(f"binning must be 1 or more, got {self.binning}")
+        for array in (K, D):
+            array.flags.writeable = False
+        set_field(self, "K", K)
+        set_field(self, "D", D)
+        set_field(self, "distortion_model", model)
+        set_field(self, "scan_direction", direction)
+
+    # -- row time ---------------------------------------------------------------------------
+
+    def row_time(self, pixels: Array) -> Array:
+        """Row times (n,) of raw pixels (n,2): -0.5 at the first exposed row, 0.5 at the last."""
+        return self._row_time_of_first_pixel() + np.asarray(pixels, float) @ self.row_time_gradient
+
+    @property
+    def row_time_gradient(self) -> Array:
+        """Derivative (2,) of the row time by the raw pixel, per delivered pixel."""
+        axis, sign, size = self._scan()
+        gradient = np.zeros(2)
+        gradient[axis] = sign * self.binning[axis] / (size - 1)
+        return gradient
+
+    @property
+    def first_row_time(self) -> float:
+        """Row time of the first exposed row of the delivered image (-0.5 without a ROI)."""
+        axis, sign, size = self._scan()
+        if self.roi is None:
+            return -0.5
+        offset, extent = (
+            (self.roi.x_offset, self.roi.width),
+            (self.roi.y_offset, self.roi.height),
+        )[axis]
+        first = offset if sign > 0 else offset + extent - 1
+        return sign * (first - 0.5 * (size - 1)) / (size - 1)
+
+    def _row_time_of_first_pixel(self) -> float:
+        axis, sign, size = self._scan()
+        return sign * (self._offset()[axis] - 0.5 * (size - 1)) / (size - 1)
+
+    def _scan(self) -> tuple[int, int, int]:
+        """Pixel axis along which the shutter moves, its sign, and the sensor's size there."""
+        columns = self.scan_direction in (ScanDirection.LEFT_TO_RIGHT, ScanDirection.RIGHT_TO_LEFT)
+        forward = self.scan_direction in (ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT)
+        return (0, 1 if forward else -1, self.width) if columns else (
+            1, 1 if forward else -1, self.height
+        )
+
+    def _offset(self) -> Array:
+        if self.roi is None:
+            return np.zeros(2)
+        return np.array([self.roi.x_offset, self.roi.y_offset], dtype=np.float64)
+
+    # -- bearing ----------------------------------------------------------------------------
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the delivered image, in delivered pixels."""
+        width, height = (self.width, self.height) if self.roi is None else (
+            self.roi.width, self.roi.height
+        )
+        return width // self.binning[0], height // self.binning[1]
+
+    def rays(self, pixels: Array) -> Array:
+        """Undistorted bearings (n,2), ``x/z, y/z``, of raw pixels (n,2).
+
+        NaN where the distortion model has no bearing for the pixel.
+        """
+        pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+        sensor = pixels * self.binning + self._offset()
+        if len(sensor) == 0:
+            return np.zeros((0, 2))
+        if len(self.D) == 0:
+            return (sensor - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
+        undistort = (
+            cv2.fisheye.undistortPoints
+            if self.distortion_model == DistortionModel.EQUIDISTANT
+            else cv2.undistortPoints
+        )
+        usable = np.all(np.isfinite(sensor), axis=1)
+        rays = np.full(sensor.shape, np.nan)
+        if np.any(usable):
+            rays[usable] = undistort(
+                sensor[usable, None], self.K, self.D, criteria=_UNDISTORT_CRITERIA
+            )[:, 0]
+        back = self._distort(rays)
+        lost = ~(np.abs(back - pixels).max(axis=1) < _ROUND_TRIP_TOLERANCE)
+        rays[lost] = np.nan
+        return rays
+
+    def project(self, points: Array) -> Array:
+        """Raw pixels (n,2) of points (n,3) in the camera frame; NaN behind the camera."""
+        points = np.asarray(points, float)
+        depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
+        return self._distort(points[:, :2] / depth[:, None])
+
+    def pixel_jacobian(self, rays: Array) -> Array:
+        """Derivatives (n,2,2) of the raw pixel by the ray at rays (n,2)."""
+        rays = np.asarray(rays, float)
+        if len(self.D) == 0:
+            scale = np.diag([self.K[0, 0], self.K[1, 1]]) / np.array(self.binning)[:, None]
+            return np.broadcast_to(scale, (len(rays), 2, 2)).copy()
+        step = _DERIVATIVE_STEP
+        offsets = np.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
+        pixels = self._distort((rays[None] + offsets[:, None]).reshape(-1, 2))
+        left, right = pixels.reshape(4, -1, 2)[0::2], pixels.reshape(4, -1, 2)[1::2]
+        return np.moveaxis((left - right) / (2.0 * step), 0, 2)
+
+    def inside(self, pixels: Array) -> NDArray[np.bool_]:
+        """Which raw pixels (n,2) lie in the delivered image."""
+        limit = np.array(self.size) - 0.5
+        return np.all((pixels > -0.5) & (pixels < limit), axis=1)  # NaN compares false
+
+    def _distort(self, rays: Array) -> Array:
+        if len(self.D) == 0:
+            sensor = rays * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
+        elif self.distortion_model == DistortionModel.EQUIDISTANT:
+            sensor = cv2.fisheye.distortPoints(rays[:, None], self.K, self.D)[:, 0]
+        else:
+            bearings = np.column_stack([rays, np.ones(len(rays))])
+            zero = np.zeros(3)
+            sensor = cv2.projectPoints(bearings[:, None], zero, zero, self.K, self.D)[0][:, 0]
+        return (sensor - self._offset()) / self.binning

@@ -1,0 +1,117 @@
+"""Rotations: exponential, logarithm and the Jacobian of the exponential.
+
+Rotation vectors are in radians; matrices act on column vectors. The kernels may be called from
+Python and from other kernels alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.jit import kernel
+
+Array = NDArray[np.float64]
+
+# Below this angle the series of the coefficients are exact to double precision.
+_SMALL_ANGLE = 1e-3
+
+
+@kernel
+def coefficients(angle_squared: float) -> tuple[float, float, float]:
+    """``sin(a)/a``, ``(1 - cos a)/a^2`` and ``(a - sin a)/a^3``, finite and accurate at zero."""
+    if angle_squared < _SMALL_ANGLE**2:
+        return (
+            1.0 - angle_squared / 6.0 * (1.0 - angle_squared / 20.0),
+            0.5 - angle_squared / 24.0 * (1.0 - angle_squared / 30.0),
+            1.0 / 6.0 - angle_squared / 120.0 * (1.0 - angle_squared / 42.0),
+        )
+    angle = np.sqrt(angle_squared)
+    sine, half_sine = np.sin(angle), np.sin(0.5 * angle)
+    return (
+        sine / angle,
+        2.0 * half_sine * half_sine / angle_squared,
+        (angle - sine) / (angle_squared * angle),
+    )
+
+
+@kernel
+def exp(vector: Array) -> Array:
+    """Rotation matrix (3,3) of a rotation vector (3,) (Rodrigues' formula)."""
+    x, y, z = vector[0], vector[1], vector[2]
+    s, c, _ = coefficients(x * x + y * y + z * z)
+    matrix = np.empty((3, 3))
+    matrix[0, 0] = 1.0 - c * (y * y + z * z)
+    matrix[0, 1] = c * x * y - s * z
+    matrix[0, 2] = c * x * z + s * y
+    matrix[1, 0] = c * x * y + s * z
+    matrix[1, 1] = 1.0 - c * (x * x + z * z)
+    matrix[1, 2] = c * y * z - s * x
+    matrix[2, 0] = c * x * z - s * y
+    matrix[2, 1] = c * y * z + s * x
+    matrix[2, 2] = 1.0 - c * (x * x + y * y)
+    return matrix
+
+
+@kernel
+def quaternion(matrix: Array) -> Array:
+    """Unit quaternion (4,) ``x y z w`` with ``w >= 0`` of a rotation matrix (3,3)."""
+    # Shepperd's choice of the largest component keeps the division well conditioned.
+    q = np.empty(4)
+    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    largest = 3
+    value = trace
+    for i in range(3):
+        if matrix[i, i] > value:
+            largest, value = i, matrix[i, i]
+    if largest == 3:
+        q[0] = matrix[2, 1] - matrix[1, 2]
+        q[1] = matrix[0, 2] - matrix[2, 0]
+        q[2] = matrix[1, 0] - matrix[0, 1]
+        q[3] = 1.0 + trace
+    else:
+        i = largest
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1.0 + 2.0 * matrix[i, i] - trace
+        q[j] = matrix[j, i] + matrix[i, j]
+        q[k] = matrix[k, i] + matrix[i, k]
+        q[3] = matrix[k, j] - matrix[j, k]
+    norm = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if q[3] < 0.0:
+        norm = -norm
+    return q / norm
+
+
+@kernel
+def log(matrix: Array) -> Array:
+    """Rotation vector (3,), of angle 0 to pi, of a rotation matrix (3,3)."""
+    q = quaternion(matrix)
+    sine_squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
+    sine = np.sqrt(sine_squared)
+    # Series of 2 atan2(s, w)/s: the direct form is 0/0 at the identity.
+    scale = 2.0 + sine_squared / 3.0 if sine < 1e-5 else 2.0 * np.arctan2(sine, q[3]) / sine
+    return scale * q[:3]
+
+
+def hat(vector: Array) -> Array:
+    """Skew matrices (..., 3, 3) with ``hat(v) @ x == cross(v, x)`` of vectors (..., 3)."""
+    vector = np.asarray(vector, float)
+    matrix = np.zeros((*vector.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -vector[..., 2], vector[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = vector[..., 2], -vector[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -vector[..., 1], vector[..., 0]
+    return matrix
+
+
+def exp_many(vectors: Array) -> Array:
+    """Rotation matrices (n,3,3) of rotation vectors (n,3)."""
+    vectors = np.ascontiguousarray(vectors, dtype=np.float64)
+    return _exp_many(vectors)
+
+
+@kernel
+def _exp_many(vectors: Array) -> Array:
+    matrices = np.empty((len(vectors), 3, 3))
+    for i in range(len(vectors)):
+        matrices[i] = exp(vectors[i])
+    return matrices
