@@ -1,0 +1,1 @@
+"""What goes in and out: messages, recordings, trajectories; no ROS needed."""

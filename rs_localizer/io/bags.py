@@ -1,0 +1,205 @@
+"""Recordings: rosbag2 (MCAP, sqlite3) and ROS 1 bags in, rosbag2 out, by the rosbags library.
+
+Messages come out as rosbags' plain objects with the attribute names of ROS 2, whatever the
+recording was; the readers of this package take them and rclpy's messages alike.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.errors import WriterError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+_SUFFIXES = (".mcap", ".db3", ".bag")
+# Fields that ROS 2 spells in lower case.
+_ROS1_FIELDS = {"sensor_msgs/msg/CameraInfo": {"D": "d", "K": "k", "R": "r", "P": "p"}}
+
+
+class BagError(ValueError):
+    """A recording that cannot be read or written; the message names the path and the fault."""
+
+
+@lru_cache(maxsize=1)
+def typestore() -> Typestore:
+    """The message types of ROS 2 Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def make_message(type_name: str, **fields: Any) -> Any:
+    """A message for :class:`BagWriter` of a type such as ``geometry_msgs/msg/Pose``.
+
+    Every field has to be given; number arrays as NumPy arrays of the field's type.
+    """
+    return typestore().types[type_name](**fields)
+
+
+class BagReader:
+    """An open recording (see :func:`open_bag`)."""
+
+    def __init__(self, path: Path, reader: AnyReader) -> None:
+        self._path = path
+        self._reader = reader
+        self.topics: dict[str, str] = {
+            name: info.msgtype or "several types" for name, info in reader.topics.items()
+        }
+
+    @property
+    def path(self) -> Path:
+        return self._path
+
+    def count(self, topics: Collection[str]) -> int:
+        """How many messages the recording holds on these topics."""
+        counts = self._reader.topics
+        return sum(counts[topic].msgcount for topic in topics if topic in counts)
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of recording in ns and message, in the order of that time.
+
+        Raises:
+            BagError: for a topic that is not in the recording, or damaged data.
+        """
+        missing = [topic for topic in topics if topic not in self.topics]
+        if missing:
+            raise BagError(
+                f"{self._path} has no topic {', '.join(missing)}; it has "
+                f"{', '.join(sorted(self.topics))}"
+            )
+        wanted = [c for c in self._reader.connections if c.topic in topics]
+        if not wanted:
+            return
+        with _explained(self._path):
+            for connection, stamp_ns, data in self._reader.messages(connections=wanted):
+                message = self._reader.deserialize(data, connection.msgtype)
+                if not self._reader.is2:
+                    message = _as_ros2(message, connection.msgtype)
+                yield connection.topic, stamp_ns, message
+
+
+@contextlib.contextmanager
+def open_bag(path: Path | str) -> Iterator[BagReader]:
+    """Open a recording: a rosbag2 directory, one of its ``.mcap`` or ``.db3`` files, or a ``.bag``.
+
+    Raises:
+        BagError: when there is no such recording, or it is damaged or empty.
+    """
+    path = Path(path)
+    with contextlib.ExitStack() as stack:
+        with _explained(path):
+            file = _storage(path)
+            reader = stack.enter_context(AnyReader([file], default_typestore=typestore()))
+            bag = BagReader(path, reader)
+            if bag.count(bag.topics) == 0:
+                raise BagError(f"{path} is an empty recording: it holds no message")
+        yield bag
+
+
+def _storage(path: Path) -> Path:
+    """What rosbags opens for this path."""
+    if not path.exists():
+        raise BagError(f"{path} does not exist")
+    if not path.is_dir():
+        if path.suffix not in _SUFFIXES:
+            raise BagError(
+                f"{path} is no recording: expected a rosbag2 directory or a file ending in "
+                f"{', '.join(_SUFFIXES)}"
+            )
+        if path.stat().st_size == 0:
+            raise BagError(f"{path} is an empty file")
+        return path
+    if (path / "metadata.yaml").exists():
+        return path
+    # A recorder that was killed leaves its data without metadata.yaml.
+    files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
+    if len(files) != 1:
+        raise BagError(
+            f"{path} is no recording: the directory has no metadata.yaml and "
+            f"{len(files)} files ending in {', '.join(_SUFFIXES)}"
+        )
+    return files[0]
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn whatever goes wrong while a recording is read into a BagError."""
+    try:
+        yield
+    except (BagError, GeneratorExit):
+        raise
+    except Exception as error:
+        # A damaged file shows as errors of struct, sqlite, YAML, zstd, assertions and more.
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise BagError(f"{path} cannot be read as a recording: {reason}") from error
+
+
+def _as_ros2(message: Any, type_name: str) -> Any:
+    """A ROS 1 message with the field names of ROS 2 (``header.seq`` stays as an extra)."""
+    names = _ROS1_FIELDS.get(type_name)
+    if names is None:
+        return message
+    fields = {
+        names.get(name, name): getattr(message, name) for name in message.__dataclass_fields__
+    }
+    fields.pop("__msgtype__", None)
+    return make_message(type_name, **fields)
+
+
+class BagWriter:
+    """Writes a rosbag2 directory; a context manager.
+
+    What was written before an exception (Ctrl-C among them) stays readable.
+
+    Args:
+        path: the directory to create.
+        storage: ``mcap`` or ``sqlite3``.
+
+    Raises:
+        BagError: when the path exists or cannot be created.
+    """
+
+    def __init__(self, path: Path | str, storage: str = "mcap") -> None:
+        if storage not in STORAGES:
+            raise BagError(f"storage must be one of {', '.join(STORAGES)}; got {storage!r}")
+        self._path = Path(path)
+        self._connections: dict[str, Any] = {}
+        try:
+            self._writer = Writer(self._path, version=9, storage_plugin=STORAGES[storage])
+        except WriterError:
+            raise BagError(f"{self._path} exists already; it is not overwritten") from None
+
+    make = staticmethod(make_message)
+
+    def __enter__(self) -> Self:
+        try:
+            self._writer.open()
+        except (WriterError, OSError) as error:
+            raise BagError(f"{self._path} cannot be written: {error}") from error
+        return self
+
+    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        """Append a message of :func:`make_message`; ``stamp_ns`` is its time of recording."""
+        connection = self._connections.get(topic)
+        if connection is None:
+            connection = self._writer.add_connection(
+                topic, message.__msgtype__, typestore=typestore()
+            )
+            self._connections[topic] = connection
+        data = typestore().serialize_cdr(message, message.__msgtype__)
+        self._writer.write(connection, stamp_ns, data)
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._writer.close()

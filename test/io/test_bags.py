@@ -1,0 +1,167 @@
+"""Recordings of all three kinds are written and read back; bad ones are refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_typestore
+
+from rs_localizer.io.bags import STORAGES, BagError, BagWriter, make_message, open_bag
+
+
+def header(seconds: int) -> Any:
+    stamp = make_message("builtin_interfaces/msg/Time", sec=seconds, nanosec=7)
+    return make_message("std_msgs/msg/Header", stamp=stamp, frame_id="map")
+
+
+def point(seconds: int, x: float) -> Any:
+    return make_message(
+        "geometry_msgs/msg/PointStamped",
+        header=header(seconds),
+        point=make_message("geometry_msgs/msg/Point", x=x, y=0.25, z=-1e-300),
+    )
+
+
+def write_ros2(path: Path, storage: str) -> None:
+    with BagWriter(path, storage) as bag:
+        bag.write("/points", point(3, 3.0), 3_000_000_007)
+        bag.write("/points", point(1, 1.0), 1_000_000_007)
+        bag.write("/other", point(2, 2.0), 2_000_000_007)
+
+
+def write_ros1(path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types = store.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=5, nanosec=6)
+    info = types["sensor_msgs/msg/CameraInfo"](
+        header=types["std_msgs/msg/Header"](seq=9, stamp=stamp, frame_id="cam"),
+        height=480,
+        width=640,
+        distortion_model="plumb_bob",
+        D=np.array([0.1, 0.2, 0.3, 0.4, 0.5]),
+        K=np.arange(9.0),
+        R=np.eye(3).ravel(),
+        P=np.arange(12.0),
+        binning_x=2,
+        binning_y=1,
+        roi=types["sensor_msgs/msg/RegionOfInterest"](
+            x_offset=1, y_offset=2, height=3, width=4, do_rectify=False
+        ),
+    )
+    with Ros1Writer(path) as bag:
+        connection = bag.add_connection("/camera_info", info.__msgtype__, typestore=store)
+        bag.write(connection, 5_000_000_006, store.serialize_ros1(info, info.__msgtype__))
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_ros2_round_trip_in_order_of_time(tmp_path: Path, storage: str) -> None:
+    write_ros2(tmp_path / "bag", storage)
+    (data,) = (file for file in (tmp_path / "bag").iterdir() if file.name != "metadata.yaml")
+    for path in (tmp_path / "bag", data):
+        with open_bag(path) as bag:
+            assert bag.topics == dict.fromkeys(
+                ("/points", "/other"), "geometry_msgs/msg/PointStamped"
+            )
+            assert bag.count(["/points"]) == 2
+            assert bag.count(["/points", "/other", "/absent"]) == 3
+            read = list(bag.messages(["/points", "/other"]))
+        assert [(topic, stamp) for topic, stamp, _ in read] == [
+            ("/points", 1_000_000_007),
+            ("/other", 2_000_000_007),
+            ("/points", 3_000_000_007),
+        ]
+        assert repr(read[2][2]) == repr(point(3, 3.0))
+
+
+def test_killed_recorder_left_no_metadata(tmp_path: Path) -> None:
+    write_ros2(tmp_path / "bag", "mcap")
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    with open_bag(tmp_path / "bag") as bag:
+        assert bag.count(["/points"]) == 2
+
+
+def test_ros1_has_the_names_of_ros2(tmp_path: Path) -> None:
+    write_ros1(tmp_path / "old.bag")
+    with open_bag(tmp_path / "old.bag") as bag:
+        ((topic, stamp, info),) = bag.messages(["/camera_info"])
+    assert (topic, stamp) == ("/camera_info", 5_000_000_006)
+    assert (info.header.stamp.sec, info.header.stamp.nanosec) == (5, 6)
+    assert info.header.frame_id == "cam"
+    np.testing.assert_array_equal(info.k, np.arange(9.0))
+    np.testing.assert_array_equal(info.d, [0.1, 0.2, 0.3, 0.4, 0.5])
+    assert (info.binning_x, info.roi.width) == (2, 4)
+
+
+def test_what_was_written_before_an_error_stays_readable(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / "bag") as bag:
+        bag.write("/points", point(1, 1.0), 1)
+        raise KeyboardInterrupt
+    with open_bag(tmp_path / "bag") as bag:
+        assert bag.count(["/points"]) == 1
+
+
+def test_absent_topic_names_those_present(tmp_path: Path) -> None:
+    write_ros2(tmp_path / "bag", "mcap")
+    with open_bag(tmp_path / "bag") as bag, pytest.raises(BagError, match=r"/pose; .*/other, /poi"):
+        list(bag.messages(["/pose"]))
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    write_ros2(tmp_path / "bag", "mcap")
+    with pytest.raises(BagError, match=r"bag exists already"):
+        BagWriter(tmp_path / "bag")
+    with pytest.raises(BagError, match="storage must be one of mcap, sqlite3; got 'zip'"):
+        BagWriter(tmp_path / "new", "zip")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("absent", None, "absent does not exist"),
+        ("notes.txt", b"hello", r"notes.txt is no recording: expected .*\.mcap, \.db3, \.bag"),
+        ("zero.mcap", b"", "zero.mcap is an empty file"),
+        ("wrong.mcap", b"hello" * 99, "wrong.mcap cannot be read as a recording: .*magic"),
+        ("wrong.db3", b"hello" * 99, "wrong.db3 cannot be read as a recording: .*not a database"),
+        ("wrong.bag", b"hello" * 99, "wrong.bag cannot be read as a recording: .*magic"),
+    ],
+)
+def test_what_is_no_recording_is_refused(
+    tmp_path: Path, name: str, content: bytes | None, expected: str
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(BagError, match=expected), open_bag(tmp_path / name):
+        pass
+
+
+def test_directories_that_are_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="no metadata.yaml and 0 files"), open_bag(tmp_path):
+        pass
+    (tmp_path / "metadata.yaml").write_text("{: not yaml")
+    with pytest.raises(BagError, match="cannot be read"), open_bag(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_empty_recording(tmp_path: Path, storage: str) -> None:
+    with BagWriter(tmp_path / "bag", storage):
+        pass
+    with pytest.raises(BagError, match="holds no message"), open_bag(tmp_path / "bag"):
+        pass
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("keep", [0.2, 0.6, 0.95])
+def test_truncated_recording(tmp_path: Path, storage: str, keep: float) -> None:
+    with BagWriter(tmp_path / "bag", storage) as bag:
+        for index in range(500):
+            bag.write("/points", point(index, 1.0), index)
+    (data,) = (file for file in (tmp_path / "bag").iterdir() if file.name != "metadata.yaml")
+    content = data.read_bytes()
+    data.write_bytes(content[: int(keep * len(content))])
+    with pytest.raises(BagError, match="bag cannot be read"), open_bag(tmp_path / "bag") as opened:
+        list(opened.messages(["/points"]))
