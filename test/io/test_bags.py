@@ -97,9 +97,13 @@ def test_ros1_has_the_names_of_ros2(tmp_path: Path) -> None:
 
 
 def test_what_was_written_before_an_error_stays_readable(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / "bag") as bag:
-        bag.write("/points", point(1, 1.0), 1)
-        raise KeyboardInterrupt
+    def interrupted() -> None:
+        with BagWriter(tmp_path / "bag") as bag:
+            bag.write("/points", point(1, 1.0), 1)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     with open_bag(tmp_path / "bag") as bag:
         assert bag.count(["/points"]) == 1
 
@@ -139,7 +143,7 @@ def test_what_is_no_recording_is_refused(
 
 
 def test_directories_that_are_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="no metadata.yaml and 0 files"), open_bag(tmp_path):
+    with pytest.raises(BagError, match=r"no metadata.yaml and 0 files"), open_bag(tmp_path):
         pass
     (tmp_path / "metadata.yaml").write_text("{: not yaml")
     with pytest.raises(BagError, match="cannot be read"), open_bag(tmp_path):

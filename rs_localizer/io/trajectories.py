@@ -1,0 +1,177 @@
+"""Trajectory files: TUM poses ``t x y z qx qy qz qw`` and twists ``t wx wy wz vx vy vz``.
+
+Times are seconds in the files and integer nanoseconds here: a float of today's date in seconds
+is 240 ns coarse. Files that end in ``.gz`` are compressed text.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+
+# Files round quaternions to four digits or more; what is further from 1 is no rotation.
+_QUATERNION_TOLERANCE = 0.01
+
+
+class TrajectoryError(ValueError):
+    """A trajectory file that cannot be read; the message names the file, the line, the fault."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses map_from_body in the order of time."""
+
+    stamps_ns: NDArray[np.int64]  # (n,) strictly increasing
+    positions: Array  # (n,3) m
+    quaternions: Array  # (n,4) x y z w, unit
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Trajectory:
+        """The poses of some rows."""
+        return Trajectory(self.stamps_ns[rows], self.positions[rows], self.quaternions[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Twists:
+    """Velocities of a body in its own axes, in the order of time."""
+
+    stamps_ns: NDArray[np.int64]  # (n,) strictly increasing
+    angular: Array  # (n,3) rad/s
+    linear: Array  # (n,3) m/s
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Twists:
+        """The twists of some rows."""
+        return Twists(self.stamps_ns[rows], self.angular[rows], self.linear[rows])
+
+
+def read_tum(path: Path | str) -> Trajectory:
+    """Read a TUM file.
+
+    Raises:
+        TrajectoryError: for a missing, empty or malformed file, unsorted or repeated times.
+    """
+    path = Path(path)
+    stamps_ns, values = _read_table(path, ("x", "y", "z", "qx", "qy", "qz", "qw"))
+    norms = np.linalg.norm(values[:, 3:], axis=1)
+    wrong = np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE)
+    if len(wrong):
+        raise TrajectoryError(
+            f"{path}: the quaternion of pose {wrong[0] + 1} has norm {norms[wrong[0]]:.6g}, not 1"
+        )
+    return Trajectory(stamps_ns, values[:, :3], values[:, 3:] / norms[:, None])
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write a TUM file; what is read back is the same to the last bit."""
+    values = np.hstack([trajectory.positions, trajectory.quaternions])
+    _write_table(Path(path), "t x y z qx qy qz qw", trajectory.stamps_ns, values)
+
+
+def read_twists(path: Path | str) -> Twists:
+    """Read a twist file; raises TrajectoryError as :func:`read_tum` does."""
+    stamps_ns, values = _read_table(Path(path), ("wx", "wy", "wz", "vx", "vy", "vz"))
+    return Twists(stamps_ns, values[:, :3], values[:, 3:])
+
+
+def write_twists(path: Path | str, twists: Twists) -> None:
+    """Write a twist file; what is read back is the same to the last bit."""
+    values = np.hstack([twists.angular, twists.linear])
+    _write_table(Path(path), "t wx wy wz vx vy vz", twists.stamps_ns, values)
+
+
+def split_at_gaps(trajectory: Trajectory, factor: float = 3.0) -> list[Trajectory]:
+    """Parts without a pause longer than ``factor`` times the median spacing.
+
+    A recording that lost track for a while says nothing of the motion meanwhile.
+    """
+    spacing = np.diff(trajectory.stamps_ns)
+    if len(spacing) == 0:
+        return [trajectory]
+    ends = np.flatnonzero(spacing > factor * np.median(spacing)) + 1
+    bounds = [0, *ends.tolist(), len(trajectory)]
+    return [trajectory.part(slice(*pair)) for pair in pairwise(bounds)]
+
+
+def parse_stamp(text: str) -> int:
+    """Nanoseconds of a decimal number of seconds, exact (also ``1.5e9``)."""
+    seconds = Decimal(text)
+    if not seconds.is_finite():
+        raise InvalidOperation
+    return int((seconds * 1_000_000_000).to_integral_value())
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Seconds with nine decimals."""
+    seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
+
+
+def _open(path: Path, mode: Literal["r", "w"]) -> TextIO:
+    if path.suffix == ".gz":
+        return io.TextIOWrapper(gzip.GzipFile(path, mode), encoding="utf-8")
+    return path.open(mode, encoding="utf-8")
+
+
+def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64], Array]:
+    """Times in ns and the other columns; comments and empty lines are skipped."""
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in _lines(path):
+        words = line.split()
+        try:
+            if len(words) != 1 + len(columns):
+                raise ValueError
+            stamp_ns, row = parse_stamp(words[0]), [float(word) for word in words[1:]]
+            if not np.all(np.isfinite(row)):
+                raise ValueError
+        except (ValueError, InvalidOperation):
+            raise TrajectoryError(
+                f"{path}, line {number}: expected the finite numbers t {' '.join(columns)}, "
+                f"found {line[:80]!r}"
+            ) from None
+        if stamps and stamp_ns <= stamps[-1]:
+            fault = "repeats" if stamp_ns == stamps[-1] else "lies before"
+            raise TrajectoryError(
+                f"{path}, line {number}: the time {words[0]} {fault} the time of the line before"
+            )
+        stamps.append(stamp_ns)
+        rows.append(row)
+    if not rows:
+        raise TrajectoryError(f"{path} holds no line of numbers")
+    return np.array(stamps, dtype=np.int64), np.array(rows)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    try:
+        with _open(path, "r") as file:
+            for number, line in enumerate(file, start=1):
+                stripped = line.strip()
+                if stripped and not stripped.startswith("#"):
+                    yield number, stripped
+    except FileNotFoundError:
+        raise TrajectoryError(f"{path} does not exist") from None
+    except (OSError, EOFError, UnicodeDecodeError) as error:
+        raise TrajectoryError(f"{path} cannot be read as text: {error}") from error
+
+
+def _write_table(path: Path, title: str, stamps_ns: Iterable[int], values: Array) -> None:
+    with _open(path, "w") as file:
+        file.write(f"# {title}\n")
+        for stamp_ns, row in zip(stamps_ns, values.tolist(), strict=True):
+            file.write(f"{format_stamp(stamp_ns)} {' '.join(map(repr, row))}\n")
