@@ -1,0 +1,1 @@
+"""Simulated and recorded data, and how far an estimate is from the truth."""
