@@ -1,0 +1,54 @@
+# make demo   the whole thing on the bundled recording: a table on the screen, pictures in out/
+# make test   lint, types and tests
+# make clean  removes everything that make has made
+#
+# Both prepare a virtual environment first (once). PYTHON chooses the interpreter, VENV the place.
+
+VENV ?= .venv
+OUT ?= out
+
+# The first interpreter that will do; without any, python3 is refused below with the reason.
+supported = import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
+ifndef PYTHON
+PYTHON := $(shell for p in python3 python3.12 python3.11; do \
+    $$p -c '$(supported)' 2>/dev/null && echo $$p && exit; done; echo python3)
+endif
+
+# The environment is sealed: ROS wheels from pip and an installed ROS do not mix in one process.
+ifdef AMENT_PREFIX_PATH
+unexport LD_LIBRARY_PATH
+endif
+unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
+
+# One stamp per interpreter, so that another PYTHON makes a new environment.
+ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
+python := $(VENV)/bin/python
+
+.PHONY: demo test lint clean
+.DELETE_ON_ERROR:
+
+demo: $(ready)
+	@$(python) -m rs_localizer demo --out $(OUT)
+
+test: lint
+	@$(python) -m pytest -q
+
+lint: $(ready)
+	@$(python) -m ruff check --quiet --output-format concise .
+	@$(python) -m mypy --no-error-summary
+
+$(ready): setup.py pyproject.toml Makefile
+	@$(PYTHON) -c '$(supported)' || { \
+	    echo "rs_localizer needs Python 3.11 or 3.12, and $(PYTHON) is $$($(PYTHON) -V 2>&1)." \
+	        "Choose another with: make PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	    echo "$(PYTHON) cannot make virtual environments." \
+	        "On Debian and Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
+	@echo "Preparing $(VENV) (once, takes a few minutes)"
+	@[ -e $@ ] || $(PYTHON) -m venv --clear $(VENV)
+	@$(python) -m pip install --quiet --quiet --disable-pip-version-check --no-input --editable '.[ros,test]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) $(OUT) build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find rs_localizer test -name __pycache__ -type d -prune -exec rm -rf {} +

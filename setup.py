@@ -1,0 +1,69 @@
+"""The package for colcon (ament_python) and for pip."""
+
+import os
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = "rs_localizer"
+
+requirements = [
+    "matplotlib",
+    "numba",
+    "numpy>=1.26",
+    "opencv-python-headless>=4.6",
+    "PyYAML",
+    "rosbags",
+    "scipy",
+    "tqdm",
+]
+if os.environ.get("AMENT_PREFIX_PATH"):
+    # In a ROS environment rosdep brings them, from package.xml. Some are then invisible to pip
+    # (Ubuntu's OpenCV has no metadata), and a requirement that is not met ends the installed
+    # executables as soon as a library imports pkg_resources, as Ubuntu's Matplotlib does.
+    requirements = ["setuptools"]
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    description="Pose and velocity of a rolling-shutter camera from a single image",
+    maintainer="Seed b0484be4 maintainers",
+    maintainer_email="maintainers@users.noreply.h-seed-b0484be4.example",
+    license="Apache-2.0",
+    packages=find_packages(include=[package_name, f"{package_name}.*"]),
+    package_data={package_name: ["py.typed", "data/**/*"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+        (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{package_name}/launch", sorted(glob("launch/*.launch.py"))),
+    ],
+    zip_safe=False,
+    python_requires=">=3.11",
+    install_requires=requirements,
+    extras_require={
+        # ROS 2 Jazzy without an installation of ROS.
+        "ros": [
+            "ros-jazzy-rclpy",
+            "ros-jazzy-common-interfaces",
+            "ros-jazzy-rmw-fastrtps-cpp",
+        ],
+        "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
+        "evo": ["evo"],
+        "test": [
+            "catkin_pkg",
+            "hypothesis",
+            "mypy",
+            "pytest",
+            "pytest-timeout",
+            "ruff",
+            "setuptools>=70.1",  # the first that builds wheels on its own
+        ],
+    },
+    entry_points={
+        "console_scripts": [
+            "localizer = rs_localizer.ros.localizer_node:main",
+            "rs_localizer = rs_localizer.cli.main:main",
+        ],
+    },
+)

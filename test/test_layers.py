@@ -1,0 +1,75 @@
+"""Imports inside the package go down only."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "rs_localizer"
+
+# What each part may import besides itself; a part without a row: everything but `ros` and `cli`.
+MAY_IMPORT = {
+    "core": set(),
+    "config": {"core"},
+    "solvers": {"core"},
+    "localizer": {"core", "config", "solvers"},
+    "io": {"core"},
+    "lab": {"core", "io"},
+}
+ABOVE = {"ros", "cli"}
+
+
+def imported(source: str, inside: str) -> set[str]:
+    """Absolute dotted names that a module of the package `inside` imports, late ones included."""
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parents = inside.split(".")[: len(inside.split(".")) + 1 - node.level]
+            base = ".".join([*parents, node.module or ""] if node.level else [node.module or ""])
+            names |= {f"{base.strip('.')}.{alias.name}" for alias in node.names}
+    return names
+
+
+def parts(names: set[str]) -> set[str]:
+    """First-level parts of this package among dotted names; `__init__` for its public names."""
+    below = {name.split(".")[1] for name in names if name.startswith("rs_localizer.")}
+    here = {path.stem for path in PACKAGE.iterdir()}
+    public = {"__init__"} if "rs_localizer" in names or below - here else set()
+    return below & here | public
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("import rs_localizer.io.bags", {"io"}),
+        ("from rs_localizer.io.bags import read", {"io"}),
+        ("from rs_localizer import io", {"io"}),
+        ("def late():\n    from ..io import bags", {"io"}),
+        ("from . import so3", {"core"}),
+        ("import numpy, rs_localizer", {"__init__"}),
+        ("from rs_localizer import Camera", {"__init__"}),
+        ("from numpy import io", set()),
+    ],
+)
+def test_imports_are_seen(source: str, expected: set[str]) -> None:
+    assert parts(imported(source, "rs_localizer.core")) == expected
+
+
+def test_imports_go_down_only() -> None:
+    wrong = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        where = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        part = where[1]
+        used = parts(imported(path.read_text(), ".".join(where[:-1]))) - {part}
+        if part == "__init__":
+            allowed = {"core", "config", "solvers", "localizer"}
+        elif part in MAY_IMPORT:
+            allowed = MAY_IMPORT[part]
+        else:
+            allowed = used - ABOVE | ({"cli"} if part == "__main__" else set())
+        wrong += [f"{path.relative_to(PACKAGE.parent)} imports {bad}" for bad in used - allowed]
+    assert wrong == []

@@ -1,0 +1,158 @@
+"""The package as ROS, colcon and pip see it: description, versions, content, import rule."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from configparser import ConfigParser
+from email import message_from_string
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from catkin_pkg.changelog import get_changelog_from_path
+from catkin_pkg.package import parse_package
+
+import rs_localizer
+
+ROOT = Path(__file__).parents[1]
+# Names under which package.xml's dependencies are imported, where they differ.
+MODULES = {"tf2_ros_py": "tf2_ros"}
+
+
+def test_package_xml_is_valid_and_of_the_right_kind() -> None:
+    # With an invalid one (its e-mail address, say) colcon silently sees a plain Python package.
+    warnings: list[str] = []
+    package = parse_package(str(ROOT / "package.xml"), warnings=warnings)
+    assert warnings == []
+    assert package.name == "rs_localizer"
+    assert package.get_build_type() == "ament_python"
+    assert package.licenses == ["Apache-2.0"]
+
+
+def test_versions_agree() -> None:
+    version = parse_package(str(ROOT / "package.xml")).version
+    # The one form that catkin_prepare_release finds and raises.
+    assert re.findall(r'version="(\d+\.\d+\.\d+)",', (ROOT / "setup.py").read_text()) == [version]
+    assert rs_localizer.__version__ == version
+    newest = next(iter(get_changelog_from_path(str(ROOT / "CHANGELOG.rst")).foreach_version()))
+    assert newest[0] == version
+
+
+def build_wheel(directory: Path, **environment: str) -> Path:
+    """Build the wheel from a copy of the sources."""
+    source, result = directory / "source", directory / "result"
+    result.mkdir()
+    for name in "rs_localizer config launch resource".split():
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in "package.xml setup.py setup.cfg pyproject.toml LICENSE".split():
+        shutil.copy(ROOT / name, source)
+    code = f"import setuptools.build_meta as b; b.build_wheel({str(result)!r})"
+    inherited = {k: v for k, v in os.environ.items() if k != "AMENT_PREFIX_PATH"}
+    command = [sys.executable, "-c", code]
+    made = subprocess.run(
+        command,
+        cwd=source,
+        env=inherited | environment,
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert made.returncode == 0, made.stderr
+    return next(result.iterdir())
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
+    with zipfile.ZipFile(build_wheel(tmp_path_factory.mktemp("wheel"))) as archive:
+        yield archive
+
+
+def metadata(wheel: zipfile.ZipFile, name: str) -> str:
+    """A text of the wheel's .dist-info directory."""
+    path = next(n for n in wheel.namelist() if n.endswith(f".dist-info/{name}"))
+    return wheel.read(path).decode()
+
+
+def test_wheel_holds_every_file_of_the_package(wheel: zipfile.ZipFile) -> None:
+    paths = [p for p in (ROOT / "rs_localizer").rglob("*") if "__pycache__" not in p.parts]
+    files = {p.relative_to(ROOT).as_posix() for p in paths if p.is_file()}
+    assert "rs_localizer/py.typed" in files
+    assert files - set(wheel.namelist()) == set()
+
+
+def test_wheel_puts_shared_files_where_ros_looks(wheel: zipfile.ZipFile) -> None:
+    shared = {name.partition(".data/data/share/")[2] for name in wheel.namelist()} - {""}
+    expected = {"ament_index/resource_index/packages/rs_localizer", "rs_localizer/package.xml"}
+    expected |= {f"rs_localizer/config/{path.name}" for path in (ROOT / "config").glob("*")}
+    expected |= {f"rs_localizer/launch/{path.name}" for path in (ROOT / "launch").glob("*.py")}
+    assert shared == expected
+    assert "rs_localizer/config/rs_localizer.yaml" in shared
+    assert "rs_localizer/launch/localizer.launch.py" in shared
+
+
+def test_declared_commands_can_be_imported(wheel: zipfile.ZipFile) -> None:
+    declared = ConfigParser()
+    declared.read_string(metadata(wheel, "entry_points.txt"))
+    assert declared.sections() == ["console_scripts"]
+    assert set(declared["console_scripts"]) == {"localizer", "rs_localizer"}
+    for name, value in declared["console_scripts"].items():
+        assert callable(EntryPoint(name, value, "console_scripts").load()), value
+
+
+def requirements(text: str) -> set[str]:
+    """Names of the requirements in METADATA that are not behind an extra."""
+    required = message_from_string(text).get_all("Requires-Dist") or []
+    return {re.split(r"[ <>=;]", line)[0] for line in required if "extra ==" not in line}
+
+
+def test_pip_brings_the_libraries(wheel: zipfile.ZipFile) -> None:
+    required = requirements(metadata(wheel, "METADATA"))
+    assert {"numpy", "numba", "opencv-python-headless", "rosbags"} <= required
+
+
+def test_nothing_is_required_of_pip_in_a_ros_environment(tmp_path: Path) -> None:
+    # Ubuntu's OpenCV is no pip package: a requirement would stop the installed executables.
+    with zipfile.ZipFile(build_wheel(tmp_path, AMENT_PREFIX_PATH="/opt/ros/jazzy")) as wheel:
+        assert requirements(metadata(wheel, "METADATA")) == {"setuptools"}
+
+
+def ros_modules() -> list[str]:
+    """What package.xml names of ROS, by the names that one imports."""
+    depends = [d.name for d in parse_package(str(ROOT / "package.xml")).exec_depends]
+    return [MODULES.get(name, name) for name in depends if not name.startswith("python3-")]
+
+
+def lint(module: str, path: str) -> str:
+    """Ruff's findings in a file at `path` that imports a module and uses it."""
+    ruff = [sys.executable, "-m", "ruff", "check", "--output-format=concise"]
+    found = subprocess.run(
+        [*ruff, "--stdin-filename", path, "-"],
+        input=f"import {module}\n\n{module}.init()\n",
+        cwd=ROOT,
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert found.returncode in (0, 1), found.stderr
+    return found.stdout
+
+
+@pytest.mark.parametrize(
+    "path", ["rs_localizer/x.py", "rs_localizer/core/x.py", "rs_localizer/cli/x.py", "test/x.py"]
+)
+def test_ros_is_refused_outside_its_place(path: str) -> None:
+    modules = ros_modules()
+    assert {"rclpy", "sensor_msgs", "tf2_ros", "launch"} <= set(modules)
+    for module in [*modules, "rclpy.node", "sensor_msgs.msg"]:
+        assert "TID251" in lint(module, path), module
+
+
+def test_ros_is_accepted_in_its_place() -> None:
+    for path in ("rs_localizer/ros/x.py", "test/ros/test_x.py", "launch/x.launch.py"):
+        assert "All checks passed" in lint("rclpy", path), path
