@@ -1,0 +1,192 @@
+"""PointCloud2 <-> correspondences.
+
+Fields are looked up by name and may lie anywhere in a row; unknown ones are ignored. The data are
+read in place through a NumPy structured view, whatever their padding and byte order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.io.messages import Make, MessageError, frame_id, make_header, stamp_ns
+
+# sensor_msgs/PointField: the number of a type and its NumPy code.
+_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_NAMES = dict(
+    zip(_FORMATS, "INT8 UINT8 INT16 UINT16 INT32 UINT32 FLOAT32 FLOAT64".split(), strict=True)
+)
+_NUMBERS = {np.dtype(code): number for number, code in _FORMATS.items()}
+_REALS = (7, 8)
+_INTEGERS = (1, 2, 3, 4, 5, 6)
+_REQUIRED = ("x", "y", "z", "u", "v")
+_TYPES = dict.fromkeys((*_REQUIRED, "score"), _REALS) | {"id": _INTEGERS}
+# Added to the rows that were kept.
+_RESIDUAL = ("residual", "<f4")
+
+Field = tuple[str, int, int, int]  # name, offset, datatype, count
+
+
+class EmptyCloudError(MessageError):
+    """A well-formed cloud without a single point."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correspondences:
+    """The usable rows of a cloud: map points and where the raw image shows them."""
+
+    stamp_ns: int  # of the image
+    frame: str  # in which the points are given
+    points: Array  # (n,3) m
+    pixels: Array  # (n,2) raw (distorted) pixels, centre of the first pixel at 0, 0
+    scores: Array | None  # (n,) higher is better
+    dropped: int  # rows that held NaN or infinity
+    table: NDArray[Any]  # (n,) structured: the known fields of these rows as they came
+
+
+def read_correspondences(message: Any) -> Correspondences:
+    """Read a sensor_msgs/PointCloud2 with x, y, z, u, v and optional score and id.
+
+    Rows with a value that is not finite are dropped and counted.
+
+    Raises:
+        EmptyCloudError: for a cloud without points.
+        MessageError: for anything that cannot be read, saying what was found.
+    """
+    frame = frame_id(message, "the frame of x, y, z")
+    table = _view(message)
+    names = [name for name in (*_REQUIRED, "score") if name in (table.dtype.names or ())]
+    values = np.empty((len(names), len(table)))
+    for row, name in zip(values, names, strict=True):
+        row[:] = table[name]
+    finite = np.isfinite(values).all(axis=0)
+    dropped = len(table) - int(np.count_nonzero(finite))
+    if dropped:
+        values, table = values[:, finite], table[finite]
+    return Correspondences(
+        stamp_ns=stamp_ns(message),
+        frame=frame,
+        points=np.ascontiguousarray(values[:3].T),
+        pixels=np.ascontiguousarray(values[3:5].T),
+        scores=values[5] if len(names) > 5 else None,
+        dropped=dropped,
+        table=table,
+    )
+
+
+def _view(message: Any) -> NDArray[Any]:
+    """The known fields of a cloud as a structured array (n,) over the message's own data."""
+    width, height = int(message.width), int(message.height)
+    point_step, row_step = int(message.point_step), int(message.row_step)
+    fields = tuple(
+        (str(item.name), int(item.offset), int(item.datatype), int(item.count))
+        for item in message.fields
+        if item.name in _TYPES
+    )
+    row_type = _row_type(fields, point_step, bool(message.is_bigendian))
+    if width == 0 or height == 0:
+        raise EmptyCloudError(f"the cloud has no points: width {width}, height {height}")
+    if height == 1:
+        row_step = width * point_step  # some publishers leave it at 0
+    elif row_step < width * point_step:
+        raise MessageError(
+            f"row_step is {row_step}, too small for {width} points of {point_step} bytes"
+        )
+    # Sizes are Python integers here: a message can claim 2^64 points.
+    expected = (height - 1) * row_step + width * point_step
+    if len(message.data) < expected:
+        raise MessageError(
+            f"the data are truncated: {width} x {height} points of {point_step} bytes take "
+            f"{expected} bytes, found {len(message.data)}"
+        )
+    rows: NDArray[Any] = np.ndarray(
+        (height, width), row_type, message.data, strides=(row_step, point_step)
+    )
+    return rows.reshape(-1)
+
+
+@lru_cache(maxsize=16)
+def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> np.dtype[Any]:
+    """Structured type of one row; a camera's clouds all have the same."""
+    names = [field[0] for field in fields]
+    for name in _REQUIRED:
+        if name not in names:
+            raise MessageError(
+                f"the cloud has no field {name!r}; it needs {', '.join(_REQUIRED)}, "
+                f"found {', '.join(names) or 'none of them'}"
+            )
+    order, codes = ">" if big_endian else "<", []
+    for name, offset, number, count in fields:
+        if names.count(name) > 1:
+            raise MessageError(f"the cloud has {names.count(name)} fields {name!r}")
+        if number not in _TYPES[name]:
+            allowed = ", ".join(_NAMES[allowed] for allowed in _TYPES[name])
+            found = _NAMES.get(number, f"the unknown type {number}")
+            raise MessageError(f"field {name!r} must be one of {allowed}; found {found}")
+        if count not in (0, 1):  # 0 is an old way to write 1
+            raise MessageError(f"field {name!r} must hold one value, found {count}")
+        codes.append(order + _FORMATS[number])
+        end = offset + np.dtype(codes[-1]).itemsize
+        if end > point_step:
+            raise MessageError(
+                f"point_step is {point_step}, but field {name!r} ends at byte {end}"
+            )
+    offsets = [field[1] for field in fields]
+    return np.dtype(
+        {"names": names, "formats": codes, "offsets": offsets, "itemsize": point_step}
+    )
+
+
+def select_inliers(table: NDArray[Any], inliers: NDArray[np.bool_], residuals: Array) -> Any:
+    """Packed little-endian rows (k,) of a cloud's table that were kept, with their residual.
+
+    Args:
+        table: (n,) :attr:`Correspondences.table`.
+        inliers: (n,) which rows to keep.
+        residuals: (n,) px.
+    """
+    rows = np.flatnonzero(inliers)
+    kept = np.empty(len(rows), _packed(table.dtype))
+    for name in table.dtype.names or ():
+        kept[name] = table[name][rows]
+    kept["residual"] = residuals[rows]
+    return kept
+
+
+@lru_cache(maxsize=16)
+def _packed(row_type: np.dtype[Any]) -> np.dtype[Any]:
+    fields: Mapping[str, Any] = row_type.fields or {}
+    return np.dtype([(n, fields[n][0].newbyteorder("<")) for n in fields] + [_RESIDUAL])
+
+
+def make_cloud(make: Make, stamp: int, frame: str, rows: NDArray[Any]) -> Any:
+    """A sensor_msgs/PointCloud2 of packed little-endian rows (k,)."""
+    row_type = rows.dtype
+    fields = [
+        make(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=offset,
+            datatype=_NUMBERS[kind.newbyteorder("=")],
+            count=1,
+        )
+        for name, (kind, offset, *_) in (row_type.fields or {}).items()
+    ]
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=make_header(make, stamp, frame),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        is_bigendian=False,
+        point_step=row_type.itemsize,
+        row_step=row_type.itemsize * len(rows),
+        data=np.ascontiguousarray(rows).view(np.uint8),
+        is_dense=True,
+    )
