@@ -84,12 +84,6 @@ def _view(message: Any) -> NDArray[Any]:
     """The known fields of a cloud as a structured array (n,) over the message's own data."""
     width, height = int(message.width), int(message.height)
     point_step, row_step = int(message.point_step), int(message.row_step)
-    fields = tuple(
-        (str(item.name), int(item.offset), int(item.datatype), int(item.count))
-        for item in message.fields
-        if item.name in _TYPES
-    )
-    row_type = _row_type(fields, point_step, bool(message.is_bigendian))
     if width == 0 or height == 0:
         raise EmptyCloudError(f"the cloud has no points: width {width}, height {height}")
     if height == 1:
@@ -105,6 +99,17 @@ def _view(message: Any) -> NDArray[Any]:
             f"the data are truncated: {width} x {height} points of {point_step} bytes take "
             f"{expected} bytes, found {len(message.data)}"
         )
+    names = [str(item.name) for item in message.fields]
+    if missing := [name for name in _REQUIRED if name not in names]:
+        raise MessageError(
+            f"the cloud has no field {', '.join(missing)}; found {', '.join(names) or 'none'}"
+        )
+    fields = tuple(
+        (str(item.name), int(item.offset), int(item.datatype), int(item.count))
+        for item in message.fields
+        if item.name in _TYPES
+    )
+    row_type = _row_type(fields, point_step, bool(message.is_bigendian))
     rows: NDArray[Any] = np.ndarray(
         (height, width), row_type, message.data, strides=(row_step, point_step)
     )
@@ -115,12 +120,6 @@ def _view(message: Any) -> NDArray[Any]:
 def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> np.dtype[Any]:
     """Structured type of one row; a camera's clouds all have the same."""
     names = [field[0] for field in fields]
-    for name in _REQUIRED:
-        if name not in names:
-            raise MessageError(
-                f"the cloud has no field {name!r}; it needs {', '.join(_REQUIRED)}, "
-                f"found {', '.join(names) or 'none of them'}"
-            )
     order, codes = ">" if big_endian else "<", []
     for name, offset, number, count in fields:
         if names.count(name) > 1:

@@ -1,0 +1,85 @@
+"""Messages for the tests, written from the definitions of ROS and not by the package's code."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+# sensor_msgs/PointField: number of a type -> code of struct.
+STRUCT_CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
+Field = tuple[str, int, int]  # name, offset, number of its type
+
+
+def _header(stamp: tuple[int, int], frame: str) -> SimpleNamespace:
+    return SimpleNamespace(
+        stamp=SimpleNamespace(sec=stamp[0], nanosec=stamp[1]), frame_id=frame
+    )
+
+
+def pack_cloud(
+    rows: Sequence[Sequence[float]],
+    fields: Sequence[Field],
+    *,
+    point_step: int,
+    height: int = 1,
+    row_padding: int = 0,
+    big_endian: bool = False,
+    stamp: tuple[int, int] = (5, 7),
+    frame: str = "map",
+) -> SimpleNamespace:
+    """A PointCloud2 with these rows (a value per field); unused bytes are 0xAA."""
+    width = len(rows) // height
+    row_step = width * point_step + row_padding
+    data = bytearray(b"\xaa" * (height * row_step))
+    for index, row in enumerate(rows):
+        start = index // width * row_step + index % width * point_step
+        for value, (_, offset, number) in zip(row, fields, strict=True):
+            code = (">" if big_endian else "<") + STRUCT_CODES[number]
+            struct.pack_into(code, data, start + offset, value)
+    return SimpleNamespace(
+        header=_header(stamp, frame),
+        height=height,
+        width=width,
+        fields=[
+            SimpleNamespace(name=name, offset=offset, datatype=number, count=1)
+            for name, offset, number in fields
+        ],
+        is_bigendian=big_endian,
+        point_step=point_step,
+        row_step=row_step,
+        data=np.frombuffer(bytes(data), np.uint8),
+        is_dense=True,
+    )
+
+
+def camera_info(**changes: Any) -> SimpleNamespace:
+    """A CameraInfo of an ideal 640x480 camera, with changes."""
+    values = {
+        "header": _header((5, 7), "camera"),
+        "width": 640,
+        "height": 480,
+        "distortion_model": "plumb_bob",
+        "d": np.zeros(5),
+        "k": np.array([500.0, 0.0, 319.5, 0.0, 510.0, 239.5, 0.0, 0.0, 1.0]),
+        "r": np.eye(3).ravel(),
+        "p": np.zeros(12),
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False),
+    }
+    return SimpleNamespace(**(values | changes))
+
+
+@pytest.fixture
+def make_cloud_message() -> Callable[..., SimpleNamespace]:
+    return pack_cloud
+
+
+@pytest.fixture
+def make_camera_info() -> Callable[..., SimpleNamespace]:
+    return camera_info
