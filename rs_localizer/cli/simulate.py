@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from rs_localizer import data
+from rs_localizer.cli import UsageError
 from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
 from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import STORAGES, BagWriter
@@ -23,13 +25,14 @@ from rs_localizer.lab.true_motion import (
     TrueMotion,
 )
 
-SUMMARY = "write a bag with ground truth: a scene, a motion, a rolling-shutter camera"
-EXAMPLE = "rs_localizer simulate flight --trajectory poses.txt --duration 30 --noise 1"
-
 # A still hand is no example: without any motion given, the camera turns and walks like this.
 _ANGULAR_VELOCITY = (0.0, 1.0, 0.0)
 _LINEAR_VELOCITY = (0.3, 0.0, 0.0)
 _DURATION = 10.0
+# A time of 0 means "none" to ROS.
+_START_NS = 1_000_000_000
+# Stands for the bundled trajectory.
+_BUNDLED = "tum_vi_room5"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--trajectory",
         type=Path,
         metavar="FILE",
-        help="follow recorded poses: TUM text, also .gz; gaps are left out, never bridged",
+        help="follow recorded poses: TUM text, also .gz; gaps are left out, never bridged "
+        f"({_BUNDLED}: the bundled motion of a hand-held rig)",
     )
     motion.add_argument(
         "--axes",
@@ -142,7 +146,9 @@ def run(args: argparse.Namespace) -> None:
         frames = simulate_frames(
             camera, motion, map_points, settings, stamps_ns=stamps, seed=args.seed
         )
-        for frame in tqdm(frames, total=len(stamps), unit="frame", desc="simulate"):
+        for frame in tqdm(
+            frames, total=len(stamps), unit="frame", desc="simulate", disable=None
+        ):
             write_simulated(bag, camera, frame)
             points += len(frame.points)
     print(
@@ -155,8 +161,11 @@ def _motion(args: argparse.Namespace) -> TrueMotion:
     velocities = (args.angular_velocity, args.linear_velocity)
     if args.trajectory is not None:
         if velocities != (None, None):
-            raise ValueError("give either --trajectory or velocities, not both")
-        return RecordedMotion(read_tum(args.trajectory), args.axes, args.knot_spacing)
+            raise UsageError("give either --trajectory or velocities, not both")
+        file = args.trajectory
+        if file == Path(_BUNDLED) and not file.exists():
+            file = data.path(data.HAND_MOTION)
+        return RecordedMotion(read_tum(file), args.axes, args.knot_spacing)
     angular, linear = velocities
     if angular is None and linear is None:
         angular, linear = _ANGULAR_VELOCITY, _LINEAR_VELOCITY
@@ -164,6 +173,7 @@ def _motion(args: argparse.Namespace) -> TrueMotion:
         np.array(angular or (0.0, 0.0, 0.0)),
         np.array(linear or (0.0, 0.0, 0.0)),
         args.start + (_DURATION if args.duration is None else args.duration),
+        start_ns=_START_NS,
     )
 
 

@@ -7,6 +7,7 @@ recording was; the readers of this package take them and rclpy's messages alike.
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Collection, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -156,7 +157,8 @@ def _as_ros2(message: Any, type_name: str) -> Any:
 class BagWriter:
     """Writes a rosbag2 directory; a context manager.
 
-    What was written before an exception (Ctrl-C among them) stays readable.
+    What was written before an exception (Ctrl-C among them) stays readable; without any message,
+    nothing is left.
 
     Args:
         path: the directory to create.
@@ -203,3 +205,5 @@ class BagWriter:
         traceback: TracebackType | None,
     ) -> None:
         self._writer.close()
+        if exc is not None and not self._connections:
+            shutil.rmtree(self._path)  # nothing was written: leave nothing in the way

@@ -108,6 +108,16 @@ def test_what_was_written_before_an_error_stays_readable(tmp_path: Path) -> None
         assert bag.count(["/points"]) == 1
 
 
+def test_an_error_before_the_first_message_leaves_nothing(tmp_path: Path) -> None:
+    def failed() -> None:
+        with BagWriter(tmp_path / "bag"):
+            raise OSError
+
+    with pytest.raises(OSError):
+        failed()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_absent_topic_names_those_present(tmp_path: Path) -> None:
     write_ros2(tmp_path / "bag", "mcap")
     with open_bag(tmp_path / "bag") as bag, pytest.raises(BagError, match=r"/pose; .*/other, /poi"):

@@ -1,0 +1,23 @@
+"""Recordings that come with the package; each folder has an ATTRIBUTION.md."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+WEBCAM = "webcam_chessboard/recording"
+"""Rosbag2 of a hand-held rolling-shutter webcam over a chessboard; see its parameters.yaml."""
+HAND_MOTION = "motion/tum_vi_room5.txt.gz"
+"""TUM trajectory at 120 Hz of a hand-held rig, z up."""
+
+
+def path(name: str) -> Path:
+    """Where a bundled recording lies on disk.
+
+    Raises:
+        FileNotFoundError: when the package was installed without it.
+    """
+    found = Path(str(files(__name__) / name))
+    if not found.exists():
+        raise FileNotFoundError(f"{found} is missing: rs_localizer was installed without its data")
+    return found
