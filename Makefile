@@ -19,6 +19,8 @@ ifdef AMENT_PREFIX_PATH
 unexport LD_LIBRARY_PATH
 endif
 unexport AMENT_PREFIX_PATH PYTHONPATH PYTHONHOME RMW_IMPLEMENTATION
+# By this the ROS wheels of another environment would say that the library path is already set.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 # One stamp per interpreter, so that another PYTHON makes a new environment.
 ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
@@ -38,15 +40,16 @@ lint: $(ready)
 	@$(python) -m mypy --no-error-summary
 
 $(ready): setup.py pyproject.toml Makefile
-	@$(PYTHON) -c '$(supported)' || { \
-	    echo "rs_localizer needs Python 3.11 or 3.12, and $(PYTHON) is $$($(PYTHON) -V 2>&1)." \
+	@$(PYTHON) -c '$(supported)' 2>/dev/null || { \
+	    echo "rs_localizer needs Python 3.11 or 3.12, but $(PYTHON) is" \
+	        "$$($(PYTHON) -V 2>/dev/null || echo 'not there')." \
 	        "Choose another with: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	    echo "$(PYTHON) cannot make virtual environments." \
 	        "On Debian and Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
 	@echo "Preparing $(VENV) (once, takes a few minutes)"
 	@[ -e $@ ] || $(PYTHON) -m venv --clear $(VENV)
-	@$(python) -m pip install --quiet --quiet --disable-pip-version-check --no-input --editable '.[ros,test]'
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --editable '.[ros,test]'
 	@touch $@
 
 clean:
