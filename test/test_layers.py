@@ -16,7 +16,7 @@ MAY_IMPORT = {
     "solvers": {"core"},
     "localizer": {"core", "config", "solvers"},
     "io": {"core"},
-    "lab": {"core", "io"},
+    "lab": {"core", "config", "solvers", "localizer", "io", "settings"},
 }
 ABOVE = {"ros", "cli"}
 
