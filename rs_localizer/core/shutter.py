@@ -92,13 +92,13 @@ def project_rolling(
     tau = before + error_before
     for _ in range(_MOST_STEPS):
         error = view(tau)[1] - tau
-        with np.errstate(all="ignore"):  # points that no row sees end as NaN
-            slope = np.where(tau != before, (error - error_before) / (tau - before), -1.0)
-            step = np.where(error != 0.0, -error / slope, 0.0)
-        before, error_before = tau, error
-        tau = tau + step
-        if not np.any(np.abs(step) > _ROW_TIME_TOLERANCE):
+        moving = np.abs(error) > _ROW_TIME_TOLERANCE
+        if not np.any(moving):
             break
+        with np.errstate(all="ignore"):  # points that no row sees end as NaN
+            step = -error * (tau - before) / (error - error_before)
+        before, error_before = tau, error
+        tau = np.where(moving, tau + step, tau)
     pixels, row_time = view(tau)
-    settled = np.abs(row_time - tau) < 1e3 * _ROW_TIME_TOLERANCE
+    settled = np.abs(row_time - tau) < 1e3 * _ROW_TIME_TOLERANCE  # NaN compares false
     return np.where(settled[:, None], pixels, np.nan), np.where(settled, tau, np.nan)

@@ -1,0 +1,154 @@
+"""The robust loop: draw samples in blocks, solve, score, optimise the best, stop when sure.
+
+It knows a solver only as a function that turns samples into models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.residuals import pack, squared_errors
+from rs_localizer.core.sampling import Pool, draw
+from rs_localizer.core.scoring import best_models, optimize
+from rs_localizer.core.so3 import Array
+from rs_localizer.core.types import BoolArray
+
+MODEL_SIZE = 18
+
+# Of every block this many hypotheses are optimised: a six-point model of inliers alone is often
+# not the first in a block, because noise makes it miss most of the other inliers.
+_KEEP = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """The points of one frame, ready for the kernels."""
+
+    points: Array  # (n,3) m, in a frame near them
+    rays: Array  # (n,2)
+    tau: Array  # (n,)
+    row_time_gradient: Array  # (2,) per pixel
+    packed: Array
+
+    @classmethod
+    def of(
+        cls, points: Array, rays: Array, tau: Array, by_ray: Array, row_time_gradient: Array
+    ) -> Observations:
+        """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2)."""
+        return cls(points, rays, tau, row_time_gradient, pack(points, rays, tau, by_ray))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def squared_errors(self, state: Array) -> Array:
+        """Squared reprojection errors (n,) in raw pixels."""
+        errors: Array = squared_errors(self.packed, len(self), state, self.row_time_gradient)
+        return errors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """How samples become models, and how models are judged.
+
+    ``solve(points, rays, tau, samples, rotations, models)`` fills models (k,18,h), see
+    :mod:`rs_localizer.solvers.batch`.
+    """
+
+    solve: Callable[[Array, Array, Array, Array, Array, Array], None]
+    sample_size: int
+    solutions: int
+    block: int  # samples per block
+    score_scale: float  # px, truncation of the error of minimal models
+    final_scale: float  # px, truncation after local optimisation: the inlier threshold
+    prior: Array  # (6,) precisions of the velocities
+    noise: float  # px, expected standard deviation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """The best motion so far."""
+
+    state: Array  # (18,) of model B
+    cost: float  # truncated, squared pixels
+    samples: int = 0  # drawn until then
+
+    @property
+    def found(self) -> bool:
+        return bool(np.isfinite(self.cost))
+
+
+def search(
+    observations: Observations,
+    hypotheses: Hypotheses,
+    rotations: Sequence[Array],
+    pools: Sequence[Pool],
+    start: Candidate,
+    confidence: float,
+    max_samples: int,
+    random: Array,
+) -> Candidate:
+    """The best optimised hypothesis of up to ``max_samples`` minimal samples.
+
+    Blocks take the initial rotations in turn and draw equally from all pools. The search stops
+    when the chance that no sample so far held inliers alone, at the inlier ratios of the best
+    *optimised* motion, is below ``1 - confidence``: minimal models see too few of the inliers to
+    count them (a six-point model sees a tenth).
+    """
+    usable = [pool for pool in pools if len(pool.points) >= hypotheses.sample_size]
+    best = start
+    inliers = _inliers(observations, best, hypotheses.final_scale)
+    drawn = np.zeros(len(usable), dtype=np.int64)
+    row_range = float(np.ptp(observations.tau))
+    while usable and drawn.sum() < max_samples:
+        block = int(min(hypotheses.block, max_samples - drawn.sum()))
+        samples = np.empty((block, hypotheses.sample_size), dtype=np.int64)
+        for index, (pool, part) in enumerate(
+            zip(usable, np.array_split(samples, len(usable)), strict=True)
+        ):
+            prefixes = pool.prefix_sizes(
+                int(drawn[index]), len(part), hypotheses.sample_size, max_samples // len(usable)
+            )
+            draw(pool.points, prefixes, observations.tau, row_range, random, part)
+            drawn[index] += len(part)
+        models = np.empty((hypotheses.solutions, MODEL_SIZE, block))
+        rotation = rotations[int(drawn.sum() // hypotheses.block) % len(rotations)]
+        hypotheses.solve(
+            observations.points, observations.rays, observations.tau, samples,
+            rotation[None], models,
+        )  # fmt: skip
+        states, costs = best_models(
+            models, observations.packed, observations.row_time_gradient,
+            hypotheses.score_scale, _KEEP,
+        )  # fmt: skip
+        state, cost = optimize(
+            states, costs, observations.packed, observations.row_time_gradient,
+            2.0 * hypotheses.score_scale, hypotheses.final_scale, hypotheses.prior,
+            hypotheses.noise,
+        )  # fmt: skip
+        if cost < best.cost:
+            best = Candidate(state, cost)
+            inliers = _inliers(observations, best, hypotheses.final_scale)
+        if _missed(inliers, usable, drawn, hypotheses.sample_size) < 1.0 - confidence:
+            break
+    return Candidate(best.state, best.cost, start.samples + int(drawn.sum()))
+
+
+def _inliers(observations: Observations, candidate: Candidate, scale: float) -> BoolArray:
+    if not candidate.found:
+        return np.zeros(len(observations), dtype=np.bool_)
+    inliers: BoolArray = observations.squared_errors(candidate.state) < scale * scale
+    return inliers
+
+
+def _missed(
+    inliers: BoolArray, pools: Sequence[Pool], drawn: Array, size: int
+) -> float:
+    """Chance that none of the samples drawn from the pools held inliers alone."""
+    missed = 1.0
+    for pool, count in zip(pools, drawn, strict=True):
+        share = np.count_nonzero(inliers[pool.points]) / len(pool.points)
+        missed *= (1.0 - share**size) ** count
+    return missed

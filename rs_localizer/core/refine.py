@@ -1,0 +1,148 @@
+"""Refinement of a motion on many points: Levenberg-Marquardt in model B, with a velocity prior.
+
+Parameters of a step, as in ``Estimate.covariance``: the camera turns by ``exp([phi]x)`` in its own
+axes, moves by ``rho`` along them, and the two velocities change additively.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.residuals import PARAMETERS, STATE_SIZE, normal_equations
+from rs_localizer.core.so3 import Array, exp
+
+# A step that gains less than this part of the noise variance changes nothing.
+_CONVERGED = 1e-6
+_MOST_DAMPING = 1e8
+
+
+@kernel
+def apply_step(state: Array, step: Array) -> Array:
+    """The state moved by a step (12,)."""
+    turn = exp(-step[0:3])
+    moved = np.empty(STATE_SIZE)
+    for i in range(3):
+        for j in range(3):
+            moved[3 * i + j] = (
+                turn[i, 0] * state[j] + turn[i, 1] * state[3 + j] + turn[i, 2] * state[6 + j]
+            )
+        moved[9 + i] = (
+            turn[i, 0] * (state[9] - step[3])
+            + turn[i, 1] * (state[10] - step[4])
+            + turn[i, 2] * (state[11] - step[5])
+        )
+    for i in range(6):
+        moved[12 + i] = state[12 + i] + step[6 + i]
+    return moved
+
+
+@kernel
+def solve_positive(matrix: Array, right: Array) -> tuple[Array, bool]:
+    """Solution of a symmetric positive definite system by Cholesky, and whether it is one."""
+    size = len(right)
+    # Scaling to a unit diagonal makes radians and metres comparable.
+    scale = np.empty(size)
+    for i in range(size):
+        if not matrix[i, i] > 0.0:
+            return right, False
+        scale[i] = 1.0 / np.sqrt(matrix[i, i])
+    factor = np.empty((size, size))
+    solution = np.empty(size)
+    for i in range(size):
+        for j in range(i + 1):
+            total = matrix[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not total > 1e-15:
+                    return right, False
+                factor[i, i] = np.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+        total = right[i] * scale[i]
+        for k in range(i):
+            total -= factor[i, k] * solution[k]
+        solution[i] = total / factor[i, i]
+    for i in range(size - 1, -1, -1):
+        total = solution[i]
+        for k in range(i + 1, size):
+            total -= factor[k, i] * solution[k]
+        solution[i] = total / factor[i, i]
+    for i in range(size):
+        solution[i] *= scale[i]
+    return solution, True
+
+
+@kernel
+def _posterior(
+    data: Array, state: Array, gradient: Array, scale: float, softness: float,
+    prior: Array, noise: float, information: Array, slope: Array,
+) -> float:
+    """Normal equations and cost with the velocity prior, in squared pixels."""
+    cost = normal_equations(data, state, gradient, scale, softness, information, slope)
+    for i in range(6):
+        weight = noise * noise * prior[i]
+        information[6 + i, 6 + i] += weight
+        slope[6 + i] += weight * state[12 + i]
+        cost += weight * state[12 + i] * state[12 + i]
+    return cost
+
+
+@kernel
+def refine(
+    data: Array, start: Array, gradient: Array, scale: float, softness: float, prior: Array,
+    noise: float, iterations: int,
+) -> tuple[Array, Array, float, bool]:
+    """Minimize the robust cost of all points plus the prior.
+
+    Args:
+        data: packed points, with weights.
+        start: state (18,).
+        gradient: (2,) row time by pixel.
+        scale, softness: of the robust loss, see :mod:`rs_localizer.core.residuals`.
+        prior: (6,) precisions of a zero-mean prior on angular and linear velocity.
+        noise: standard deviation of the pixels, against which the prior is weighed.
+        iterations: most steps.
+
+    Returns:
+        state (18,), information (12,12) times the noise variance, cost, and whether a step
+        was accepted as the last one or nothing more was to be gained.
+    """
+    state = start.copy()
+    information = np.empty((PARAMETERS, PARAMETERS))
+    slope = np.empty(PARAMETERS)
+    next_information = np.empty((PARAMETERS, PARAMETERS))
+    next_slope = np.empty(PARAMETERS)
+    cost = _posterior(data, state, gradient, scale, softness, prior, noise, information, slope)
+    damping = 0.0
+    converged = False
+    for _ in range(iterations):
+        damped = information.copy()
+        for i in range(PARAMETERS):
+            damped[i, i] *= 1.0 + damping
+        step, solved = solve_positive(damped, -slope)
+        gain = 0.0
+        if solved:
+            for i in range(PARAMETERS):
+                gain -= step[i] * slope[i]
+            trial = apply_step(state, step)
+            trial_cost = _posterior(
+                data, trial, gradient, scale, softness, prior, noise, next_information, next_slope
+            )
+            if trial_cost <= cost:
+                state, cost = trial, trial_cost
+                information, next_information = next_information, information
+                slope, next_slope = next_slope, slope
+                damping = 0.0 if damping < 1e-5 else 0.1 * damping
+                if gain < _CONVERGED * noise * noise:
+                    converged = True
+                    break
+                continue
+            if gain < _CONVERGED * noise * noise:
+                converged = True
+                break
+        damping = max(10.0 * damping, 1e-4)
+        if damping > _MOST_DAMPING:
+            break
+    return state, information, cost, converged

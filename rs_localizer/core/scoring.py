@@ -1,0 +1,86 @@
+"""Which hypotheses of a block are worth a closer look, and the closer look."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.refine import refine
+from rs_localizer.core.residuals import STATE_SIZE, robust_cost
+from rs_localizer.core.so3 import Array
+
+# Local optimisation tightens Tukey's loss from the first scale to the last by these steps.
+_ANNEALING_STEPS = 4
+_ITERATIONS_PER_SCALE = 3
+
+
+@kernel
+def state_of_model(model: Array) -> Array:
+    """State (model B) of a solver's model A (18,): ``omega = -w``, ``v = w x C - t``."""
+    state = np.empty(STATE_SIZE)
+    for k in range(12):
+        state[k] = model[k]
+    c, w, t = model[9:12], model[12:15], model[15:18]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        state[12 + i] = -w[i]
+        state[15 + i] = w[j] * c[k] - w[k] * c[j] - t[i]
+    return state
+
+
+@kernel
+def best_models(
+    models: Array, data: Array, gradient: Array, scale: float, keep: int
+) -> tuple[Array, Array]:
+    """States (keep,18) and costs (keep,) of the models (k,18,h) with the least truncated error.
+
+    A model is left as soon as its cost exceeds that of the worst kept one. Places that no model
+    takes have infinite cost.
+    """
+    states = np.zeros((keep, STATE_SIZE))
+    costs = np.full(keep, np.inf)
+    solutions, _, count = models.shape
+    for h in range(count):
+        for s in range(solutions):
+            if np.isnan(models[s, 0, h]):
+                continue
+            state = state_of_model(models[s, :, h])
+            cost = robust_cost(data, state, gradient, scale, 0.0, costs[keep - 1])
+            if cost < costs[keep - 1]:
+                place = keep - 1
+                while place > 0 and cost < costs[place - 1]:
+                    costs[place] = costs[place - 1]
+                    states[place] = states[place - 1]
+                    place -= 1
+                costs[place] = cost
+                states[place] = state
+    return states, costs
+
+
+@kernel
+def optimize(
+    states: Array, costs: Array, data: Array, gradient: Array, first_scale: float,
+    last_scale: float, prior: Array, noise: float,
+) -> tuple[Array, float]:
+    """Local optimisation of the states with finite cost; the best state and its truncated cost.
+
+    Each is refined on all points under Tukey's loss while its scale falls from the first to the
+    last; the truncated cost is that of the last scale.
+    """
+    best = np.zeros(STATE_SIZE)
+    best_cost = np.inf
+    ratio = (last_scale / first_scale) ** (1.0 / (_ANNEALING_STEPS - 1))
+    for i in range(len(states)):
+        if not np.isfinite(costs[i]):
+            continue
+        state = states[i]
+        scale = first_scale
+        for _ in range(_ANNEALING_STEPS):
+            state, _, _, _ = refine(
+                data, state, gradient, scale, 1.0, prior, noise, _ITERATIONS_PER_SCALE
+            )
+            scale *= ratio
+        cost = robust_cost(data, state, gradient, last_scale, 0.0, best_cost)
+        if cost < best_cost:
+            best, best_cost = state, cost
+    return best, best_cost

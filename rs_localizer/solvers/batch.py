@@ -1,0 +1,95 @@
+"""Data of a batch of samples on its way into the lanes and out again.
+
+A kernel keeps its samples in a flat work array of ``LANES`` doubles per value:
+
+    points (3 n) · rays (2 n) · row times (n) · initial rotation (9) · the solver's own state
+
+and writes solutions into ``models`` (solutions, 18, samples): rotation (9, row-major), C (3),
+w (3), t (3) in model A, all of them NaN where there is no solution. All kernels have the same
+signature, ``(points, rays, tau, samples, rotations, iterations, models)``, see :func:`gather`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.simd import LANES, Vector, multiply
+from rs_localizer.core.so3 import Array
+
+MODEL_SIZE = 18
+
+
+def inputs(size: int) -> int:
+    """Number of values before the solver's own state, for samples of ``size`` points."""
+    return 6 * size + 9
+
+
+@kernel
+def gather(
+    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, start: int, work: Array
+) -> None:
+    """Fill the lanes with samples ``start, start + 1, ...``; past the end the last one repeats.
+
+    Points (m,3), rays (m,2) and row times (m,) are picked by ``samples`` (h,n); ``rotations`` is
+    (1,3,3), one for all samples, or (h,3,3).
+    """
+    count, size = samples.shape
+    for lane in range(LANES):
+        h = min(start + lane, count - 1)
+        for i in range(size):
+            j = samples[h, i]
+            for k in range(3):
+                work[(3 * i + k) * LANES + lane] = points[j, k]
+            for k in range(2):
+                work[(3 * size + 2 * i + k) * LANES + lane] = rays[j, k]
+            work[(5 * size + i) * LANES + lane] = tau[j]
+        rotation = rotations[min(h, len(rotations) - 1)]
+        for k in range(9):
+            work[(6 * size + k) * LANES + lane] = rotation[k // 3, k % 3]
+
+
+@kernel
+def scatter(work: Array, offset: int, start: int, model: Array) -> None:
+    """Write the lanes' models, which begin at value ``offset``, to columns of ``model`` (18,h)."""
+    lanes = min(LANES, model.shape[1] - start)
+    for lane in range(lanes):
+        finite = True
+        for k in range(MODEL_SIZE):
+            finite = finite and np.isfinite(work[(offset + k) * LANES + lane])
+        for k in range(MODEL_SIZE):
+            model[k, start + lane] = work[(offset + k) * LANES + lane] if finite else np.nan
+
+
+class Sample:
+    """The inputs of a traced function by their names."""
+
+    __slots__ = ("points", "rays", "rotation", "state", "tau")
+
+    def __init__(self, values: Sequence[Any], size: int) -> None:
+        self.points: list[Vector] = [list(values[3 * i : 3 * i + 3]) for i in range(size)]
+        rays = values[3 * size : 5 * size]
+        self.rays: list[Vector] = [list(rays[2 * i : 2 * i + 2]) for i in range(size)]
+        self.tau: Vector = list(values[5 * size : 6 * size])
+        rotation = values[6 * size : 6 * size + 9]
+        self.rotation: list[Vector] = [list(rotation[3 * i : 3 * i + 3]) for i in range(3)]
+        self.state: Vector = list(values[6 * size + 9 :])
+
+    def rotated_points(self) -> list[Vector]:
+        """The points in the frame of the initial rotation."""
+        return [multiply(self.rotation, x) for x in self.points]
+
+    def with_results(
+        self, points: Sequence[Vector], rotation: Sequence[Vector], state: Vector
+    ) -> Vector:
+        """The values in their order again, with what a step has changed."""
+        return [
+            *(x for point in points for x in point),
+            *(x for ray in self.rays for x in ray),
+            *self.tau,
+            *(x for row in rotation for x in row),
+            *state,
+        ]

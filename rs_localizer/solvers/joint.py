@@ -1,0 +1,29 @@
+"""joint: both ``r6p_vct_w`` and ``r6p_vcwt`` on every sample; the robust score picks.
+
+The suggestion of Kukelova, Albl, Sugimoto, Pajdla, ACCV 2018, sec. 5, for unknown motion: the
+first is ahead under pure translation, the second elsewhere. Six points, two solutions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.so3 import Array
+from rs_localizer.solvers import r6p_two_step, r6p_vcwt
+
+SAMPLE_SIZE = 6
+SOLUTIONS = 2
+
+_solve_vct_w = r6p_two_step.solve_vct_w
+_solve_vcwt = r6p_vcwt.solve_batch
+
+
+@kernel
+def solve_batch(
+    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    models: Array,
+) -> None:
+    """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
+    _solve_vct_w(points, rays, tau, samples, rotations, iterations, models[0:1])
+    _solve_vcwt(points, rays, tau, samples, rotations, iterations, models[1:2])

@@ -1,0 +1,126 @@
+"""The solvers by name: the only place that names them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.solvers import joint, p3p, r6p_two_step, r6p_vcwt, r9p
+from rs_localizer.solvers.batch import MODEL_SIZE
+
+
+@dataclass(frozen=True, slots=True)
+class Solver:
+    """A minimal solver: its batch kernel (see :mod:`rs_localizer.solvers.batch`) and sizes."""
+
+    solve: Callable[..., None]
+    solve_as_published: Callable[..., None]  # the paper's form where ours differs, else the same
+    sample_size: int
+    solutions: int  # at most, per sample
+    rolling_shutter: bool = True
+
+
+def _solver(
+    module: ModuleType,
+    solve: Callable[..., None],
+    as_published: Callable[..., None] | None = None,
+    rolling_shutter: bool = True,
+) -> Solver:
+    published = as_published or solve
+    return Solver(solve, published, module.SAMPLE_SIZE, module.SOLUTIONS, rolling_shutter)
+
+
+SOLVERS: dict[str, Solver] = {
+    "p3p": _solver(p3p, p3p.solve_batch, rolling_shutter=False),
+    "r6p_vc_wt": _solver(r6p_two_step, r6p_two_step.solve_vc_wt),
+    "r6p_vct_w": _solver(r6p_two_step, r6p_two_step.solve_vct_w),
+    "r6p_vct_wt": _solver(r6p_two_step, r6p_two_step.solve_vct_wt),
+    "r6p_vcwt": _solver(r6p_vcwt, r6p_vcwt.solve_batch, r6p_vcwt.solve_batch_frozen),
+    "r9p": _solver(r9p, r9p.solve_batch, r9p.solve_batch_as_published),
+    "joint": _solver(joint, joint.solve_batch),
+}
+
+
+def find_solver(name: str) -> Solver:
+    """The solver of that name.
+
+    Raises:
+        ValueError: unknown name, or ``r6p``, whose polynomial solver is not part of this version.
+    """
+    if name in SOLVERS:
+        return SOLVERS[name]
+    if name == "r6p":
+        raise ValueError(
+            "solver r6p (the six-point polynomial solver) is not available in this version; "
+            f"choose one of {', '.join(SOLVERS)}"
+        )
+    raise ValueError(f"unknown solver {name!r}; choose one of {', '.join(SOLVERS)}")
+
+
+def solve_minimal(
+    name: str,
+    points: ArrayLike,
+    rays: ArrayLike,
+    tau: ArrayLike,
+    rotation: ArrayLike | None = None,
+    iterations: int = 5,
+    as_published: bool = False,
+) -> tuple[Array, Array, Array, Array]:
+    """Solve many minimal samples at once.
+
+    Args:
+        name: a key of :data:`SOLVERS`.
+        points: (h,n,3) world points, n the solver's sample size.
+        rays: (h,n,2) undistorted bearings ``x/z, y/z``.
+        tau: (h,n) row times, see :mod:`rs_localizer.core.shutter`.
+        rotation: initial rotation camera_from_map, (3,3) or (h,3,3); identity by default. The
+            rolling-shutter solvers need it to tens of degrees; ``p3p`` ignores it.
+        iterations: of the iterative solvers.
+        as_published: r6p_vcwt with v^ frozen and r9p with its gauge free, as in the paper;
+            otherwise relinearised, and with ``trace(R_RS) = 0``.
+
+    Returns:
+        rotations (h,k,3,3), translations (h,k,3), w (h,k,3) and t (h,k,3) of model A,
+        ``lambda x = exp(tau [w]x) R X + C + tau t``, per unit of ``tau``; NaN where a sample has
+        fewer than k solutions. For ``p3p``, w and t are zero.
+
+    Raises:
+        ValueError: unknown solver, wrong shapes, or fewer than one iteration.
+    """
+    solver = find_solver(name)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    rays = np.ascontiguousarray(rays, dtype=np.float64)
+    tau = np.ascontiguousarray(tau, dtype=np.float64)
+    n = solver.sample_size
+    h = len(points)
+    if points.shape != (h, n, 3) or rays.shape != (h, n, 2) or tau.shape != (h, n):
+        raise ValueError(
+            f"{name} takes points (h,{n},3), rays (h,{n},2) and tau (h,{n}); "
+            f"got {points.shape}, {rays.shape} and {tau.shape}"
+        )
+    initial = np.eye(3) if rotation is None else np.ascontiguousarray(rotation, dtype=np.float64)
+    if initial.shape not in ((3, 3), (h, 3, 3)):
+        raise ValueError(f"rotation must be (3,3) or ({h},3,3), got {initial.shape}")
+    if iterations < 1:
+        raise ValueError(f"iterations must be 1 or more, got {iterations}")
+    k = solver.solutions
+    models = np.empty((k, MODEL_SIZE, h))
+    if h > 0:
+        samples = np.arange(h * n, dtype=np.int64).reshape(h, n)
+        solve = solver.solve_as_published if as_published else solver.solve
+        solve(
+            points.reshape(-1, 3), rays.reshape(-1, 2), tau.ravel(), samples,
+            initial.reshape(-1, 3, 3), iterations, models,
+        )  # fmt: skip
+    found = np.moveaxis(models, (2, 0), (0, 1))  # (h,k,18)
+    return (
+        np.ascontiguousarray(found[..., :9]).reshape(h, k, 3, 3),
+        np.ascontiguousarray(found[..., 9:12]),
+        np.ascontiguousarray(found[..., 12:15]),
+        np.ascontiguousarray(found[..., 15:18]),
+    )
