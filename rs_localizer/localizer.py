@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.ransac import Candidate, Hypotheses, Observations, search
-from rs_localizer.core.refine import refine
+from rs_localizer.core.refine import Posterior, invert_information, refine
 from rs_localizer.core.residuals import set_weights
-from rs_localizer.core.sampling import Pool
+from rs_localizer.core.sampling import IntArray, Pool, Random, generator
 from rs_localizer.core.scoring import optimize
 from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray, Estimate, Failure, Reason
+from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.solvers import Solver, find_solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -34,6 +34,13 @@ _HELD = np.full(6, 1e18)
 # (99.8 % of Rayleigh-distributed errors), but the threshold is widened at most twofold.
 _GATE = 3.5
 _WIDEST = 2.0
+_FINAL_ROUNDS = 3
+_FINAL_ITERATIONS = 10
+# Positions of image points are never better than this, in pixels; it also keeps noise-free data
+# from claiming an infinite information.
+_LEAST_NOISE = 1e-4
+# Of the information matrix scaled to a unit diagonal.
+_LEAST_EIGENVALUE = 1e-11
 # Beyond this the camera turns by more than the motion model is meant for.
 _MOST_TURN = 1.5
 
@@ -106,21 +113,19 @@ class Localizer:
             self.camera.row_time_gradient,
         )
         ranking = None if scores is None else np.argsort(-scores[usable], kind="stable")
-        random = np.array([self.config.seed], dtype=np.uint64)
+        random = generator(self.config.seed)
 
         start = self._global_shutter(observations, ranking, random)
         if not start.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
         best = self._motion(observations, ranking, start, random)
-        state, covariance, inliers = self._final(observations, best)
-        return self._result(
-            observations, usable, len(points), centre, start, best, state, covariance, inliers
-        )
+        posterior = self._final(observations, best)
+        return self._result(observations, usable, len(points), centre, start, best, posterior)
 
     # -- steps ------------------------------------------------------------------------------
 
     def _global_shutter(
-        self, observations: Observations, ranking: Array | None, random: Array
+        self, observations: Observations, ranking: IntArray | None, random: Random
     ) -> Candidate:
         """A pose that fits all rows roughly, by P3P and a wide threshold."""
         rolling = self._solver.rolling_shutter
@@ -143,7 +148,7 @@ class Localizer:
         )  # fmt: skip
 
     def _motion(
-        self, observations: Observations, ranking: Array | None, start: Candidate, random: Array
+        self, observations: Observations, ranking: IntArray | None, start: Candidate, random: Random
     ) -> Candidate:
         """The motion that most points agree on, from the solver's hypotheses."""
         if not self._solver.rolling_shutter:
@@ -169,49 +174,52 @@ class Localizer:
             Candidate(state, cost), self.config.confidence, self.config.max_iterations, random,
         )  # fmt: skip
 
-    def _final(
-        self, observations: Observations, best: Candidate
-    ) -> tuple[Array, Array, BoolArray]:
-        """State, covariance (12,12) and inliers of the maximum a posteriori estimate."""
+    def _final(self, observations: Observations, best: Candidate) -> Posterior:
+        """The maximum a posteriori motion of the inliers, which its noise decides."""
         threshold = self.config.inlier_threshold
         prior = self._prior if self._solver.rolling_shutter else _HELD
-        state = best.state
-        gate = threshold
-        for _ in range(3):
-            errors = observations.squared_errors(state)
-            noise = _noise(errors, gate)
+        state, gate, freedom = best.state, threshold, 0.0
+        errors = observations.squared_errors(state)
+        for _ in range(_FINAL_ROUNDS):
+            noise = noise_deviation(errors, gate, freedom)
             gate = min(max(threshold, _GATE * noise), _WIDEST * threshold)
-            inliers = errors < gate * gate
-            set_weights(observations.packed, inliers.astype(np.float64))
+            set_weights(observations.packed, (errors < gate * gate).astype(np.float64))
             state, information, _, _ = refine(
                 observations.packed, state, observations.row_time_gradient, 1e6, 0.0, prior,
-                noise, 10,
+                noise, _FINAL_ITERATIONS,
             )  # fmt: skip
-        covariance = noise * noise * np.linalg.pinv(information, hermitian=True)
-        return state, covariance, observations.squared_errors(state) < gate * gate
+            errors = observations.squared_errors(state)
+            inverse, smallest = invert_information(information)
+            # The prior takes a part of the twelve degrees of freedom.
+            freedom = 12.0 - noise**2 * float(prior @ np.diag(inverse)[6:])
+        noise = noise_deviation(errors, gate, freedom)
+        return Posterior(state, noise**2 * inverse, smallest, errors < gate * gate, errors)
 
     def _result(
         self,
         observations: Observations,
-        usable: Array,
+        usable: IntArray,
         count: int,
         centre: Array,
         start: Candidate,
         best: Candidate,
-        state: Array,
-        covariance: Array,
-        inliers: BoolArray,
+        posterior: Posterior,
     ) -> Estimate | Failure:
         """Accept the motion or say what is wrong with it."""
-        found = int(np.count_nonzero(inliers))
+        found = int(np.count_nonzero(posterior.inliers))
         if found < self.config.min_inliers:
             return Failure(
                 Reason.TOO_FEW_INLIERS,
                 f"{found} inliers of {len(usable)} points after {best.samples} samples, "
                 f"{self.config.min_inliers} are needed",
             )
-        if not np.all(np.isfinite(state)) or not np.all(np.diag(covariance) >= 0.0):
-            return Failure(Reason.DEGENERATE, "the points do not determine the motion")
+        if not posterior.smallest_eigenvalue > _LEAST_EIGENVALUE:
+            return Failure(
+                Reason.DEGENERATE,
+                f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
+                f"information {posterior.smallest_eigenvalue:.1e}",
+            )
+        state = posterior.state
         turn = float(np.linalg.norm(state[12:15]))
         if turn > _MOST_TURN:
             return Failure(
@@ -220,17 +228,17 @@ class Localizer:
             )
         rotation = state[:9].reshape(3, 3)
         residuals = np.full(count, np.nan)
-        residuals[usable] = np.sqrt(observations.squared_errors(state))
-        accepted = np.zeros(count, dtype=np.bool_)
-        accepted[usable] = inliers
+        residuals[usable] = np.sqrt(posterior.squared_errors)
+        inliers = np.zeros(count, dtype=np.bool_)
+        inliers[usable] = posterior.inliers
         return Estimate(
             rotation=rotation,
             translation=state[9:12] - rotation @ centre,
             angular_velocity=state[12:15],
             linear_velocity=state[15:18],
-            inliers=accepted,
+            inliers=inliers,
             residuals=residuals,
-            covariance=covariance,
+            covariance=posterior.covariance,
             global_shutter_inliers=self._global_shutter_inliers(observations, start),
             iterations=best.samples,
         )
@@ -254,7 +262,8 @@ class Localizer:
         self, solver: Solver, block: int, score_scale: float, final_scale: float, prior: Array
     ) -> Hypotheses:
         def solve(
-            points: Array, rays: Array, tau: Array, samples: Array, rotations: Array, models: Array
+            points: Array, rays: Array, tau: Array, samples: IntArray, rotations: Array,
+            models: Array,
         ) -> None:
             solver.solve(
                 points, rays, tau, samples, rotations, self.config.solver_iterations, models
@@ -285,28 +294,34 @@ class Localizer:
 _NOTHING = Candidate(np.zeros(18), math.inf)
 
 
-def _pools(observations: Observations, ranking: Array | None) -> list[Pool]:
+def _pools(observations: Observations, ranking: IntArray | None) -> list[Pool]:
     everything = Pool(np.arange(len(observations)))
     # Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
     return [everything] if ranking is None else [Pool(ranking, ranked=True), everything]
 
 
-def _noise(squared_errors: Array, gate: float) -> float:
+def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float:
     """Standard deviation of the pixel noise from the errors within a gate.
+
+    Args:
+        squared_errors: (n,) of all points.
+        gate: px.
+        freedom: degrees of freedom that the fit has used up.
 
     The errors of true inliers are Rayleigh distributed; cutting them off at the gate lowers their
     mean square by a factor that depends on the deviation itself, hence the fixed point.
     """
     within = squared_errors[squared_errors < gate * gate]
-    if len(within) == 0:
+    left = 2 * len(within) - freedom
+    if left <= 0.0:
         return gate / _GATE
-    mean = 0.5 * float(within.mean())
+    mean = float(within.sum()) / left
     variance = mean
     for _ in range(20):
-        u = gate * gate / (2.0 * variance)
+        u = gate * gate / (2.0 * max(variance, 1e-12 * gate * gate))
         kept = 1.0 - u * math.exp(-u) / -math.expm1(-u)
         variance = min(mean / max(kept, 1e-3), gate * gate)
-    return math.sqrt(variance)
+    return max(math.sqrt(variance), _LEAST_NOISE)
 
 
 def _checked(
@@ -327,5 +342,5 @@ def _checked(
         checks.append(("scores", scores))
     for name, array in checks:
         if not np.all(np.isfinite(array)):
-            raise ValueError(f"{name} must be finite, found {np.sum(~np.isfinite(array))} NaN or inf")
+            raise ValueError(f"{name} must be finite, found NaN or infinity")
     return points, pixels, scores

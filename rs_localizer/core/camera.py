@@ -12,7 +12,6 @@ from enum import StrEnum
 
 import cv2
 import numpy as np
-
 from numpy.typing import NDArray
 
 from rs_localizer.core.so3 import Array
@@ -161,11 +160,11 @@ class Camera:
             (self.roi.y_offset, self.roi.height),
         )[axis]
         first = offset if sign > 0 else offset + extent - 1
-        return sign * (first - 0.5 * (size - 1)) / (size - 1)
+        return float(sign * (first - 0.5 * (size - 1)) / (size - 1))
 
     def _row_time_of_first_pixel(self) -> float:
         axis, sign, size = self._scan()
-        return sign * (self._offset()[axis] - 0.5 * (size - 1)) / (size - 1)
+        return float(sign * (self._offset()[axis] - 0.5 * (size - 1)) / (size - 1))
 
     def _scan(self) -> tuple[int, int, int]:
         """Pixel axis along which the shutter moves, its sign, and the sensor's size there."""
@@ -200,7 +199,8 @@ class Camera:
         if len(sensor) == 0:
             return np.zeros((0, 2))
         if len(self.D) == 0:
-            return (sensor - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
+            plain: Array = (sensor - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
+            return plain
         undistort = (
             cv2.fisheye.undistortPoints
             if self.distortion_model == DistortionModel.EQUIDISTANT
@@ -232,13 +232,14 @@ class Camera:
         step = _DERIVATIVE_STEP
         offsets = np.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
         pixels = self._distort((rays[None] + offsets[:, None]).reshape(-1, 2))
-        left, right = pixels.reshape(4, -1, 2)[0::2], pixels.reshape(4, -1, 2)[1::2]
-        return np.moveaxis((left - right) / (2.0 * step), 0, 2)
+        ahead, behind = pixels.reshape(4, -1, 2)[0::2], pixels.reshape(4, -1, 2)[1::2]
+        return np.moveaxis((ahead - behind) / (2.0 * step), 0, 2)
 
     def inside(self, pixels: Array) -> NDArray[np.bool_]:
         """Which raw pixels (n,2) lie in the delivered image."""
         limit = np.array(self.size) - 0.5
-        return np.all((pixels > -0.5) & (pixels < limit), axis=1)  # NaN compares false
+        inside: NDArray[np.bool_] = np.all((pixels > -0.5) & (pixels < limit), axis=1)
+        return inside  # NaN compares false
 
     def _distort(self, rays: Array) -> Array:
         if len(self.D) == 0:
@@ -249,4 +250,5 @@ class Camera:
             bearings = np.column_stack([rays, np.ones(len(rays))])
             zero = np.zeros(3)
             sensor = cv2.projectPoints(bearings[:, None], zero, zero, self.K, self.D)[0][:, 0]
-        return (sensor - self._offset()) / self.binning
+        pixels: Array = (sensor - self._offset()) / self.binning
+        return pixels

@@ -6,11 +6,13 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+_CONFIG: Any = numba.config
 
 
 def _cache_directory() -> str | None:
@@ -25,7 +27,7 @@ def _cache_directory() -> str | None:
         for file in sorted((package / folder).glob("*.py")):
             digest.update(file.read_bytes())
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    base = Path(numba.config.CACHE_DIR or Path(home) / "rs_localizer")
+    base = Path(_CONFIG.CACHE_DIR or Path(home) / "rs_localizer")
     directory = base / digest.hexdigest()[:16]
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -39,10 +41,10 @@ _CACHE_DIRECTORY = _cache_directory()
 
 def kernel(function: F) -> F:
     """Compile a function with Numba: cached on disk, without the GIL, NaN preserved."""
-    users_directory = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _CACHE_DIRECTORY or users_directory
+    users_directory = _CONFIG.CACHE_DIR
+    _CONFIG.CACHE_DIR = _CACHE_DIRECTORY or users_directory
     try:
-        compiled: F = numba.njit(
+        compiled: Any = numba.njit(
             cache=_CACHE_DIRECTORY is not None,
             nogil=True,
             # Without it every division is checked for zero, which stops vectorization.
@@ -51,5 +53,5 @@ def kernel(function: F) -> F:
             fastmath={"contract", "reassoc", "nsz", "arcp"},
         )(function)
     finally:
-        numba.config.CACHE_DIR = users_directory
-    return compiled
+        _CONFIG.CACHE_DIR = users_directory
+    return cast(F, compiled)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.residuals import pack, squared_errors
-from rs_localizer.core.sampling import Pool, draw
+from rs_localizer.core.sampling import IntArray, Pool, Random, draw
 from rs_localizer.core.scoring import best_models, optimize
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray
@@ -57,7 +57,7 @@ class Hypotheses:
     :mod:`rs_localizer.solvers.batch`.
     """
 
-    solve: Callable[[Array, Array, Array, Array, Array, Array], None]
+    solve: Callable[[Array, Array, Array, IntArray, Array, Array], None]
     sample_size: int
     solutions: int
     block: int  # samples per block
@@ -88,7 +88,7 @@ def search(
     start: Candidate,
     confidence: float,
     max_samples: int,
-    random: Array,
+    random: Random,
 ) -> Candidate:
     """The best optimised hypothesis of up to ``max_samples`` minimal samples.
 
@@ -144,7 +144,7 @@ def _inliers(observations: Observations, candidate: Candidate, scale: float) -> 
 
 
 def _missed(
-    inliers: BoolArray, pools: Sequence[Pool], drawn: Array, size: int
+    inliers: BoolArray, pools: Sequence[Pool], drawn: IntArray, size: int
 ) -> float:
     """Chance that none of the samples drawn from the pools held inliers alone."""
     missed = 1.0

@@ -6,15 +6,29 @@ axes, moves by ``rho`` along them, and the two velocities change additively.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.residuals import PARAMETERS, STATE_SIZE, normal_equations
 from rs_localizer.core.so3 import Array, exp
+from rs_localizer.core.types import BoolArray
 
 # A step that gains less than this part of the noise variance changes nothing.
 _CONVERGED = 1e-6
 _MOST_DAMPING = 1e8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """The refined motion of one frame and what the points say of it."""
+
+    state: Array  # (18,)
+    covariance: Array  # (12,12)
+    smallest_eigenvalue: float  # of the information scaled to a unit diagonal
+    inliers: BoolArray  # (n,)
+    squared_errors: Array  # (n,) px^2
 
 
 @kernel
@@ -146,3 +160,21 @@ def refine(
         if damping > _MOST_DAMPING:
             break
     return state, information, cost, converged
+
+
+def invert_information(information: Array) -> tuple[Array, float]:
+    """Inverse of an information matrix and the smallest eigenvalue of its scaled form.
+
+    The scaled form has a unit diagonal, so that units do not matter; where it is singular, or not
+    finite, the inverse is NaN.
+    """
+    diagonal = np.diag(information)
+    if not np.all(np.isfinite(information)) or not np.all(diagonal > 0.0):
+        return np.full(information.shape, np.nan), 0.0
+    scale = 1.0 / np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    smallest = float(values[0])
+    if not smallest > 0.0:
+        return np.full(information.shape, np.nan), smallest
+    half = scale[:, None] * vectors / np.sqrt(values)
+    return half @ half.T, smallest

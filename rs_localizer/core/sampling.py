@@ -12,6 +12,13 @@ from rs_localizer.core.jit import kernel
 from rs_localizer.core.so3 import Array
 
 IntArray = NDArray[np.int64]
+Random = NDArray[np.uint64]  # (1,), the state of the generator
+
+
+def generator(seed: int) -> Random:
+    """A random generator that kernels can draw from."""
+    return np.array([seed], dtype=np.uint64)
+
 
 # A sample whose rows lie closer together than this part of all rows hardly sees the motion.
 _LEAST_ROW_SPREAD = 0.25

@@ -17,12 +17,13 @@ from typing import Any, Union
 
 from llvmlite import ir
 from numba import types
-from numba.core.cgutils import get_or_insert_function
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 LANES = 8  # one AVX-512 register of doubles; narrower machines split it
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+_get_or_insert_function: Any = cgutils.get_or_insert_function
 _FLAGS = ("contract", "nsz", "arcp")  # a*b + c may fuse; NaN and infinity keep their meaning
 
 Number = Union["Lanes", float]
@@ -89,7 +90,7 @@ class Lanes:
         return Mask(self.builder, value)
 
     def _call(self, name: str) -> Lanes:
-        function = get_or_insert_function(
+        function = _get_or_insert_function(
             self.builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), f"{name}.v{LANES}f64"
         )
         return Lanes(self.builder, self.builder.call(function, [self.value]))
@@ -162,11 +163,11 @@ def traced(body: Callable[[list[Lanes]], Sequence[Number]], *inputs: int) -> Any
         return context.get_dummy_value()
 
     # Numba reads the number of arguments off the function that it is given.
-    @intrinsic  # type: ignore[untyped-decorator]  # numba has no types
+    @intrinsic
     def one_source(typingctx: Any, source: Any, target: Any) -> Any:
         return types.void(source, target), compile_call
 
-    @intrinsic  # type: ignore[untyped-decorator]
+    @intrinsic
     def two_sources(typingctx: Any, source: Any, uniform: Any, target: Any) -> Any:
         return types.void(source, uniform, target), compile_call
 

@@ -79,7 +79,8 @@ def quaternion(matrix: Array) -> Array:
     norm = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if q[3] < 0.0:
         norm = -norm
-    return q / norm
+    unit: Array = q / norm
+    return unit
 
 
 @kernel
@@ -90,7 +91,8 @@ def log(matrix: Array) -> Array:
     sine = np.sqrt(sine_squared)
     # Series of 2 atan2(s, w)/s: the direct form is 0/0 at the identity.
     scale = 2.0 + sine_squared / 3.0 if sine < 1e-5 else 2.0 * np.arctan2(sine, q[3]) / sine
-    return scale * q[:3]
+    vector: Array = scale * q[:3]
+    return vector
 
 
 def hat(vector: Array) -> Array:

@@ -30,12 +30,14 @@ _INPUTS = inputs(SAMPLE_SIZE)
 _CUBIC_STEPS = 9
 _DEPTH_STEPS = 2
 
-Symmetric = tuple[Any, Any, Any, Any, Any, Any]  # 00, 01, 02, 11, 12, 22
+Symmetric = tuple[Any, ...]  # 00, 01, 02, 11, 12, 22
 
 
 def _adjugate(m: Symmetric) -> Symmetric:
     a, b, c, d, e, f = m
-    return (d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b)
+    return (
+        d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b,
+    )  # fmt: skip
 
 
 def _trace_product(m: Symmetric, n: Symmetric) -> Any:
@@ -168,7 +170,7 @@ def _solve(values: list[Lanes]) -> Vector:
         _trace_product(adjugate1, d2) * leading,
         determinant(d1, adjugate1) * leading,
     )
-    conic: Symmetric = tuple(x + gamma * y for x, y in zip(d1, d2, strict=True))  # type: ignore[assignment]
+    conic = tuple(x + gamma * y for x, y in zip(d1, d2, strict=True))
     models: Vector = []
     for line in _lines(conic):
         # On the line lambda_1 = w0 lambda_2 + w1 lambda_3; with k = lambda_3 / lambda_2 the conic
