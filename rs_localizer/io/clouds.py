@@ -63,8 +63,9 @@ def read_correspondences(message: Any) -> Correspondences:
     table = _view(message)
     names = [name for name in (*_REQUIRED, "score") if name in (table.dtype.names or ())]
     values = np.empty((len(names), len(table)))
-    for row, name in zip(values, names, strict=True):
-        row[:] = table[name]
+    with np.errstate(invalid="ignore"):  # a signaling NaN warns when it is converted
+        for row, name in zip(values, names, strict=True):
+            row[:] = table[name]
     finite = np.isfinite(values).all(axis=0)
     dropped = len(table) - int(np.count_nonzero(finite))
     if dropped:

@@ -113,6 +113,13 @@ def test_rows_that_are_not_finite_are_dropped_and_counted(
     assert len(read.scores) == len(read.table) == 10
 
 
+def test_a_signaling_nan_is_dropped_silently(cloud: SimpleNamespace) -> None:
+    data = cloud.data.copy()
+    data[20:24] = np.array([0x7F800001], "<u4").view(np.uint8)
+    cloud.data = data
+    assert read_correspondences(cloud).dropped == 1
+
+
 def change_field(which: str, **values: Any) -> Callable[[Any], None]:
     def change(message: Any) -> None:
         for field in message.fields:

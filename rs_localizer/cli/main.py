@@ -1,0 +1,112 @@
+"""``rs_localizer COMMAND``: finds the command, turns its faults into one line and an exit code.
+
+Exit codes: 0 done, 1 the work failed, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import rs_localizer
+from rs_localizer.cli import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command: what it does, and a line that a user can try.
+
+    Its module, imported only when it is chosen, offers ``add_arguments(parser)`` and
+    ``run(arguments)``.
+    """
+
+    module: str
+    summary: str
+    example: str
+
+
+COMMANDS = {
+    "demo": Command(
+        "rs_localizer.cli.demo",
+        "play the bundled recordings through the real node; ends with a table and pictures",
+        "rs_localizer demo --out out",
+    ),
+    "replay": Command(
+        "rs_localizer.cli.replay",
+        "a recording in; poses and twists out, as text files and as a bag",
+        "rs_localizer replay flight -p readout_time:=0.03 --out flight_poses",
+    ),
+    "simulate": Command(
+        "rs_localizer.cli.simulate",
+        "write a recording with ground truth: a scene, a motion, a rolling-shutter camera",
+        "rs_localizer simulate flight --trajectory poses.txt --duration 30 --noise 1",
+    ),
+    "evaluate": Command(
+        "rs_localizer.cli.evaluate",
+        "errors of estimated poses and twists against the truth, as tables and plots",
+        "rs_localizer evaluate flight_poses flight",
+    ),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code. ``argv`` defaults to the process's arguments."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        name = _parser().parse_args(words[:1]).command
+        command = COMMANDS[name]
+        module = importlib.import_module(command.module)
+        parser = argparse.ArgumentParser(
+            prog=f"rs_localizer {name}",
+            description=_sentence(command.summary),
+            epilog=f"example:\n  {command.example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        module.add_arguments(parser)
+        arguments = parser.parse_args(words[1:])
+    except SystemExit as end:  # argparse has said all there is to say
+        return int(end.code or 0)
+    try:
+        module.run(arguments)
+    except UsageError as error:
+        return _fail(name, str(error), 2)
+    except (ValueError, OSError) as error:
+        return _fail(name, str(error), 1)
+    except KeyboardInterrupt:
+        return _fail(name, "interrupted", 1)
+    return 0
+
+
+def _fail(name: str, text: str, code: int) -> int:
+    print(f"rs_localizer {name}: {' '.join(text.split())}", file=sys.stderr)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    width = max(map(len, COMMANDS))
+    lines = [
+        f"  {name:{width}}  {command.summary}\n  {'':{width}}  $ {command.example}"
+        for name, command in COMMANDS.items()
+    ]
+    parser = argparse.ArgumentParser(
+        prog="rs_localizer",
+        description="Position, orientation and velocity of a rolling-shutter camera.",
+        epilog="\n".join(["commands:", *lines, "", "rs_localizer COMMAND --help says more."]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"rs_localizer {rs_localizer.__version__}"
+    )
+    parser.add_argument(
+        "command", metavar="COMMAND", choices=COMMANDS, help=f"one of {', '.join(COMMANDS)}"
+    )
+    return parser
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."

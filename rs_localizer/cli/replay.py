@@ -1,0 +1,205 @@
+"""``rs_localizer replay``: a recording -> poses and twists, offline or through the graph."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import shutil
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.cli import UsageError
+from rs_localizer.core import so3
+from rs_localizer.frames import FrameLocalizer
+from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, open_bag
+from rs_localizer.io.outputs import Frame, messages
+from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
+from rs_localizer.replay import Topics, find_topics, replay
+from rs_localizer.settings import NODE_NAME, build, load_params_file, parse_assignment
+
+# What replay writes into its output directory.
+POSES, TWISTS, RESULT = "poses.txt", "twists.txt", "result"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "bag", type=Path, metavar="BAG", help="rosbag2 (MCAP, sqlite3) or ROS 1 bag"
+    )
+    topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
+    topics.add_argument("--correspondences", metavar="TOPIC")
+    topics.add_argument("--camera-info", metavar="TOPIC")
+    offline = parser.add_argument_group("offline (default): at full speed, no ROS needed")
+    offline.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help=f"directory to create, for {POSES} (TUM), {TWISTS} and the bag {RESULT} "
+        "(default: BAG_replay)",
+    )
+    offline.add_argument("--overwrite", action="store_true", help="replace an earlier result")
+    offline.add_argument(
+        "--params", type=Path, metavar="FILE", help="settings: a ROS 2 params file"
+    )
+    offline.add_argument(
+        "-p",
+        dest="assignments",
+        action="append",
+        default=[],
+        metavar="NAME:=VALUE",
+        help="one setting, as after --ros-args; may be repeated",
+    )
+    offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
+    graph = parser.add_argument_group("through the ROS graph")
+    graph.add_argument(
+        "--ros", action="store_true", help="publish the recording, with /clock, for a live node"
+    )
+    graph.add_argument(
+        "--rate", type=float, metavar="R", help="times real time, with --ros (default: 1)"
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    _check_usage(args)
+    if args.ros:
+        with open_bag(args.bag) as bag:
+            _play(bag, find_topics(bag, args.correspondences, args.camera_info), args.rate or 1.0)
+        return
+    localizer = _localizer(args.params, args.assignments)
+    with open_bag(args.bag) as bag:
+        topics = find_topics(bag, args.correspondences, args.camera_info)
+        out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
+        _prepare(out, args.overwrite)
+        _replay(bag, topics, localizer, out, args.storage)
+
+
+def _check_usage(args: argparse.Namespace) -> None:
+    if not args.ros:
+        if args.rate is not None:
+            raise UsageError("--rate goes with --ros; offline replay runs at full speed")
+        return
+    given = (args.out, args.params, args.assignments, args.overwrite)
+    if any(given):
+        raise UsageError(
+            "--out, --overwrite, --params and -p are for offline replay; with --ros the running "
+            "node has the settings and publishes the result"
+        )
+    if args.rate is not None and not 0.0 < args.rate < float("inf"):
+        raise UsageError(f"--rate must be positive, got {args.rate}")
+
+
+def _localizer(params: Path | None, assignments: list[str]) -> FrameLocalizer:
+    values = {} if params is None else load_params_file(params)
+    try:
+        localizer = FrameLocalizer(build(values))
+    except ValueError as error:
+        raise ValueError(f"{params}: {error}") from error
+    try:
+        localizer.config = build(values | dict(map(parse_assignment, assignments)))
+    except ValueError as error:
+        raise UsageError(f"-p: {error}") from error
+    return localizer
+
+
+def _prepare(out: Path, overwrite: bool) -> None:
+    if out.exists() and not overwrite:
+        raise ValueError(f"{out} exists; choose another --out, or --overwrite")
+    out.mkdir(parents=True, exist_ok=True)
+    for name in (POSES, TWISTS):
+        (out / name).unlink(missing_ok=True)
+    if (out / RESULT / "metadata.yaml").exists():  # nothing but a recording is removed
+        shutil.rmtree(out / RESULT)
+
+
+def _replay(
+    bag: BagReader, topics: Topics, localizer: FrameLocalizer, out: Path, storage: str
+) -> None:
+    localizer.warm_up()
+    frames: list[Frame] = []
+    refused: Counter[str] = Counter()
+    total = bag.count([topics.correspondences])
+    start = time.perf_counter()
+    # The bar is for a person who waits: none in a log file.
+    with (
+        BagWriter(out / RESULT, storage) as writer,
+        tqdm(total=total, unit="frame", desc="replay", disable=None) as bar,
+    ):
+        for recorded_ns, result in replay(bag, topics, localizer):
+            if result:
+                frames.append(result)
+                for name, message in messages(result, writer.make).items():
+                    writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
+            else:
+                refused[result.reason] += 1
+            bar.update(1 if result or result.reason != "bad_camera_info" else 0)
+    seconds = time.perf_counter() - start
+    repeated = _write_texts(out, frames)
+    _print_summary(total, frames, refused, repeated, seconds)
+    print(f"written to {out}: {POSES}, {TWISTS}, {RESULT}")
+    if not frames:
+        raise ValueError(f"no frame of {bag.path} was localized")
+
+
+def _write_texts(out: Path, frames: list[Frame]) -> int:
+    """Write poses and twists in the order of their stamps; how many stamps came repeatedly."""
+    stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+    first = np.unique(stamps, return_index=True)[1]
+    once = [frames[i] for i in first]
+    write_tum(
+        out / POSES,
+        Trajectory(
+            stamps_ns=stamps[first],
+            positions=np.array([f.pose.position for f in once]).reshape(-1, 3),
+            quaternions=np.array([_quaternion(f) for f in once]).reshape(-1, 4),
+        ),
+    )
+    moving = [(f.stamp_ns, f.twist) for f in once if f.twist is not None]
+    write_twists(
+        out / TWISTS,
+        Twists(
+            stamps_ns=np.array([stamp for stamp, _ in moving], dtype=np.int64),
+            angular=np.array([twist.angular for _, twist in moving]).reshape(-1, 3),
+            linear=np.array([twist.linear for _, twist in moving]).reshape(-1, 3),
+        ),
+    )
+    return len(frames) - len(once)
+
+
+def _quaternion(frame: Frame) -> so3.Array:
+    return so3.quaternion(np.ascontiguousarray(frame.pose.rotation))
+
+
+def _print_summary(
+    total: int, frames: list[Frame], refused: Counter[str], repeated: int, seconds: float
+) -> None:
+    rows = [("frames", total), ("localized", len(frames))]
+    rows += [(f"  refused: {reason}", count) for reason, count in refused.most_common()]
+    dropped = sum(frame.dropped for frame in frames)
+    rows += [("rows dropped (not finite)", dropped)] if dropped else []
+    rows += [("stamps repeated, not in the text files", repeated)] if repeated else []
+    for name, count in rows:
+        print(f"{name:40} {count:8}")
+    print(f"{'frames per second':40} {total / seconds:8.0f}")
+    if frames and not any(frame.twist for frame in frames):
+        print("no twists: the readout time is not given, or the solver estimates none")
+
+
+def _play(bag: BagReader, topics: Topics, rate: float) -> None:
+    try:  # by name: whoever has no ROS replays offline
+        play = importlib.import_module("rs_localizer.ros.player").play
+    except ImportError as error:
+        raise ValueError(
+            f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
+            "(README.md)"
+        ) from error
+    names = (topics.camera_info, topics.correspondences)
+    play(
+        tqdm(
+            bag.messages(names), total=bag.count(names), unit="message", desc="play", disable=None
+        ),
+        {name: bag.topics[name] for name in names},
+        rate,
+    )

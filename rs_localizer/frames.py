@@ -1,0 +1,133 @@
+"""A frame from message to pose: what the live node and the offline replay share.
+
+Both feed their messages to a :class:`FrameLocalizer` and publish what
+:func:`rs_localizer.io.outputs.messages` makes of the result, so that both say the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from rs_localizer.config import NodeConfig, PoseTime
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.types import Estimate
+from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.io.clouds import (
+    Correspondences,
+    EmptyCloudError,
+    read_correspondences,
+    select_inliers,
+)
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Frame
+from rs_localizer.localizer import Localizer
+from rs_localizer.moments import pose_at, twist_at
+from rs_localizer.solvers import find_solver
+
+# Stands in until the first CameraInfo: kernels are compiled and settings checked before it comes.
+_ANY_CALIBRATION = Calibration(
+    "camera", 640, 480, (500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0), (), "plumb_bob",
+    (1, 1), None,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A frame without a pose; false in a condition.
+
+    Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud`` and
+    ``bad_cloud`` (a message that cannot be read).
+    """
+
+    reason: str
+    detail: str  # one sentence that says what was found
+
+    def __bool__(self) -> Literal[False]:
+        return False
+
+
+class FrameLocalizer:
+    """Localizes correspondence messages with the latest camera and the latest settings.
+
+    Args:
+        config: settings; assigning :attr:`config` changes them from the next frame on.
+
+    Raises:
+        ValueError: for settings that the localizer refuses.
+    """
+
+    def __init__(self, config: NodeConfig) -> None:
+        self._calibration: Calibration | None = None
+        self._config = config
+        self._camera, self._localizer = _build(_ANY_CALIBRATION, config)
+
+    @property
+    def config(self) -> NodeConfig:
+        return self._config
+
+    @config.setter
+    def config(self, config: NodeConfig) -> None:
+        # Nothing changes if this raises: camera, localizer and settings always belong together.
+        self._camera, self._localizer = _build(self._calibration or _ANY_CALIBRATION, config)
+        self._config = config
+
+    def warm_up(self) -> None:
+        """Compile all that the present settings need."""
+        self._localizer.warm_up()
+
+    def take_camera_info(self, message: Any) -> None:
+        """Use this sensor_msgs/CameraInfo from the next frame on.
+
+        Raises:
+            MessageError: for one that cannot be used, saying what was found; the previous stays.
+        """
+        calibration = read_camera_info(message)
+        if calibration != self._calibration:  # drivers repeat it with every image
+            self._camera, self._localizer = _build(calibration, self._config)
+            self._calibration = calibration
+
+    def localize(self, message: Any) -> Frame | Refusal:
+        """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
+        try:
+            cloud = read_correspondences(message)
+        except EmptyCloudError as error:
+            return Refusal("empty_cloud", str(error))
+        except MessageError as error:
+            return Refusal("bad_cloud", str(error))
+        if self._calibration is None:
+            return Refusal("no_camera_info", "no usable camera_info has come yet")
+        result = self._localizer.localize(cloud.points, cloud.pixels, cloud.scores)
+        if not result:
+            return Refusal(str(result.reason), result.detail)
+        return self._frame(cloud, result, self._calibration.frame)
+
+    def _frame(self, cloud: Correspondences, estimate: Estimate, body_frame: str) -> Frame:
+        readout_time = self._config.readout_time
+        first_row_time = self._camera.first_row_time
+        stamp_ns = cloud.stamp_ns
+        if self._config.pose_time == PoseTime.MID_FRAME:
+            tau = 0.0
+            delay = self._config.stamp_offset - readout_time * first_row_time
+            stamp_ns += round(delay * 1e9)
+        else:
+            tau = first_row_time
+            if readout_time > 0.0:
+                tau -= self._config.stamp_offset / readout_time
+        moving = readout_time > 0.0 and find_solver(self._config.solver).rolling_shutter
+        return Frame(
+            input_stamp_ns=cloud.stamp_ns,
+            stamp_ns=stamp_ns,
+            map_frame=cloud.frame,
+            body_frame=body_frame,
+            pose=pose_at(estimate, tau),
+            twist=twist_at(estimate, tau, readout_time) if moving else None,
+            inliers=select_inliers(cloud.table, estimate.inliers, estimate.residuals),
+            dropped=cloud.dropped,
+            estimate=estimate,
+        )
+
+
+def _build(calibration: Calibration, config: NodeConfig) -> tuple[Camera, Localizer]:
+    camera = calibration.camera(config.readout_time, config.scan_direction)
+    return camera, Localizer(camera, config)

@@ -1,0 +1,88 @@
+"""Offline replay: the frames of a recording, one after the other, through the node's own code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from rs_localizer.frames import FrameLocalizer, Refusal
+from rs_localizer.io.bags import BagError, BagReader
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Frame
+
+_INPUTS = {
+    "correspondences": "sensor_msgs/msg/PointCloud2",
+    "camera_info": "sensor_msgs/msg/CameraInfo",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """Where a recording has the inputs of the node."""
+
+    correspondences: str
+    camera_info: str
+
+
+def find_topics(
+    bag: BagReader, correspondences: str | None = None, camera_info: str | None = None
+) -> Topics:
+    """The topics of the inputs, given or found.
+
+    Found are those that end in the node's own names, else the only one of the type.
+
+    Raises:
+        BagError: when a given topic is not there, or none or several could be meant.
+    """
+    return Topics(
+        _find(bag, "correspondences", correspondences), _find(bag, "camera_info", camera_info)
+    )
+
+
+def _find(bag: BagReader, name: str, given: str | None) -> str:
+    type_name = _INPUTS[name]
+    of_type = sorted(topic for topic, kind in bag.topics.items() if kind == type_name)
+    if given is not None:
+        if given in of_type:
+            return given
+        found = f"is of type {bag.topics[given]}" if given in bag.topics else "does not exist"
+        raise BagError(
+            f"{bag.path}: topic {given} {found}; topics of type {type_name}: {_list(of_type)}"
+        )
+    for candidates in ([t for t in of_type if t.rsplit("/", 1)[-1] == name], of_type):
+        if len(candidates) == 1:
+            return candidates[0]
+        if candidates:
+            raise BagError(
+                f"{bag.path}: several topics may be the {name}: {_list(candidates)}; "
+                f"choose one with --{name.replace('_', '-')}"
+            )
+    raise BagError(
+        f"{bag.path} has no topic of type {type_name} for the {name}; it has "
+        f"{_describe(bag.topics)}"
+    )
+
+
+def replay(
+    bag: BagReader, topics: Topics, localizer: FrameLocalizer
+) -> Iterator[tuple[int, Frame | Refusal]]:
+    """Time of recording (ns) and result of every cloud, as the node would have answered.
+
+    A CameraInfo that cannot be used gives a Refusal ``bad_camera_info`` of its own.
+    """
+    for topic, recorded_ns, message in bag.messages((topics.camera_info, topics.correspondences)):
+        if topic == topics.correspondences:
+            yield recorded_ns, localizer.localize(message)
+            continue
+        try:
+            localizer.take_camera_info(message)
+        except MessageError as error:
+            yield recorded_ns, Refusal("bad_camera_info", str(error))
+
+
+def _list(topics: list[str]) -> str:
+    return ", ".join(topics) or "none"
+
+
+def _describe(topics: Mapping[str, str]) -> str:
+    return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))

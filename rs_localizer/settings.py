@@ -1,0 +1,147 @@
+"""The settings of :mod:`rs_localizer.config` by their dotted names, as ROS parameters have them.
+
+The node declares them, and a params file or ``-p name:=value`` of a command sets them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rs_localizer.config import NodeConfig
+
+NODE_NAME = "rs_localizer"
+# Parameters that every ROS 2 node may have; they say nothing about poses.
+_FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")
+
+
+class SettingsError(ValueError):
+    """A params file or an assignment that cannot be used; the text says what was found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting: its default and what users are told of it."""
+
+    default: Any
+    description: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple[str, ...]
+    read_only: bool
+
+
+@lru_cache(maxsize=1)
+def settings() -> dict[str, Setting]:
+    """All settings of the node, by dotted name."""
+    return dict(_walk(NodeConfig(), ""))
+
+
+def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if is_dataclass(value):
+            yield from _walk(value, f"{prefix}{item.name}.")
+        else:
+            yield prefix + item.name, Setting(default=value, **item.metadata)
+
+
+def build(values: Mapping[str, Any]) -> NodeConfig:
+    """Settings from values by dotted name; what is missing has its default.
+
+    Raises:
+        ValueError: for a wrong value.
+    """
+    config: NodeConfig = _build(NodeConfig(), values, "")
+    return config
+
+
+def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    chosen = {}
+    for item in fields(config):
+        default = getattr(config, item.name)
+        if is_dataclass(default):
+            chosen[item.name] = _build(default, values, f"{prefix}{item.name}.")
+        else:
+            chosen[item.name] = values.get(prefix + item.name, default)
+    return type(config)(**chosen)
+
+
+def load_params_file(path: Path) -> dict[str, Any]:
+    """Values by dotted name of a ROS 2 params file, as far as it is meant for the node.
+
+    Raises:
+        SettingsError: for a file that cannot be read, a name that is no setting, or a file
+            without parameters for the node.
+    """
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(f"{path} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
+    values: dict[str, Any] = {}
+    blocks = list(_blocks(tree, ""))
+    for name, parameters in blocks:
+        if not isinstance(parameters, dict):
+            raise SettingsError(f"{path}: ros__parameters of {name} must be a mapping")
+        values.update(_flatten(parameters, ""))
+    if not blocks:
+        raise SettingsError(f"{path} has no ros__parameters for /{NODE_NAME} (or /**)")
+    return {name: _checked(name, value, str(path)) for name, value in values.items()}
+
+
+def parse_assignment(text: str) -> tuple[str, Any]:
+    """Name and value of ``name:=value``, the value read as YAML as in ROS 2.
+
+    Raises:
+        SettingsError: for another form or a name that is no setting.
+    """
+    name, separator, value = text.partition(":=")
+    if not separator or not name:
+        raise SettingsError(f"expected name:=value, got {text!r}")
+    try:
+        return name, _checked(name, yaml.safe_load(value), text)
+    except yaml.YAMLError as error:
+        raise SettingsError(f"the value of {text!r} cannot be read") from error
+
+
+def _blocks(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Blocks ``ros__parameters`` whose node name, given as a path or nested, is ours."""
+    if not isinstance(tree, dict):
+        return
+    for key, value in tree.items():
+        if key == "ros__parameters":
+            if path.rsplit("/", 1)[-1] in (NODE_NAME, "*", "**"):
+                yield path, value
+        else:
+            yield from _blocks(value, f"{path}/{str(key).strip('/')}")
+
+
+def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in parameters.items():
+        name = f"{prefix}{key}"
+        if name.split(".")[0] in _FOREIGN:
+            continue
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def _checked(name: str, value: Any, where: str) -> Any:
+    if name not in settings():
+        raise SettingsError(
+            f"{where}: {name!r} is no setting; there are {', '.join(settings())}"
+        )
+    if isinstance(value, str) and isinstance(settings()[name].default, float):
+        # ROS reads 1e-3 as a number, PyYAML as text.
+        with contextlib.suppress(ValueError):
+            return float(value)
+    return value

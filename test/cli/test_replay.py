@@ -1,0 +1,399 @@
+"""``rs_localizer replay``: three kinds of recordings in, poses and twists out, faults in a line."""
+
+from __future__ import annotations
+
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_typestore
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
+from rs_localizer.io.outputs import TYPES
+from rs_localizer.io.trajectories import read_tum, read_twists
+from rs_localizer.lab.recording import write_simulated
+from rs_localizer.lab.scene import room
+from rs_localizer.lab.simulation import FrameSettings, simulate_frames
+from rs_localizer.lab.true_motion import ConstantVelocity
+
+READOUT_TIME = 0.03
+FRAMES = 6
+# Nanoseconds since 1970 that a float of seconds cannot hold.
+START = 1_732_204_800_123_456_789
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+SHUTTER = ["-p", f"readout_time:={READOUT_TIME}"]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated flight with /truth beside the inputs."""
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
+    motion = ConstantVelocity(
+        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.3, start_ns=START
+    )
+    world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
+    settings = FrameSettings(points=100, noise=0.5, outliers=0.2)
+    with BagWriter(path) as bag:
+        for frame in list(simulate_frames(camera, motion, world, settings))[:FRAMES]:
+            write_simulated(bag, camera, frame)
+    return path
+
+
+def messages(path: Path) -> list[tuple[str, int, Any]]:
+    with open_bag(path) as bag:
+        return list(bag.messages(tuple(bag.topics)))
+
+
+def rewrite(source: Path, target: Path, change: Any, storage: str = "mcap") -> Path:
+    """A copy of a recording; ``change(topic, message)`` gives the topic, or None to leave out."""
+    with BagWriter(target, storage) as bag:
+        for topic, stamp_ns, message in messages(source):
+            new_topic = change(topic, message)
+            if new_topic is not None:
+                bag.write(new_topic, message, stamp_ns)
+    return target
+
+
+def test_what_comes_out(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "out"
+    assert main(["replay", str(recording), "--out", str(out), *SHUTTER]) == 0
+    captured = capsys.readouterr()
+    words = {line.rsplit(None, 1)[0]: line.split()[-1] for line in captured.out.splitlines()}
+    assert words["frames"] == words["localized"] == str(FRAMES)
+    assert captured.err == ""  # no progress bar where nobody watches
+
+    truth = {
+        topic: [message for name, _, message in messages(recording) if name == topic]
+        for topic in ("/truth/pose", "/truth/twist")
+    }
+    poses, twists = read_tum(out / "poses.txt"), read_twists(out / "twists.txt")
+    assert len(poses) == len(twists) == FRAMES
+    # The truth comes in pairs: at the stamp and at the middle row.
+    for i, pose in enumerate(truth["/truth/pose"][::2]):
+        stamp = pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec
+        assert poses.stamps_ns[i] == twists.stamps_ns[i] == stamp
+        position = pose.pose.position
+        error = poses.positions[i] - (position.x, position.y, position.z)
+        assert np.linalg.norm(error) < 0.05
+    for i, twist in enumerate(truth["/truth/twist"][::2]):
+        angular = twist.twist.angular
+        error = twists.angular[i] - (angular.x, angular.y, angular.z)
+        assert np.linalg.norm(error) < 0.3
+    with open_bag(out / "result") as bag:
+        assert bag.topics == {f"/rs_localizer/{name}": kind for name, kind in TYPES.items()}
+        for topic in bag.topics:
+            assert bag.count([topic]) == FRAMES
+        recorded = [stamp for _, stamp, _ in bag.messages(["/rs_localizer/pose"])]
+    assert recorded == [s for t, s, _ in messages(recording) if t == "/correspondences"]
+    text = (out / "poses.txt").read_text()
+    assert text.startswith("# t x y z qx qy qz qw\n1732204800.")
+
+
+def test_the_same_again_is_the_same(recording: Path, tmp_path: Path) -> None:
+    outs = [tmp_path / "a", tmp_path / "b"]
+    for out in outs:
+        assert main(["replay", str(recording), "--out", str(out), *SHUTTER]) == 0
+    for name in ("poses.txt", "twists.txt"):
+        assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
+
+
+def write_ros1(source: Path, target: Path) -> Path:
+    """The inputs of a recording as a ROS 1 bag, with its capitals and sequence numbers."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+
+    def old(message: Any) -> Any:
+        if not hasattr(message, "__msgtype__"):
+            return [old(item) for item in message] if isinstance(message, list) else message
+        names = {"d": "D", "k": "K", "r": "R", "p": "P"}
+        is_info = message.__msgtype__ == "sensor_msgs/msg/CameraInfo"
+        fields = {
+            (names.get(name, name) if is_info else name): old(getattr(message, name))
+            for name in message.__dataclass_fields__
+            if name != "__msgtype__" and not name.isupper()
+        }
+        if message.__msgtype__ == "std_msgs/msg/Header":
+            fields["seq"] = 0
+        return store.types[message.__msgtype__](**fields)
+
+    with Ros1Writer(target) as bag:
+        connections = {}
+        for topic, stamp_ns, message in messages(source):
+            if topic.startswith("/truth"):
+                continue
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = bag.add_connection(topic, kind, typestore=store)
+            bag.write(connections[topic], stamp_ns, store.serialize_ros1(old(message), kind))
+    return target
+
+
+def test_every_kind_of_recording_gives_the_same(recording: Path, tmp_path: Path) -> None:
+    bags = [
+        recording,
+        next(recording.glob("*.mcap")),
+        rewrite(recording, tmp_path / "sqlite", lambda topic, message: topic, "sqlite3"),
+        write_ros1(recording, tmp_path / "old.bag"),
+    ]
+    texts = []
+    for i, bag in enumerate(bags):
+        out = tmp_path / f"out{i}"
+        storage = list(STORAGES)[i % 2]
+        arguments = ["--out", str(out), "--storage", storage, *SHUTTER]
+        assert main(["replay", str(bag), *arguments]) == 0
+        texts.append([(out / name).read_text() for name in ("poses.txt", "twists.txt")])
+    assert texts.count(texts[0]) == len(bags)
+
+
+def test_settings_of_a_file_and_of_the_command_line(recording: Path, tmp_path: Path) -> None:
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        f"/**:\n  ros__parameters: {{readout_time: {READOUT_TIME}, pose_time: mid_frame}}\n"
+    )
+    out = tmp_path / "out"
+    arguments = ["replay", str(recording), "--params", str(file), "--out", str(out)]
+    assert main(arguments) == 0
+    middle = read_tum(out / "poses.txt").stamps_ns
+    assert main([*arguments, "--overwrite", "-p", "pose_time:=stamp"]) == 0
+    first = read_tum(out / "poses.txt").stamps_ns
+    assert (middle - first).tolist() == [15_000_000] * FRAMES
+
+
+def test_frames_before_the_first_camera_info_are_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    infos: list[int] = []
+
+    def late(topic: str, message: Any) -> str | None:
+        if topic != "/camera_info":
+            return topic
+        infos.append(1)
+        if len(infos) == 2:
+            message.k = np.zeros(9)
+        return topic if len(infos) > 1 else None
+
+    bag = rewrite(recording, tmp_path / "late", late)
+    assert main(["replay", str(bag), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
+    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines()[:5])
+    assert rows["frames"] == str(FRAMES)
+    assert rows["localized"] == str(FRAMES - 2)
+    assert rows["  refused: no_camera_info"] == "2"
+    assert rows["  refused: bad_camera_info"] == "1"
+
+
+def test_no_frame_localized_is_a_failure(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def empty(topic: str, message: Any) -> str:
+        if topic == "/correspondences":
+            message.width, message.row_step, message.data = 0, 0, np.zeros(0, np.uint8)
+        return topic
+
+    bag = rewrite(recording, tmp_path / "empty", empty)
+    assert main(["replay", str(bag), "--out", str(tmp_path / "out")]) == 1
+    captured = capsys.readouterr()
+    assert f"no frame of {bag} was localized" in captured.err
+    assert "refused: empty_cloud" in captured.out
+
+
+def test_repeated_stamps_come_once(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def loop(topic: str, message: Any) -> str:
+        message.header.stamp.sec = 5
+        message.header.stamp.nanosec = message.header.stamp.nanosec // 10**8 * 10**8
+        return topic
+
+    bag = rewrite(recording, tmp_path / "loop", loop)
+    out = tmp_path / "out"
+    assert main(["replay", str(bag), "--out", str(out), *SHUTTER]) == 0
+    poses = read_tum(out / "poses.txt")
+    assert 0 < len(poses) < FRAMES
+    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines()[:3])
+    assert rows["stamps repeated, not in the text files"] == str(FRAMES - len(poses))
+
+
+def test_without_readout_time_there_are_no_twists(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["replay", str(recording), "--out", str(out)]) == 0
+    assert "no twists: the readout time is not given" in capsys.readouterr().out
+    assert len(read_tum(out / "poses.txt")) == FRAMES
+    assert (out / "twists.txt").read_text() == "# t wx wy wz vx vy vz\n"
+    with open_bag(out / "result") as bag:
+        assert sorted(bag.topics) == [
+            f"/rs_localizer/{name}" for name in ("inliers", "pose", "pose_with_covariance")
+        ]
+
+
+def test_an_earlier_result_is_not_overwritten_unasked(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["replay", str(recording), "--out", str(out), *SHUTTER]
+    assert main(arguments) == 0
+    (out / "notes.txt").write_text("mine")
+    before = (out / "poses.txt").read_bytes()
+    assert main([*arguments, "-p", "pose_time:=mid_frame"]) == 1
+    assert f"{out} exists" in capsys.readouterr().err
+    assert (out / "poses.txt").read_bytes() == before
+    assert main([*arguments, "-p", "pose_time:=mid_frame", "--overwrite"]) == 0
+    assert (out / "poses.txt").read_bytes() != before
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_topics_are_found_or_chosen(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def attempt(name: str, change: Any, *arguments: str) -> tuple[int, str]:
+        bag = rewrite(recording, tmp_path / name, change)
+        out = tmp_path / f"{name}_out"
+        code = main(["replay", str(bag), "--out", str(out), *SHUTTER, *arguments])
+        return code, capsys.readouterr().err
+
+    def in_namespaces(topic: str, message: Any) -> str:
+        return f"/robot{topic}"
+
+    def odd(topic: str, message: Any) -> str:
+        return {"/correspondences": "/matches", "/camera_info": "/cam/info"}.get(topic, topic)
+
+    clouds: list[str] = []
+
+    def two(topic: str, message: Any) -> str:
+        if topic != "/correspondences":
+            return topic
+        clouds.append(topic)
+        return ("/left", "/right")[len(clouds) % 2] + topic
+
+    assert attempt("namespace", in_namespaces) == (0, "")
+    assert attempt("by_type", odd) == (0, "")
+    assert attempt("given", odd, "--correspondences", "/matches") == (0, "")
+    code, text = attempt("two", two)
+    assert code == 1
+    assert "several topics may be the correspondences: /left/correspondences, /right" in text
+    assert "--correspondences" in text
+    chosen = ("--correspondences", "/left/correspondences")
+    assert attempt("chosen", two, *chosen) == (0, "")
+    code, text = attempt("absent", odd, "--camera-info", "/nowhere")
+    assert code == 1
+    assert "topic /nowhere does not exist" in text
+    assert "/cam/info" in text
+    code, text = attempt("type", odd, "--camera-info", "/matches")
+    assert code == 1
+    assert "topic /matches is of type sensor_msgs/msg/PointCloud2" in text
+    code, text = attempt("none", lambda t, m: None if t == "/camera_info" else t)
+    assert code == 1
+    assert "no topic of type sensor_msgs/msg/CameraInfo" in text
+    assert "/correspondences (sensor_msgs/msg/PointCloud2)" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["-p", "solver:=p4p"], 2, "solver must be one of p3p,"),
+        (["-p", "solver:=r6p"], 2, "r6p"),
+        (["-p", "sead:=1"], 2, "'sead' is no setting"),
+        (["-p", "seed"], 2, "expected name:=value, got 'seed'"),
+        (["--params", "nowhere.yaml"], 1, "nowhere.yaml cannot be read"),
+        (["--rate", "2"], 2, "--rate goes with --ros"),
+        (["--ros", "--rate", "-1"], 2, "--rate must be positive, got -1.0"),
+        (["--ros", "-p", "seed:=1"], 2, "are for offline replay"),
+        (["--ros", "--out", "somewhere"], 2, "are for offline replay"),
+    ],
+)
+def test_wrong_settings(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    code: int,
+    text: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(recording), *words]) == code
+    error = capsys.readouterr().err
+    assert error.startswith("rs_localizer replay: ")
+    assert error.count("\n") == 1
+    assert text in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_params_file_with_a_wrong_value_is_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text("/**:\n  ros__parameters: {readout_time: 3.0}\n")
+    assert main(["replay", str(recording), "--params", str(file)]) == 1
+    assert "bad.yaml: readout_time must lie between 0.0 and 0.2" in capsys.readouterr().err
+
+
+def no_bag(directory: Path) -> Path:
+    path = directory / "letter.txt"
+    path.write_text("Dear all")
+    return path
+
+
+def text_as_bag(directory: Path) -> Path:
+    path = directory / "letter.bag"
+    path.write_text("Dear all")
+    return path
+
+
+def cut_bag(directory: Path) -> Path:
+    path = directory / "cut.db3"
+    sqlite3.connect(path).close()
+    path.write_bytes(b"SQLite format 3\x00" + bytes(50))
+    return path
+
+
+def empty_bag(directory: Path) -> Path:
+    with BagWriter(directory / "empty"):
+        pass
+    return directory / "empty"
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda directory: directory / "nowhere", "nowhere does not exist"),
+        (no_bag, "letter.txt is no recording"),
+        (text_as_bag, "letter.bag cannot be read as a recording"),
+        (cut_bag, "cut.db3 cannot be read as a recording"),
+        (empty_bag, "is an empty recording"),
+        (lambda directory: directory, "is no recording"),
+    ],
+)
+def test_recordings_that_are_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], make: Any, text: str
+) -> None:
+    path = make(tmp_path)
+    assert main(["replay", str(path), "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"rs_localizer replay: {path}")
+    assert error.count("\n") == 1
+    assert text in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_ctrl_c_ends_it_in_one_line(recording: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys, rs_localizer.cli.replay as r; from rs_localizer.cli.main import main\n"
+        "def interrupt(*_): raise KeyboardInterrupt\n"
+        "r.replay = interrupt\n"
+        f"sys.exit(main(['replay', {str(recording)!r}, '--out', {str(tmp_path / 'out')!r}]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stderr) == (1, "rs_localizer replay: interrupted\n")

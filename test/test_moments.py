@@ -1,0 +1,148 @@
+"""Pose, twist and covariances at a moment, against finite differences of the motion model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.so3 import Array
+from rs_localizer.core.types import Estimate
+from rs_localizer.moments import pose_at, twist_at
+
+READOUT_TIME = 0.03
+TAUS = [-0.5, 0.0, 0.3, -7.0]
+# Per readout: none, nearly none, fast, and around half a turn.
+RATES = [0.0, 1e-6, 0.5, 3.0]
+
+
+def estimate(rate: float, seed: int = 0) -> Estimate:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(12, 12)) * np.repeat([0.003, 0.01, 0.02, 0.05], 3)[:, None]
+    direction = rng.normal(size=3)
+    return Estimate(
+        rotation=Rotation.from_rotvec(rng.normal(size=3)).as_matrix(),
+        translation=rng.normal(size=3),
+        angular_velocity=rate * direction / np.linalg.norm(direction),
+        linear_velocity=rate * rng.normal(size=3),
+        inliers=np.ones(20, dtype=bool),
+        residuals=np.ones(20),
+        covariance=root @ root.T,
+        global_shutter_inliers=10,
+        iterations=100,
+    )
+
+
+def disturbed(motion: Motion, error: Array) -> Motion:
+    """The motion with errors in the order of ``Estimate.covariance``, by its definition."""
+    phi, rho, d_omega, d_v = error.reshape(4, 3)
+    map_from_camera = motion.rotation.T
+    centre = -map_from_camera @ motion.translation + map_from_camera @ rho
+    rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
+    return Motion(
+        rotation,
+        -rotation @ centre,
+        motion.angular_velocity + d_omega,
+        motion.linear_velocity + d_v,
+    )
+
+
+def pose(motion: Motion, tau: float) -> tuple[Array, Array]:
+    """Rotation map_from_camera and camera centre."""
+    rotation, translation = motion.at(tau)
+    return rotation.T, -rotation.T @ translation
+
+
+def pose_error(motion: Motion, tau: float, error: Array) -> Array:
+    """Displacement, and rotation about fixed map axes, that an error brings."""
+    rotation, position = pose(motion, tau)
+    turned, moved = pose(disturbed(motion, error), tau)
+    about_fixed_axes = Rotation.from_matrix(turned @ rotation.T).as_rotvec()
+    return np.concatenate([moved - position, about_fixed_axes])
+
+
+def twist(motion: Motion, tau: float) -> Array:
+    """Linear and angular velocity in body axes, by central differences of the poses."""
+    step = 1e-5
+    before, after, now = pose(motion, tau - step), pose(motion, tau + step), pose(motion, tau)
+    seconds = 2.0 * step * READOUT_TIME
+    linear = now[0].T @ (after[1] - before[1]) / seconds
+    angular = Rotation.from_matrix(before[0].T @ after[0]).as_rotvec() / seconds
+    return np.concatenate([linear, angular])
+
+
+def numerical_jacobian(function: Callable[[Array], Array], step: float) -> Array:
+    columns = [
+        (function(step * unit) - function(-step * unit)) / (2.0 * step) for unit in np.eye(12)
+    ]
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_pose(rate: float, tau: float) -> None:
+    motion = estimate(rate)
+    rotation, position = pose(motion, tau)
+    result = pose_at(motion, tau)
+    assert np.allclose(result.rotation, rotation, atol=1e-14)
+    assert np.allclose(result.position, position, atol=1e-14)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_twist_is_the_rate_of_change_of_the_pose(rate: float, tau: float) -> None:
+    motion = estimate(rate)
+    result = twist_at(motion, tau, READOUT_TIME)
+    expected = twist(motion, tau)
+    assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_pose_covariance(rate: float, tau: float) -> None:
+    motion = estimate(rate)
+    jacobian = numerical_jacobian(lambda error: pose_error(motion, tau, error), 1e-5)
+    expected = jacobian @ motion.covariance @ jacobian.T
+    assert np.allclose(pose_at(motion, tau).covariance, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_twist_covariance(rate: float, tau: float) -> None:
+    motion = estimate(rate)
+    jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-3)
+    expected = jacobian @ motion.covariance @ jacobian.T
+    found = twist_at(motion, tau, READOUT_TIME).covariance
+    assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_covariances_cover_what_is_published() -> None:
+    # No derivative at all: the scatter of poses and twists of many disturbed motions.
+    motion, tau = estimate(0.5), -0.5
+    rng = np.random.default_rng(3)
+    errors = rng.multivariate_normal(np.zeros(12), 0.01 * motion.covariance, size=4000)
+    poses = np.array([pose_error(motion, tau, error) for error in errors])
+    now = twist(motion, tau)
+    twists = np.array([twist(disturbed(motion, error), tau) - now for error in errors])
+    for scatter, covariance in (
+        (poses, 0.01 * pose_at(motion, tau).covariance),
+        (twists, 0.01 * twist_at(motion, tau, READOUT_TIME).covariance),
+    ):
+        squares = np.einsum("ni,ij,nj->n", scatter, np.linalg.inv(covariance), scatter)
+        # Chi-square of six degrees of freedom: mean 6, and 5 % beyond 12.59.
+        assert np.mean(squares) == pytest.approx(6.0, abs=0.25)
+        assert np.mean(squares > 12.59) == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+def test_covariances_are_symmetric(tau: float) -> None:
+    motion = estimate(0.5)
+    for covariance in (
+        pose_at(motion, tau).covariance,
+        twist_at(motion, tau, READOUT_TIME).covariance,
+    ):
+        assert np.array_equal(covariance, covariance.T)
+        assert np.all(np.linalg.eigvalsh(covariance) > 0.0)

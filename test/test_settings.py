@@ -1,0 +1,146 @@
+"""Settings by dotted name: the shipped params file, ROS 2 params files, assignments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rs_localizer.config import NodeConfig, VelocityPrior
+from rs_localizer.settings import (
+    SettingsError,
+    build,
+    load_params_file,
+    parse_assignment,
+    settings,
+)
+
+SHIPPED = Path(__file__).parents[1] / "config" / "rs_localizer.yaml"
+
+
+def params(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "params.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_the_shipped_file_holds_exactly_the_defaults() -> None:
+    values = load_params_file(SHIPPED)
+    assert values == {name: setting.default for name, setting in settings().items()}
+    assert [type(value) for value in values.values()] == [
+        type(settings()[name].default) for name in values
+    ]
+    assert build(values) == NodeConfig()
+
+
+def test_the_shipped_file_names_all_choices() -> None:
+    lines = [line.strip() for line in SHIPPED.read_text().splitlines()]
+    for name, setting in settings().items():
+        line = next((line for line in lines if line.startswith(f"{name}:")), "")
+        assert all(choice in line for choice in setting.choices), name
+
+
+def test_names_are_dotted_and_described() -> None:
+    assert "velocity_prior.angular" in settings()
+    for name, setting in settings().items():
+        assert setting.description, name
+        if isinstance(setting.default, (int, float)) and not isinstance(setting.default, bool):
+            assert setting.minimum <= setting.default <= setting.maximum, name
+        if setting.choices:
+            assert setting.default in setting.choices
+
+
+@pytest.mark.parametrize(
+    "heading",
+    ["/**", "rs_localizer", "/rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*"],
+)
+def test_headings_that_mean_the_node(tmp_path: Path, heading: str) -> None:
+    path = params(tmp_path, f"{heading}:\n  ros__parameters:\n    seed: 5\n")
+    assert load_params_file(path) == {"seed": 5}
+
+
+def test_nested_names_and_blocks(tmp_path: Path) -> None:
+    path = params(
+        tmp_path,
+        """
+robot:
+  rs_localizer:
+    ros__parameters:
+      velocity_prior: {angular: 0.5}
+      velocity_prior.linear: 1e-3
+other_node:
+  ros__parameters: {frequency: 3}
+/**:
+  ros__parameters:
+    use_sim_time: true
+    qos_overrides: {/camera_info: {subscription: {depth: 3}}}
+    seed: 7
+""",
+    )
+    values = load_params_file(path)
+    assert values == {
+        "velocity_prior.angular": 0.5,
+        "velocity_prior.linear": 1e-3,
+        "seed": 7,
+    }
+    assert build(values) == NodeConfig(velocity_prior=VelocityPrior(0.5, 1e-3), seed=7)
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is no setting; there are solver,"),
+        ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is no setting"),
+        ("/**:\n  ros__parameters: 5\n", "ros__parameters of /.* must be a mapping"),
+        ("other:\n  ros__parameters:\n    seed: 5\n", "has no ros__parameters for /rs_localizer"),
+        ("seed: 5\n", "has no ros__parameters"),
+        ("", "has no ros__parameters"),
+        ("a: [", "is no YAML file"),
+    ],
+)
+def test_files_that_cannot_be_used(tmp_path: Path, text: str, fault: str) -> None:
+    with pytest.raises(SettingsError, match=fault):
+        load_params_file(params(tmp_path, text))
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"none\.yaml cannot be read: No such file"):
+        load_params_file(tmp_path / "none.yaml")
+    (tmp_path / "binary").write_bytes(b"\xff\xfe\xfa")
+    with pytest.raises(SettingsError, match="is no YAML file"):
+        load_params_file(tmp_path / "binary")
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "value"),
+    [
+        ("solver:=p3p", "solver", "p3p"),
+        ("readout_time:=0.03", "readout_time", 0.03),
+        ("velocity_prior.linear:=1e-2", "velocity_prior.linear", 0.01),
+        ("seed:=3", "seed", 3),
+        ("autostart:=false", "autostart", False),
+    ],
+)
+def test_assignments(text: str, name: str, value: Any) -> None:
+    assert parse_assignment(text) == (name, value)
+
+
+@pytest.mark.parametrize("text", ["solver", "solver=p3p", ":=3", "sead:=3", "seed:=[", ""])
+def test_assignments_that_are_none(text: str) -> None:
+    with pytest.raises(SettingsError):
+        parse_assignment(text)
+
+
+@pytest.mark.parametrize(
+    ("values", "fault"),
+    [
+        ({"solver": "p4p"}, "solver must be one of p3p, .*; got 'p4p'"),
+        ({"seed": 1.5}, "seed must be of type int, got 1.5"),
+        ({"velocity_prior.linear": -1.0}, "velocity_prior.linear must lie between"),
+        ({"readout_time": "long"}, "readout_time must be of type float, got 'long'"),
+    ],
+)
+def test_wrong_values(values: dict[str, Any], fault: str) -> None:
+    with pytest.raises(ValueError, match=fault):
+        build(values)
