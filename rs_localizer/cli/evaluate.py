@@ -1,0 +1,132 @@
+"""``rs_localizer evaluate``: errors of estimated poses and twists against the truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from rs_localizer.io.estimates import Motions, read_motions
+from rs_localizer.io.trajectories import Trajectory, read_twists
+from rs_localizer.lab.metrics import (
+    Errors,
+    Summary,
+    associate,
+    pose_errors,
+    summarize,
+    twist_errors,
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    source = "TUM text, a directory of replay, or a recording"
+    parser.add_argument("estimate", type=Path, metavar="EST", help=source)
+    parser.add_argument("truth", type=Path, metavar="TRUTH", help=source)
+    parser.add_argument("--twists", type=Path, metavar="FILE", help="estimated twists as text")
+    parser.add_argument("--truth-twists", type=Path, metavar="FILE", help="true twists as text")
+    topics = parser.add_argument_group("topics of recordings (default: the only one of the type)")
+    topics.add_argument("--pose-topic", metavar="TOPIC", help="of EST")
+    topics.add_argument("--twist-topic", metavar="TOPIC", help="of EST")
+    topics.add_argument("--truth-pose-topic", metavar="TOPIC", help="of TRUTH")
+    topics.add_argument("--truth-twist-topic", metavar="TOPIC", help="of TRUTH")
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=1e-3,
+        metavar="S",
+        help="largest difference of times that are compared (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--ate", action="store_true", help="also ATE and RPE, after alignment (needs evo)"
+    )
+    parser.add_argument("--plot", type=Path, metavar="DIR", help="draw trajectories and errors")
+
+
+def run(args: argparse.Namespace) -> None:
+    estimate = _read(args.estimate, args.pose_topic, args.twist_topic, args.twists)
+    truth = _read(args.truth, args.truth_pose_topic, args.truth_twist_topic, args.truth_twists)
+    tolerance_ns = round(args.tolerance * 1e9)
+    poses = pose_errors(estimate.poses, truth.poses, tolerance_ns)
+    if len(poses.stamps_ns) == 0:
+        raise ValueError(
+            f"no pose of {args.estimate} is within {args.tolerance:g} s of one of {args.truth}: "
+            f"{_span(estimate.poses)} against {_span(truth.poses)}"
+        )
+    twists = None
+    if estimate.twists is not None and truth.twists is not None:
+        twists = twist_errors(estimate.twists, truth.twists, tolerance_ns)
+    print(f"{len(poses.stamps_ns)} of {len(estimate.poses)} poses compared\n")
+    _print_table(poses, twists)
+    if args.ate:
+        _print_ate(estimate.poses, truth.poses, tolerance_ns)
+    if args.plot is not None:
+        from rs_localizer.lab import plots
+
+        args.plot.mkdir(parents=True, exist_ok=True)
+        drawn = (
+            plots.trajectories(truth.poses, {"estimate": estimate.poses}),
+            plots.errors({"estimate": poses}, {"estimate": twists} if twists else {}),
+        )
+        for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
+            plots.save(figure, args.plot / name)
+            print(f"{args.plot / name}")
+
+
+def _read(
+    path: Path, pose_topic: str | None, twist_topic: str | None, twists: Path | None
+) -> Motions:
+    found = read_motions(path, pose_topic, twist_topic)
+    return found if twists is None else Motions(found.poses, read_twists(twists))
+
+
+def _print_table(poses: Errors, twists: Errors | None) -> None:
+    rows = [("position (m)", poses.linear), ("orientation (deg)", poses.angular)]
+    if twists is not None:
+        rows += [
+            ("angular velocity (deg/s)", twists.angular),
+            ("linear velocity (m/s)", twists.linear),
+        ]
+    print(f"{'error':26}{'count':>8}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
+    for name, errors in rows:
+        print(_row(name, summarize(errors)))
+
+
+def _row(name: str, summary: Summary) -> str:
+    figures = (summary.median, summary.mean, summary.p95, summary.maximum)
+    return f"{name:26}{summary.count:8}" + "".join(f"{figure:11.5f}" for figure in figures)
+
+
+def _print_ate(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> None:
+    try:
+        from evo.core import metrics, trajectory
+    except ImportError as error:
+        raise ValueError(
+            "--ate needs the package evo, which is not installed: pip install evo"
+        ) from error
+    rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
+    pair = []
+    for part in (truth.part(true_rows), estimate.part(rows)):
+        pair.append(
+            trajectory.PoseTrajectory3D(
+                part.positions,
+                np.roll(part.quaternions, 1, axis=1),  # evo puts w first
+                (part.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
+            )
+        )
+    true, estimated = pair
+    estimated.align(true)
+    parts = metrics.PoseRelation
+    for name, metric in (
+        ("ATE (m rms)", metrics.APE(parts.translation_part)),
+        ("ATE (deg rms)", metrics.APE(parts.rotation_angle_deg)),
+        ("RPE, next frame (m rms)", metrics.RPE(parts.translation_part)),
+        ("RPE, next frame (deg rms)", metrics.RPE(parts.rotation_angle_deg)),
+    ):
+        metric.process_data((true, estimated))
+        print(f"{name:34}{metric.get_statistic(metrics.StatisticsType.rmse):11.5f}")
+
+
+def _span(poses: Trajectory) -> str:
+    first, last = poses.stamps_ns[[0, -1]] * 1e-9
+    return f"{first:.3f} to {last:.3f} s"

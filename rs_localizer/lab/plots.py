@@ -1,0 +1,216 @@
+"""Pictures: trajectories, errors over time, inliers, residuals on an image.
+
+Every method keeps its color, its marker and its line in all of them, and they differ in lightness
+too, so that a print in black and white can be read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.io.trajectories import Trajectory
+from rs_localizer.lab.metrics import Errors, Stamps
+from rs_localizer.lab.video import Image
+
+
+@dataclass(frozen=True, slots=True)
+class _Style:
+    color: str
+    marker: str
+    line: str
+    layer: int
+
+
+# Light orange below, dark blue above; the truth is a wide grey road under both.
+_STYLES = (_Style("#0b3c8c", ".", "-", 3), _Style("#f08a24", "x", "--", 2))
+_TRUTH = "#c9c9c9"
+_DPI = 130
+# A pause of more frames than this breaks the lines.
+_LONGEST_GAP = 4.0
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG file; no display is needed."""
+    figure.savefig(path)
+
+
+def _figure(width: float, height: float) -> Figure:
+    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+
+
+def _methods(named: Mapping[str, object]) -> list[tuple[str, _Style]]:
+    """Names and styles; the first named is the one that matters."""
+    return list(zip(named, _STYLES, strict=False))
+
+
+def _tidy(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True, color="#e6e6e6", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def trajectories(truth: Trajectory | None, estimates: Mapping[str, Trajectory]) -> Figure:
+    """Where the camera was, from above and from the side."""
+    figure = _figure(10.0, 5.2)
+    left, right = figure.subplots(1, 2)
+    for axes, (a, b), title in ((left, (0, 1), "from above"), (right, (0, 2), "from the side")):
+        if truth is not None:
+            _draw_way(axes, truth, a, b)
+        for (name, style), estimate in zip(_methods(estimates), estimates.values(), strict=True):
+            axes.plot(
+                estimate.positions[:, a],
+                estimate.positions[:, b],
+                linestyle="none",
+                marker=style.marker,
+                markersize=3.0 if style.marker == "." else 4.0,
+                markeredgewidth=0.8,
+                color=style.color,
+                zorder=style.layer,
+                label=name,
+            )
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("x (m)")
+        axes.set_ylabel(f"{'xyz'[b]} (m)")
+        axes.set_title(title)
+        _tidy(axes)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def _draw_way(axes: Axes, truth: Trajectory, a: int, b: int) -> None:
+    x, y = _broken(truth.stamps_ns, truth.positions[:, a], truth.positions[:, b])
+    axes.plot(x, y, color=_TRUTH, linewidth=5.0, solid_capstyle="round", zorder=1, label="truth")
+
+
+def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
+    """Errors over time on logarithmic scales, with their medians; twists where there are any."""
+    panels: list[tuple[str, Mapping[str, Errors], Callable[[Errors], Array]]] = [
+        ("position error (mm)", poses, lambda e: np.multiply(1e3, e.linear)),
+        ("orientation error (deg)", poses, lambda e: e.angular),
+    ]
+    if twists:
+        panels += [
+            ("angular velocity\nerror (deg/s)", twists, lambda e: e.angular),
+            ("linear velocity\nerror (m/s)", twists, lambda e: e.linear),
+        ]
+    figure = _figure(10.0, 1.0 + 2.1 * len(panels))
+    start = min(int(e.stamps_ns[0]) for e in poses.values() if len(e.stamps_ns))
+    rows = figure.subplots(len(panels), 1, sharex=True, subplot_kw={"yscale": "log"})
+    for axes, (label, series, values) in zip(rows, panels, strict=True):
+        for name, style in _methods(poses):
+            if name in series:
+                one = series[name]
+                _draw_series(axes, name, style, one.stamps_ns, values(one), start)
+        _plain_numbers(axes)
+        axes.set_ylabel(label)
+        _tidy(axes)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False,
+                    borderaxespad=0.1)  # fmt: skip
+    rows[-1].set_xlabel("time (s)")
+    return figure
+
+
+def _draw_series(
+    axes: Axes, name: str, style: _Style, stamps_ns: Stamps, values: Array, start: int
+) -> None:
+    t, shown = _broken(stamps_ns, _seconds(stamps_ns, start), values)
+    label = f"{name}: median {np.median(values):.3g}" if len(values) else name
+    axes.plot(
+        t, shown, style.line, color=style.color, linewidth=1.1, zorder=style.layer, label=label
+    )
+
+
+def inliers(
+    stamps_ns: Stamps,
+    counts: Mapping[str, Array],
+    most: Array,
+    angular_rate: Array,
+    most_label: str,
+) -> Figure:
+    """Inliers of each frame, and how fast the camera turned.
+
+    Args:
+        stamps_ns: (n,) of all frames.
+        counts: (n,) inliers per method; 0 where a frame was not localized.
+        most: (n,) correspondences that could be inliers.
+        angular_rate: (n,) deg/s.
+        most_label: what ``most`` is.
+    """
+    figure = _figure(10.0, 5.4)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
+    t = _seconds(stamps_ns, int(stamps_ns[0]))
+    upper.fill_between(t, most, step="mid", color="#ececec", zorder=0, label=most_label)
+    for (name, style), values in zip(_methods(counts), counts.values(), strict=True):
+        _draw_series(upper, name, style, stamps_ns, values, int(stamps_ns[0]))
+    upper.set_ylim(bottom=0.0)
+    upper.set_ylabel("inliers in the frame")
+    upper.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False,
+                 borderaxespad=0.1)  # fmt: skip
+    lower.fill_between(t, angular_rate, color="#8a8a8a", linewidth=0.0)
+    lower.set_ylim(bottom=0.0)
+    lower.set_ylabel("the camera turns\nat (deg/s)")
+    lower.set_xlabel("time (s)")
+    for axes in (upper, lower):
+        _tidy(axes)
+    return figure
+
+
+def residuals(
+    image: Image, pixels: Array, predicted: Mapping[str, Array], magnification: float
+) -> Figure:
+    """Residuals as arrows on the image they belong to, one picture per method.
+
+    Args:
+        image: (height, width) grey.
+        pixels: (n,2) where the corners were seen.
+        predicted: (n,2) where each method's pose puts them.
+        magnification: length of an arrow in image pixels per pixel of residual.
+    """
+    figure = _figure(10.0, 4.6)
+    for axes, (name, style), seen in zip(
+        figure.subplots(1, len(predicted)), _methods(predicted), predicted.values(), strict=True
+    ):
+        offset = pixels - seen
+        rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
+        axes.imshow(0.55 * image + 0.45 * 255, cmap="gray", vmin=0, vmax=255)
+        axes.quiver(
+            pixels[:, 0], pixels[:, 1], offset[:, 0], offset[:, 1], angles="xy",
+            scale_units="xy", scale=1.0 / magnification, color=style.color, width=0.005,
+        )  # fmt: skip
+        axes.set_title(f"{name}: {rms:.3f} px rms")
+        axes.set_xlabel(f"residuals, {magnification:g} times enlarged")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        low, high = pixels.min(axis=0) - 40.0, pixels.max(axis=0) + 40.0
+        axes.set_xlim(max(low[0], -0.5), min(high[0], image.shape[1] - 0.5))
+        axes.set_ylim(min(high[1], image.shape[0] - 0.5), max(low[1], -0.5))
+    return figure
+
+
+def _plain_numbers(axes: Axes) -> None:
+    """0.1, 0.2, 0.5, 1 instead of powers of ten, on a logarithmic axis."""
+    axes.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0), numticks=12))
+    axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _seconds(stamps_ns: Stamps, start: int) -> Array:
+    return np.asarray((stamps_ns - start) * 1e-9, np.float64)
+
+
+def _broken(stamps_ns: Stamps, x: Array, y: Array) -> tuple[Array, Array]:
+    """The curve with a NaN in each long pause, so that no line bridges it."""
+    spacing = np.diff(stamps_ns)
+    if len(spacing) == 0:
+        return x, y
+    gaps = np.flatnonzero(spacing > _LONGEST_GAP * np.median(spacing)) + 1
+    return np.insert(x, gaps, np.nan), np.insert(y, gaps, np.nan)
