@@ -1,0 +1,47 @@
+"""rclpy messages, made by type name or copied from those of a recording."""
+
+from __future__ import annotations
+
+import array
+import importlib
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+
+@cache
+def message_class(type_name: str) -> Any:
+    """The rclpy class of a type such as ``geometry_msgs/msg/Pose``."""
+    package, _, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
+
+
+def make_message(type_name: str, **fields: Any) -> Any:
+    """An rclpy message (see :data:`rs_localizer.io.messages.Make`)."""
+    for name, value in fields.items():
+        if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+            # rclpy checks every single element of any other container.
+            fields[name] = array.array("B", value.tobytes())
+    return message_class(type_name)(**fields)
+
+
+def copy_message(source: Any, type_name: str) -> Any:
+    """The rclpy message of this type with the values of a message of rosbags."""
+    fields = {}
+    for name, kind in message_class(type_name).get_fields_and_field_types().items():
+        value = getattr(source, name)
+        if "/" not in kind:
+            is_array = isinstance(value, np.ndarray)
+            fields[name] = value.astype(value.dtype.newbyteorder("=")) if is_array else value
+        elif kind.startswith("sequence<"):
+            element = _full_name(kind.removeprefix("sequence<").split(",")[0].rstrip(">"))
+            fields[name] = [copy_message(item, element) for item in value]
+        else:
+            fields[name] = copy_message(value, _full_name(kind))
+    return make_message(type_name, **fields)
+
+
+def _full_name(kind: str) -> str:
+    package, name = kind.split("/")
+    return f"{package}/msg/{name}"

@@ -1,0 +1,168 @@
+"""The node ``rs_localizer``: correspondences and camera_info in; pose, twist and inliers out."""
+
+from __future__ import annotations
+
+import traceback
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.frames import FrameLocalizer
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import TYPES, messages
+from rs_localizer.ros import parameters
+from rs_localizer.ros.conversion import make_message, message_class
+from rs_localizer.ros.refusals import Refusals
+from rs_localizer.ros.stopping import StopSignals
+from rs_localizer.settings import NODE_NAME
+
+# Sensor data: the newest counts, and a late one is worth less than none.
+_INPUT_QOS = {"depth": 1, "reliability": ReliabilityPolicy.BEST_EFFORT}
+_OUTPUT_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
+
+
+class LocalizerNode(LifecycleNode):
+    """A managed node; only while active it takes and publishes messages.
+
+    Raises:
+        ValueError: when it is started with parameters that are refused, saying what was found.
+    """
+
+    def __init__(self, **kwargs) -> None:
+        super().__init__(NODE_NAME, **kwargs)
+        config = parameters.declare(self)
+        FrameLocalizer(config)  # refuses what it cannot do
+        parameters.on_change(self, check=FrameLocalizer, apply=self._take_config)
+        self.autostart = config.autostart
+        self.refusals = Refusals(self._warn)
+        self._frames: FrameLocalizer | None = None
+        self._inputs: list[Subscription] = []
+        self._outputs: dict[str, Publisher] = {}
+
+    # -- life cycle -------------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            frames = FrameLocalizer(parameters.read(self))
+            frames.warm_up()
+        except Exception:  # rclpy would hide it
+            self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
+            return TransitionCallbackReturn.FAILURE
+        self._frames = frames
+        self._outputs = {
+            name: self.create_lifecycle_publisher(
+                message_class(type_name),
+                f"~/{name}",
+                QoSProfile(**_OUTPUT_QOS),  # a new one each: overrides are written into it
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+            for name, type_name in TYPES.items()
+        }
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        # camera_info first: the executor goes through waiting messages in this order.
+        self._inputs = [
+            self.create_subscription(
+                message_type,
+                topic,
+                callback,
+                QoSProfile(**_INPUT_QOS),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+            for message_type, topic, callback in (
+                (CameraInfo, "camera_info", self._take_camera_info),
+                (PointCloud2, "correspondences", self._take_correspondences),
+            )
+        ]
+        self.get_logger().info(
+            f"active with solver {self._frames.config.solver}, listening to "
+            + " and ".join(subscription.topic_name for subscription in self._inputs)
+        )
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._close_inputs()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._close_outputs()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._close_inputs()
+        self._close_outputs()
+        return super().on_shutdown(state)
+
+    def _close_inputs(self) -> None:
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        self._inputs = []
+
+    def _close_outputs(self) -> None:
+        for publisher in self._outputs.values():
+            self.destroy_lifecycle_publisher(publisher)
+        self._outputs = {}
+        self._frames = None
+
+    # -- callbacks --------------------------------------------------------------------------
+
+    def _take_config(self, config: NodeConfig) -> None:
+        if self._frames is not None:
+            self._frames.config = config
+            self._frames.warm_up()
+
+    def _take_camera_info(self, message: CameraInfo) -> None:
+        try:
+            self._frames.take_camera_info(message)
+        except MessageError as error:
+            self.refusals.add("bad_camera_info", str(error))
+
+    def _take_correspondences(self, message: PointCloud2) -> None:
+        result = self._frames.localize(message)
+        if not result:
+            self.refusals.add(result.reason, result.detail)
+            return
+        for name, output in messages(result, make_message).items():
+            self._outputs[name].publish(output)
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until Ctrl-C or SIGTERM; the exit code."""
+    with StopSignals() as stop:
+        try:
+            return _run(args)
+        except (KeyboardInterrupt, ExternalShutdownException):
+            return 0
+        except Exception:
+            # A signal also ends the context, and with it whatever call is under way.
+            if stop.requested:
+                return 0
+            raise
+        finally:
+            rclpy.try_shutdown()
+
+
+def _run(args: list[str] | None) -> int:
+    try:
+        rclpy.init(args=args)
+        node = LocalizerNode()
+    except (ValueError, RuntimeError) as error:
+        rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
+        return 1
+    if node.autostart:
+        for transition in (node.trigger_configure, node.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                return 1
+    rclpy.spin(node)
+    return 0

@@ -1,0 +1,96 @@
+"""ROS parameters, declared by walking the settings of :mod:`rs_localizer.config`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.settings import Setting, build, settings
+
+
+def declare(node: Node) -> NodeConfig:
+    """Declare every setting as a parameter and return those that the node was started with.
+
+    Raises:
+        ValueError: for a value of a wrong type or out of range, saying what was found.
+    """
+    for name, setting in settings().items():
+        try:
+            node.declare_parameter(name, setting.default, _descriptor(setting))
+        except InvalidParameterTypeException as error:
+            raise ValueError(
+                f"{name} must be of type {type(setting.default).__name__}: {error}"
+            ) from error
+        except InvalidParameterValueException as error:
+            raise ValueError(str(error)) from error
+    return read(node)
+
+
+def read(node: Node, changes: list[Parameter] | None = None) -> NodeConfig:
+    """The settings of the node's parameters, with these changes.
+
+    Raises:
+        ValueError: for values that the settings refuse.
+    """
+    values = {name: node.get_parameter(name).value for name in settings()}
+    for parameter in changes or ():
+        if parameter.name in values:  # there are also use_sim_time and the QoS overrides
+            values[parameter.name] = parameter.value
+    return build(values)
+
+
+def on_change(
+    node: Node, check: Callable[[NodeConfig], None], apply: Callable[[NodeConfig], None]
+) -> None:
+    """Check, then apply, changes of parameters; several set at once are one change.
+
+    Args:
+        node: with declared parameters.
+        check: raises ``ValueError`` for settings that are refused: then all stay as they were.
+        apply: takes settings that were accepted.
+    """
+
+    def on_set(parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            check(read(node, parameters))
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def after_set(parameters: list[Parameter]) -> None:
+        if any(parameter.name in settings() for parameter in parameters):
+            apply(read(node))
+
+    node.add_on_set_parameters_callback(on_set)
+    node.add_post_set_parameters_callback(after_set)
+
+
+def _descriptor(setting: Setting) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=setting.description,
+        read_only=setting.read_only,
+        additional_constraints=(
+            f"one of {', '.join(setting.choices)}" if setting.choices else ""
+        ),
+    )
+    if setting.minimum is None or setting.maximum is None:
+        return descriptor
+    if isinstance(setting.default, int):
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(setting.minimum), to_value=int(setting.maximum), step=1)
+        ]
+    else:
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(setting.minimum), to_value=float(setting.maximum))
+        ]
+    return descriptor

@@ -1,0 +1,115 @@
+"""A real node in its own process, and a peer that talks to it over DDS."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+
+# Nobody else's nodes, neither on this machine nor in its network.
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randint(1, 100))
+
+TIMEOUT = 60.0  # s, of a machine that is busy
+RUN = "import sys; from rs_localizer.ros.localizer_node import main; sys.exit(main())"
+
+
+class NodeProcess:
+    """The node, started as a user starts it."""
+
+    def __init__(self, log: Path, *arguments: str, environment: dict[str, str]) -> None:
+        self._log = log
+        with log.open("w") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", RUN, "--ros-args", *arguments],
+                stdout=file,
+                stderr=file,
+                env={**os.environ, "RCUTILS_LOGGING_BUFFERED_STREAM": "0", **environment},
+            )
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def wait_for_log(self, text: str) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while text not in self.log:
+            assert self.process.poll() is None, self.log
+            assert time.monotonic() < deadline, f"no {text!r} in:\n{self.log}"
+            time.sleep(0.05)
+
+    def stop(self, *signals: int) -> int:
+        """Send signals one after the other and wait for the end: the exit code."""
+        for number in signals or (signal.SIGINT,):
+            self.process.send_signal(number)
+            time.sleep(0.05)
+        return self.process.wait(TIMEOUT)
+
+
+class Peer:
+    """A node of the test's own process, spun only while it waits."""
+
+    def __init__(self) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context)
+        self.node = rclpy.create_node("peer", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def spin_until(self, condition: Callable[[], Any], timeout: float = TIMEOUT) -> bool:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self._executor.spin_once(timeout_sec=0.02)
+        return True
+
+    def call(self, service_type: Any, name: str, request: Any) -> Any:
+        client = self.node.create_client(service_type, name)
+        assert self.spin_until(client.service_is_ready), f"no service {name}"
+        future = client.call_async(request)
+        assert self.spin_until(future.done), f"no answer from {name}"
+        self.node.destroy_client(client)
+        return future.result()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+@pytest.fixture
+def start_node(tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
+    started: list[NodeProcess] = []
+
+    def start(*arguments: str, **environment: str) -> NodeProcess:
+        log = tmp_path / f"node{len(started)}.log"
+        started.append(NodeProcess(log, *arguments, environment=environment))
+        return started[-1]
+
+    yield start
+    for node in started:
+        if node.process.poll() is None:
+            node.process.kill()
+            node.process.wait()
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    result = Peer()
+    yield result
+    result.close()
