@@ -130,7 +130,7 @@ def run(localizer: subprocess.Popen) -> None:
         distance, angle = pose_errors(pose, starts[key])
         turn = np.linalg.norm(np.array([twist.x, twist.y, twist.z]) - ANGULAR)
         turn /= np.linalg.norm(ANGULAR)
-        print(f"  {starts[key]:.1f} s: {distance:.4f} m, {angle:.3f} deg, twist {turn:.1%}")
+        print(f"  {starts[key]:.1f} s: {distance:.1e} m, {angle:.1e} deg, twist {turn:.1e}")
         assert pose.header.frame_id == "map", pose.header.frame_id
         assert twists[key].header.frame_id == "camera", twists[key].header.frame_id
         assert distance < POSITION_ERROR, "position too far from the truth"
