@@ -108,9 +108,7 @@ def search(
         for index, (pool, part) in enumerate(
             zip(usable, np.array_split(samples, len(usable)), strict=True)
         ):
-            prefixes = pool.prefix_sizes(
-                int(drawn[index]), len(part), hypotheses.sample_size, max_samples // len(usable)
-            )
+            prefixes = pool.prefix_sizes(int(drawn[index]), len(part), hypotheses.sample_size)
             draw(pool.points, prefixes, observations.tau, row_range, random, part)
             drawn[index] += len(part)
         models = np.empty((hypotheses.solutions, MODEL_SIZE, block))

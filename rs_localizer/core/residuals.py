@@ -84,9 +84,7 @@ class _View:
         u, v = x * self.inverse_depth, y * self.inverse_depth
         self.image = [u, v]
 
-        # The drift's own turn during the exposure is of second order here: first order suffices
-        # for a correction of the error's metric.
-        drift = [a + b for a, b in zip(velocity, cross(theta, velocity), strict=True)]
+        drift = multiply(self.turn, velocity)
         rate = [-(a + b) for a, b in zip(cross(omega, [x, y, z]), drift, strict=True)]
         ray_rate = [
             (rate[0] - u * rate[2]) * self.inverse_depth,

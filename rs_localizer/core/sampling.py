@@ -23,6 +23,8 @@ def generator(seed: int) -> Random:
 # A sample whose rows lie closer together than this part of all rows hardly sees the motion.
 _LEAST_ROW_SPREAD = 0.25
 _MOST_REDRAWS = 8
+# After so many samples a ranked pool is drawn from as a whole (T_N of the PROSAC paper).
+_RANKED_HORIZON = 200_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,18 +38,15 @@ class Pool:
     points: IntArray
     ranked: bool = False
 
-    def prefix_sizes(self, first: int, count: int, size: int, horizon: int) -> IntArray:
-        """From how many points of the pool samples ``first ... first + count - 1`` are drawn.
-
-        After ``horizon`` samples from a ranked pool the whole pool is in use.
-        """
+    def prefix_sizes(self, first: int, count: int, size: int) -> IntArray:
+        """From how many points of the pool samples ``first ... first + count - 1`` are drawn."""
         total = len(self.points)
         if not self.ranked or total <= size:
             return np.full(count, total, dtype=np.int64)
         n = np.arange(size, total + 1)
-        # Expected number of the horizon's samples that lie in the first n points (PROSAC's T_n).
+        # Expected number of the horizon's samples that lie in the first n points (T_n there).
         factors = (n[:, None] - np.arange(size)) / (total - np.arange(size))
-        expected = horizon * np.prod(factors, axis=1)
+        expected = _RANKED_HORIZON * np.prod(factors, axis=1)
         drawn = np.arange(first + 1, first + count + 1)
         return np.minimum(size + np.searchsorted(expected, drawn), total).astype(np.int64)
 

@@ -1,0 +1,145 @@
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.core.camera import Camera, Roi
+
+K = np.array([[500.0, 0.0, 321.0], [0.0, 510.0, 238.0], [0.0, 0.0, 1.0]])
+LENSES = [
+    ("plumb_bob", []),
+    ("plumb_bob", [-0.3, 0.1, 0.002, -0.001, 0.01]),
+    ("rational_polynomial", [0.5, 0.1, 0.001, 0.001, 0.01, 0.8, 0.2, 0.03]),
+    ("equidistant", [0.05, 0.01, 0.001, 0.0]),
+]
+DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
+
+
+def camera(**changes):
+    return Camera(**({"width": 640, "height": 480, "K": K} | changes))
+
+
+def pixels(count=200, seed=0):
+    return np.random.default_rng(seed).uniform([0, 0], [639, 479], (count, 2))
+
+
+@pytest.mark.parametrize(("model", "D"), LENSES)
+def test_rays_lead_back_to_their_pixels_by_opencv(model, D):
+    raw = pixels()
+    rays = camera(D=D, distortion_model=model).rays(raw)
+    bearings = np.column_stack([rays, np.ones(len(rays))])[:, None]
+    zero = np.zeros(3)
+    if model == "equidistant":
+        back = cv2.fisheye.projectPoints(bearings, zero, zero, K, np.array(D))[0][:, 0]
+    else:
+        back = cv2.projectPoints(bearings, zero, zero, K, np.array(D))[0][:, 0]
+    np.testing.assert_allclose(back, raw, atol=1e-6)
+
+
+@pytest.mark.parametrize(("model", "D"), LENSES)
+def test_projecting_undoes_rays_also_with_binning_and_roi(model, D):
+    cropped = camera(
+        D=D, distortion_model=model, binning=(2, 3), roi=Roi(100, 60, 400, 300)
+    )
+    raw = np.random.default_rng(1).uniform([0, 0], [199, 99], (50, 2))
+    rays = cropped.rays(raw)
+    points = 3.0 * np.column_stack([rays, np.ones(len(rays))])
+    np.testing.assert_allclose(cropped.project(points), raw, atol=1e-6)
+    # The bearing is that of the pixel on the full sensor.
+    on_sensor = raw * (2, 3) + (100, 60)
+    np.testing.assert_allclose(
+        rays, camera(D=D, distortion_model=model).rays(on_sensor), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("model", "D"), LENSES)
+def test_pixel_jacobian_is_the_finite_difference_of_projecting(model, D):
+    lens = camera(D=D, distortion_model=model, binning=(2, 1))
+    rays = lens.rays(pixels(20) / (2, 1))
+    jacobian = lens.pixel_jacobian(rays)
+    h = 1e-5
+    for k in range(2):
+        step = h * np.eye(2)[k]
+        ahead, behind = (
+            lens.project(np.column_stack([rays + s, np.ones(len(rays))])) for s in (step, -step)
+        )
+        np.testing.assert_allclose(jacobian[:, :, k], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-3)
+
+
+def test_row_time_runs_from_first_to_last_exposed_pixel():
+    corners = np.array([[0, 0], [639, 0], [0, 479], [639, 479]], float)
+    expected = {
+        "top_to_bottom": [-0.5, -0.5, 0.5, 0.5],
+        "bottom_to_top": [0.5, 0.5, -0.5, -0.5],
+        "left_to_right": [-0.5, 0.5, -0.5, 0.5],
+        "right_to_left": [0.5, -0.5, 0.5, -0.5],
+    }
+    for direction in DIRECTIONS:
+        np.testing.assert_allclose(
+            camera(scan_direction=direction).row_time(corners), expected[direction], atol=1e-15
+        )
+
+
+def test_row_time_comes_from_the_raw_row_and_not_from_the_undistorted_one():
+    bent = camera(D=[-0.3, 0.1, 0.0, 0.0, 0.0])
+    raw = pixels()
+    np.testing.assert_allclose(bent.row_time(raw), (raw[:, 1] - 239.5) / 479, atol=1e-15)
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_row_time_of_a_crop_is_that_of_the_sensor_row(direction):
+    cropped = camera(binning=(2, 2), roi=Roi(100, 60, 400, 300), scan_direction=direction)
+    whole = camera(scan_direction=direction)
+    raw = np.array([[0.0, 0.0], [10.0, 20.0], [199.5, 149.5]])
+    np.testing.assert_allclose(
+        cropped.row_time(raw), whole.row_time(raw * 2 + (100, 60)), atol=1e-15
+    )
+    first = {
+        "top_to_bottom": [0.0, 60.0],
+        "bottom_to_top": [0.0, 359.0],
+        "left_to_right": [100.0, 0.0],
+        "right_to_left": [499.0, 0.0],
+    }[direction]
+    assert cropped.first_row_time == pytest.approx(whole.row_time(np.array([first]))[0])
+    assert whole.first_row_time == -0.5
+    gradient = [
+        cropped.row_time(np.array([step]))[0] - cropped.row_time(np.zeros((1, 2)))[0]
+        for step in np.eye(2)
+    ]
+    np.testing.assert_allclose(cropped.row_time_gradient, gradient, atol=1e-15)
+
+
+def test_what_lies_behind_or_beyond_the_lens_is_nan():
+    strong = camera(D=[-0.5, 0.0, 0.0, 0.0, 0.0])
+    # The polynomial r (1 - r^2/2) never exceeds 0.55: no bearing reaches these pixels.
+    assert np.isnan(strong.rays(np.array([[1500.0, 238.0]]))).all()
+    assert np.isnan(camera().project(np.array([[0.0, 0.0, -1.0], [0.1, 0.0, 0.0]]))).all()
+    assert np.isnan(strong.rays(np.array([[np.nan, 3.0]]))).all()
+    assert strong.rays(np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_inside_is_the_area_of_the_pixels():
+    assert camera().inside(
+        np.array([[-0.4, -0.4], [639.4, 479.4], [-0.6, 3], [3, 479.6], [np.nan, 3]])
+    ).tolist() == [True, True, False, False, False]
+    assert camera(binning=(2, 2), roi=Roi(0, 0, 400, 300)).size == (200, 150)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"K": np.zeros((3, 3))}, "not calibrated: focal lengths are 0, 0"),
+        ({"K": np.full((3, 3), np.nan)}, "finite 3x3"),
+        ({"K": np.eye(4)}, "3x3"),
+        ({"K": K + [[0, 1, 0], [0, 0, 0], [0, 0, 0]]}, "no skew"),
+        ({"D": [0.1, 0.2]}, "plumb_bob takes 0 or 4 or 5 coefficients, got 2"),
+        ({"D": [np.inf] * 4}, "D must be finite"),
+        ({"distortion_model": "fov"}, "one of plumb_bob, .*; got 'fov'"),
+        ({"scan_direction": "sideways"}, "one of top_to_bottom, .*; got 'sideways'"),
+        ({"width": 0}, "at least 2x2, got 0x480"),
+        ({"readout_time": -0.1}, "readout_time must be 0 or more seconds, got -0.1"),
+        ({"binning": (0, 1)}, "binning must be 1 or more"),
+    ],
+)
+def test_an_impossible_camera_is_refused_with_what_was_found(changes, said):
+    with pytest.raises(ValueError, match=said):
+        camera(**changes)

@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.core.refine import apply_step, invert_information, refine, solve_positive
+
+NO_PRIOR = np.zeros(6)
+
+
+def distance(scene, state, motion):
+    """Largest difference of rotation (rad), translation and velocities."""
+    found = scene.motion_of(state)
+    return max(
+        np.linalg.norm(so3.log(found.rotation @ motion.rotation.T)),
+        np.abs(found.translation - motion.translation).max(),
+        np.abs(found.angular_velocity - motion.angular_velocity).max(),
+        np.abs(found.linear_velocity - motion.linear_velocity).max(),
+    )
+
+
+def test_a_step_turns_and_moves_the_camera_in_its_own_axes(scene):
+    _, motion, *_ = scene.frame()
+    step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06])
+    moved = scene.motion_of(apply_step(scene.state_of(motion), step))
+    map_from_camera = motion.rotation.T
+    np.testing.assert_allclose(moved.rotation.T, map_from_camera @ so3.exp(step[:3]), atol=1e-14)
+    centre, new_centre = (-m.rotation.T @ m.translation for m in (motion, moved))
+    np.testing.assert_allclose(new_centre, centre + map_from_camera @ step[3:6], atol=1e-14)
+    np.testing.assert_allclose(moved.angular_velocity, motion.angular_velocity + step[6:9])
+    np.testing.assert_allclose(moved.linear_velocity, motion.linear_velocity + step[9:])
+
+
+def test_the_truth_is_found_from_a_global_shutter_start(scene):
+    camera, motion, points, true, _ = scene.frame(speed=0.2, count=40)
+    start = scene.state_of(motion)
+    start[12:] = 0.0
+    start = apply_step(start, 0.05 * np.random.default_rng(0).normal(size=12))
+    state, _, cost, converged = refine(
+        scene.pack(camera, points, true), start, camera.row_time_gradient, 1e3, 0.0, NO_PRIOR,
+        1e-3, 30,
+    )  # fmt: skip
+    assert converged
+    assert cost < 1e-9
+    assert distance(scene, state, motion) < 1e-7
+
+
+def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
+    camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=60, seed=2)
+    measured[:15] = np.random.default_rng(1).uniform([0, 0], [639, 479], (15, 2))
+    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    start = apply_step(scene.state_of(motion), 0.003 * np.random.default_rng(3).normal(size=12))
+    previous = np.inf
+    for iterations in (0, 1, 2, 5, 20):
+        state, information, cost, _ = refine(
+            data, start, gradient, 4.0, 1.0, NO_PRIOR, 0.5, iterations
+        )
+        assert cost <= previous
+        previous = cost
+    # Within the noise: the translation along the axis is known to centimetres here.
+    deviations = 0.5 * np.sqrt(np.diag(invert_information(information)[0]))
+    assert distance(scene, state, motion) < 4 * deviations.max()
+
+
+def test_the_noise_decides_between_prior_and_data(scene):
+    camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
+    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    held = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, np.full(6, 1e18), 1.0, 30)[0]
+    np.testing.assert_allclose(held[12:], 0.0, atol=1e-9)
+    prior = np.full(6, 100.0)
+    free, weak, strong = (
+        refine(data, scene.state_of(motion), gradient, 1e3, 0.0, p, noise, 30)[0][12:]
+        for p, noise in ((NO_PRIOR, 1.0), (prior, 0.5), (prior, 50.0))
+    )
+    assert np.linalg.norm(weak) < np.linalg.norm(free)
+    assert np.linalg.norm(strong) < 0.8 * np.linalg.norm(weak)
+
+
+def test_the_minimum_has_no_slope_of_the_posterior(scene):
+    """The gradient of cost plus prior vanishes, by finite differences of the cost itself."""
+    from rs_localizer.core.residuals import robust_cost
+
+    camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
+    # Without the row's part the cost is exactly that of the residuals.
+    data, gradient = scene.pack(camera, points, measured), np.zeros(2)
+    prior, noise, h = np.array([30.0] * 3 + [100.0] * 3), 0.5, 1e-6
+    state = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, prior, noise, 50)[0]
+
+    def posterior(s):
+        velocities = s[12:]
+        return robust_cost(data, s, gradient, 1e3, 0.0, np.inf) + noise**2 * velocities @ (
+            prior * velocities
+        )
+
+    for e in np.eye(12):
+        slope = (posterior(apply_step(state, h * e)) - posterior(apply_step(state, -h * e))) / (2 * h)
+        curvature = (
+            posterior(apply_step(state, 1e-4 * e)) + posterior(apply_step(state, -1e-4 * e))
+            - 2 * posterior(state)
+        ) / 1e-8  # fmt: skip
+        assert abs(slope) < 1e-3 * np.sqrt(curvature) * noise
+
+
+@pytest.mark.parametrize("size", [1, 3, 12])
+def test_cholesky_is_numpy_s_solve(size):
+    rng = np.random.default_rng(size)
+    factor = rng.normal(size=(size, size))
+    units = np.diag(10.0 ** rng.uniform(-6, 6, size))
+    matrix, right = units @ (factor @ factor.T + np.eye(size)) @ units, rng.normal(size=size)
+    solution, solved = solve_positive(matrix, right)
+    assert solved
+    np.testing.assert_allclose(solution, np.linalg.solve(matrix, right), rtol=1e-6)
+
+
+def test_a_matrix_that_is_not_positive_is_refused():
+    for matrix in (np.zeros((2, 2)), np.ones((2, 2)), -np.eye(2), np.diag([1.0, np.nan])):
+        assert not solve_positive(matrix, np.ones(2))[1]
+        inverse, smallest = invert_information(matrix)
+        assert not smallest > 1e-12
+        assert np.isnan(inverse).all() or not np.isfinite(np.linalg.inv(matrix)).all()
+
+
+def test_the_inverse_and_the_eigenvalue_do_not_depend_on_units():
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(12, 12))
+    matrix = factor @ factor.T
+    units = np.diag(10.0 ** rng.uniform(-5, 5, 12))
+    inverse, smallest = invert_information(matrix)
+    np.testing.assert_allclose(inverse @ matrix, np.eye(12), atol=1e-8)
+    assert invert_information(units @ matrix @ units)[1] == pytest.approx(smallest, rel=1e-6)

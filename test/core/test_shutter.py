@@ -1,0 +1,103 @@
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion, from_model_a, project_rolling
+
+K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
+DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
+
+
+def some_motion(seed=0, speed=0.3):
+    rng = np.random.default_rng(seed)
+    return Motion(
+        Rotation.random(random_state=seed).as_matrix(),
+        np.array([0.1, -0.2, 3.0]),
+        speed * rng.normal(size=3),
+        speed * rng.normal(size=3),
+    )
+
+
+def centre(motion, tau):
+    rotation, translation = motion.at(tau)
+    return -rotation.T @ translation
+
+
+def test_velocities_are_the_derivatives_of_the_camera_s_path_in_its_own_axes():
+    motion, h = some_motion(), 1e-6
+    for tau in (-0.5, 0.0, 0.4):
+        map_from_camera = motion.at(tau)[0].T
+        velocity = (centre(motion, tau + h) - centre(motion, tau - h)) / (2 * h)
+        np.testing.assert_allclose(
+            map_from_camera.T @ velocity, motion.linear_velocity_at(tau), atol=1e-8
+        )
+        turn = motion.at(tau - h)[0] @ motion.at(tau + h)[0].T  # before_from_after
+        rate = Rotation.from_matrix(turn).as_rotvec() / (2 * h)
+        np.testing.assert_allclose(rate, motion.angular_velocity, atol=1e-7)
+
+
+def test_the_centre_moves_on_a_straight_line():
+    motion = some_motion()
+    first, middle, last = (centre(motion, tau) for tau in (-0.5, 0.0, 0.5))
+    np.testing.assert_allclose(middle, 0.5 * (first + last), atol=1e-14)
+
+
+def test_no_velocity_is_a_global_shutter():
+    motion = some_motion(speed=0.0)
+    for tau in (-0.5, 0.3):
+        rotation, translation = motion.at(tau)
+        np.testing.assert_array_equal(rotation, motion.rotation)
+        np.testing.assert_array_equal(translation, motion.translation)
+
+
+def test_many_rows_are_single_rows():
+    motion, tau = some_motion(), np.array([-0.5, 0.0, 0.37])
+    rotations, translations = motion.at_rows(tau)
+    for k, row in enumerate(tau):
+        np.testing.assert_allclose(rotations[k], motion.at(row)[0], atol=1e-15)
+        np.testing.assert_allclose(translations[k], motion.at(row)[1], atol=1e-15)
+
+
+def test_the_solvers_model_and_ours_agree_to_first_order():
+    rng = np.random.default_rng(1)
+    rotation = Rotation.random(random_state=2).as_matrix()
+    c, w, t, point = np.array([0.2, 0.1, 3.0]), *rng.normal(size=(3, 3))
+    motion = from_model_a(rotation, c, w, t)
+    for tau in (1e-3, 1e-4):
+        ours = motion.at(tau)[0] @ point + motion.at(tau)[1]
+        theirs = Rotation.from_rotvec(tau * w).as_matrix() @ rotation @ point + c + tau * t
+        assert np.linalg.norm(ours - theirs) < 10 * tau**2
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_a_point_is_seen_by_its_own_row(direction):
+    camera = Camera(640, 480, K, [-0.2, 0.05, 0.001, 0.0, 0.0], scan_direction=direction)
+    motion = some_motion(3)
+    points = np.random.default_rng(4).uniform(-1, 1, (30, 3))
+    pixels, tau = project_rolling(camera, motion.at_rows, points)
+
+    def mismatch(row_time, point):  # an independent way to the same answer
+        rotation, translation = motion.at(row_time)
+        return camera.row_time(camera.project((rotation @ point + translation)[None]))[0] - row_time
+
+    seen = 0
+    for point, pixel, row_time in zip(points, pixels, tau, strict=True):
+        if not camera.inside(pixel[None])[0]:
+            continue
+        seen += 1
+        assert brentq(mismatch, -0.6, 0.6, args=(point,), xtol=1e-12) == pytest.approx(
+            row_time, abs=1e-9
+        )
+        assert camera.row_time(pixel[None])[0] == pytest.approx(row_time, abs=1e-9)
+    assert seen > 10
+
+
+def test_a_point_behind_the_camera_is_seen_by_no_row():
+    camera = Camera(640, 480, K)
+    motion = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    pixels, tau = project_rolling(camera, motion.at_rows, np.array([[0, 0, -2.0], [0, 0, 2.0]]))
+    assert np.isnan(pixels[0]).all()
+    assert np.isnan(tau[0])
+    np.testing.assert_allclose(pixels[1], [319.5, 239.5])

@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core import so3
+
+# Angles from nothing to a half turn; the small ones cross the switch to the series.
+angles = st.sampled_from([0.0, 1e-12, 1e-8, 1e-5, 9.9e-4, 1.01e-3, 0.1, 1.0, 2.5, np.pi - 1e-6])
+axes = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 0.1)
+
+
+def vector(axis, angle):
+    return angle * np.array(axis) / np.linalg.norm(axis)
+
+
+@given(axes, angles)
+def test_exp_is_the_rotation_of_scipy(axis, angle):
+    rotation = so3.exp(vector(axis, angle))
+    expected = Rotation.from_rotvec(vector(axis, angle)).as_matrix()
+    np.testing.assert_allclose(rotation, expected, atol=1e-14)
+
+
+@given(axes, angles)
+def test_log_undoes_exp(axis, angle):
+    back = so3.log(so3.exp(vector(axis, angle)))
+    np.testing.assert_allclose(back, vector(axis, angle), atol=1e-8 if angle > 3 else 1e-13)
+
+
+@given(axes, angles)
+def test_quaternion_is_that_of_scipy_with_positive_w(axis, angle):
+    matrix = so3.exp(vector(axis, angle))
+    expected = Rotation.from_matrix(matrix).as_quat()
+    expected *= np.sign(expected[3]) or 1.0
+    np.testing.assert_allclose(so3.quaternion(matrix), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", np.eye(3))
+def test_half_turns_have_a_logarithm(axis):
+    matrix = 2.0 * np.outer(axis, axis) - np.eye(3)
+    vector_of = so3.log(matrix)
+    assert np.linalg.norm(vector_of) == pytest.approx(np.pi)
+    np.testing.assert_allclose(so3.exp(vector_of), matrix, atol=1e-12)
+
+
+@given(axes, angles)
+def test_hat_is_the_cross_product(axis, angle):
+    a, b = np.array(axis), np.array([0.3, -0.2, 0.9])
+    np.testing.assert_allclose(so3.hat(a) @ b, np.cross(a, b), atol=1e-15)
+
+
+def test_many_rotations_are_those_of_one_by_one():
+    vectors = np.random.default_rng(0).normal(size=(7, 3))
+    expected = [so3.exp(v) for v in vectors]
+    np.testing.assert_array_equal(so3.exp_many(vectors), expected)
+    assert so3.hat(vectors).shape == (7, 3, 3)

@@ -1,0 +1,251 @@
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.config import SOLVER_NAMES
+from rs_localizer.solvers import SOLVERS, find_solver, solve_minimal
+
+LINEAR = ["r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p"]
+VARIANTS = [(name, False) for name in LINEAR] + [("r6p_vcwt", True), ("r9p", True)]
+ROLLING = [*LINEAR, "joint"]
+
+
+def solve(name, p, **options):
+    return solve_minimal(name, p.points, p.rays, p.tau, p.start, **options)
+
+
+def angles(rotations, truth):
+    """Degrees between rotations (h,k,3,3) and (h,3,3)."""
+    relative = np.einsum("hkij,hlj->hkil", rotations, truth)
+    flat = relative.reshape(-1, 3, 3)
+    result = np.full(len(flat), np.nan)
+    finite = np.isfinite(flat).all(axis=(1, 2))
+    result[finite] = np.degrees(Rotation.from_matrix(flat[finite]).magnitude())
+    return result.reshape(relative.shape[:2])
+
+
+@pytest.mark.parametrize("iterations", [1, 4])
+@pytest.mark.parametrize(("name", "as_published"), VARIANTS)
+def test_every_linear_solver_is_its_numpy_oracle(minimal, name, as_published, iterations):
+    # Thirteen samples: one full block of lanes and a part of another.
+    p = minimal.problem(13, SOLVERS[name].sample_size, 0.1, 0.1, 0.1, noise=1e-3, seed=1)
+    found = solve(name, p, iterations=iterations, as_published=as_published)
+    for i in range(13):
+        expected = minimal.oracle(
+            name, p.points[i], p.rays[i], p.tau[i], p.start[i], iterations, as_published
+        )
+        for ours, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(ours[i, 0], theirs, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("as_published", [False, True])
+def test_vcwt_converges_to_the_truth_of_the_double_linearised_model(minimal, as_published):
+    p = minimal.problem(50, 6, 0.1, 0.1, 0.05, model="double", seed=2)
+    rotation, c, w, t = solve("r6p_vcwt", p, iterations=30, as_published=True)
+    good = (angles(rotation, p.rotation)[:, 0] < 1e-7) & (np.abs(c[:, 0] - p.c).max(axis=1) < 1e-8)
+    assert good.mean() > 0.95
+    assert np.abs(w[good, 0] - p.w[good]).max() < 1e-7
+    assert np.abs(t[good, 0] - p.t[good]).max() < 1e-7
+
+
+# Median errors for 1 degree and 1 cm per readout from half a degree away: that of the model, which
+# leaves out terms of second order (|w|^2/8 = 4e-5 of the distance). Orientation in degrees.
+MODEL_ERROR = {"r6p_vcwt": (2e-3, 1e-4), "r9p": (5e-3, 3e-4), "joint": (2e-3, 1e-4)}
+
+
+@pytest.mark.parametrize("name", MODEL_ERROR)
+def test_small_motion_without_noise_is_recovered_to_the_model_s_own_error(minimal, name):
+    p = minimal.problem(
+        400, SOLVERS[name].sample_size, np.radians(1.0), 0.01, np.radians(0.5), seed=3
+    )
+    rotation, c, w, t = solve(name, p)
+    errors = angles(rotation, p.rotation)
+    best = np.nanargmin(errors, axis=1)
+    rows = np.arange(400)
+    limit_angle, limit_position = MODEL_ERROR[name]
+    assert np.median(errors[rows, best]) < limit_angle
+    assert np.median(np.linalg.norm(c[rows, best] - p.c, axis=1)) < limit_position
+    assert np.median(np.linalg.norm(w[rows, best] - p.w, axis=1)) < 0.05 * np.radians(1.0)
+    assert np.median(np.linalg.norm(t[rows, best] - p.t, axis=1)) < 0.05 * 0.01
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_without_motion_and_error_the_truth_stays(minimal, name):
+    p = minimal.problem(64, SOLVERS[name].sample_size, seed=4)
+    rotation, c, w, t = solve(name, p)
+    assert np.median(angles(rotation, p.rotation)) < 1e-9
+    for found, truth in ((c, p.c), (w, p.w), (t, p.t)):
+        assert np.median(np.abs(found[:, 0] - truth)) < 1e-10
+
+
+def test_relinearising_converges_from_far_where_freezing_does_not(minimal):
+    p = minimal.problem(500, 6, np.radians(10), 0.1, np.radians(30), seed=5)
+    share = {}
+    for as_published in (False, True):
+        rotation = solve("r6p_vcwt", p, iterations=8, as_published=as_published)[0]
+        share[as_published] = np.mean(angles(rotation, p.rotation) < 2.0)
+    assert share[False] > 0.85
+    assert share[True] < 0.5 * share[False]
+
+
+def test_fixing_the_trace_takes_the_gauge_out_of_r9p(minimal):
+    p = minimal.problem(500, 9, np.radians(1), 0.01, np.radians(1), noise=1e-4, seed=6)
+    error = {}
+    for as_published in (False, True):
+        t = solve("r9p", p, as_published=as_published)[3]
+        error[as_published] = np.median(np.linalg.norm(t[:, 0] - p.t, axis=1))
+    assert error[False] < 0.3 * error[True]
+
+
+def test_p3p_finds_the_true_pose_and_only_poses_that_fit(minimal):
+    p = minimal.problem(20_000, 3, seed=7)
+    rotation, c, w, t = solve("p3p", p)
+    exists = np.isfinite(c).all(axis=2)
+    assert (exists == np.isfinite(rotation).all(axis=(2, 3))).all()
+    error = np.nanmin(
+        np.where(exists, np.abs(rotation - p.rotation[:, None]).max(axis=(2, 3)), np.inf)
+        + np.where(exists, np.abs(c - p.c[:, None]).max(axis=2), np.inf),
+        axis=1,
+    )
+    assert np.mean(error < 1e-6) > 0.9995
+    seen = np.einsum("hkij,hnj->hkni", rotation, p.points) + c[:, :, None]
+    residual = np.abs(seen[..., :2] / seen[..., 2:] - p.rays[:, None]).max(axis=(2, 3))[exists]
+    assert np.mean(residual < 1e-9) > 0.9995
+    assert (seen[exists][..., 2] > 0).all()
+    np.testing.assert_allclose(
+        rotation[exists] @ rotation[exists].swapaxes(1, 2),
+        np.broadcast_to(np.eye(3), (exists.sum(), 3, 3)), atol=1e-6,
+    )  # fmt: skip
+    assert (w[exists] == 0).all()
+    assert (t[exists] == 0).all()
+
+
+def test_p3p_finds_the_solutions_that_opencv_finds(minimal):
+    p = minimal.problem(300, 3, seed=8)
+    rotation, *_ = solve("p3p", p)
+    missing = total = 0
+    for i in range(300):
+        _, turns, shifts = cv2.solveP3P(
+            p.points[i], p.rays[i], np.eye(3), None, flags=cv2.SOLVEPNP_P3P
+        )
+        for turn, shift in zip(turns, shifts, strict=True):
+            matrix = cv2.Rodrigues(turn)[0]
+            seen = p.points[i] @ matrix.T + shift.T
+            if (seen[:, 2] <= 0).any() or np.abs(seen[:, :2] / seen[:, 2:] - p.rays[i]).max() > 1e-6:
+                continue  # not a solution at all
+            total += 1
+            missing += not np.nanmin(np.abs(rotation[i] - matrix).max(axis=(1, 2))) < 1e-3
+    assert total > 500
+    assert missing <= 0.005 * total
+
+
+def test_joint_gives_the_solutions_of_both(minimal):
+    p = minimal.problem(20, 6, 0.1, 0.1, 0.05, noise=1e-3, seed=9)
+    both = solve("joint", p)
+    for k, name in enumerate(("r6p_vct_w", "r6p_vcwt")):
+        for together, alone in zip(both, solve(name, p), strict=True):
+            np.testing.assert_array_equal(together[:, k], alone[:, 0])
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_one_initial_rotation_serves_all_samples(minimal, name):
+    p = minimal.problem(11, SOLVERS[name].sample_size, 0.05, 0.05, 0.05, seed=10)
+    one = solve_minimal(name, p.points, p.rays, p.tau, p.start[0])
+    many = solve_minimal(name, p.points, p.rays, p.tau, np.repeat(p.start[:1], 11, axis=0))
+    turned = solve_minimal(name, p.points @ p.start[0].T, p.rays, p.tau)
+    for a, b in zip(one, many, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for k in (1, 2, 3):
+        np.testing.assert_allclose(turned[k], one[k], rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(turned[0] @ p.start[0], one[0], atol=1e-8)
+
+
+@pytest.mark.parametrize("name", list(SOLVERS))
+def test_turning_the_world_turns_only_the_rotation(minimal, name):
+    p = minimal.problem(9, SOLVERS[name].sample_size, 0.05, 0.05, 0.05, seed=11)
+    turn = Rotation.random(random_state=12).as_matrix()
+    rotation, c, w, t = solve(name, p)
+    p.points, p.start = p.points @ turn.T, p.start @ turn.T
+    for ours, expected in zip(solve(name, p), (rotation @ turn.T, c, w, t), strict=True):
+        np.testing.assert_allclose(ours, expected, atol=1e-6)
+
+
+def degenerate_samples(size, count, seed):
+    """Random and adversarial samples: what a robust loop may draw by bad luck."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (count, size, 3)) + [0, 0, 2.5]
+    rays = rng.uniform(-0.5, 0.5, (count, size, 2))
+    tau = rng.uniform(-0.5, 0.5, (count, size))
+    kind = rng.integers(0, 12, count)
+    fits = kind < 6  # rays that belong to the points
+    rays[fits] = (points[..., :2] / points[..., 2:])[fits]
+    points[kind == 1, :, 2] = 2.0  # coplanar
+    points[kind == 2] = points[kind == 2][:, :1] + rng.uniform(size=(1, size, 1)) * [1, 2, 3]
+    tau[kind == 3] = 0.25  # equal rows
+    points[kind == 4, 1] = points[kind == 4, 0]
+    rays[kind == 4, 1] = rays[kind == 4, 0]
+    points[kind == 5, ..., 2] *= -1.0  # behind the camera
+    points[kind == 6] = 0.0
+    rays[kind == 7] = 0.0
+    points[kind == 8] *= 1e12
+    points[kind == 9] *= 1e-12
+    rays[kind == 10] *= 1e9
+    points[kind == 11] = points[kind == 11][:, :1]
+    return points, rays, tau
+
+
+@pytest.mark.parametrize("name", list(SOLVERS))
+def test_no_sample_breaks_a_solver(name):
+    points, rays, tau = degenerate_samples(SOLVERS[name].sample_size, 100_000, seed=13)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = solve_minimal(name, points, rays, tau)
+    parts = np.concatenate([part.reshape(*part.shape[:2], -1) for part in found], axis=2)
+    finite = np.isfinite(parts)
+    assert not np.isinf(parts).any()
+    # A solution is there or not, never half.
+    assert (finite.all(axis=2) == finite.any(axis=2)).all()
+    assert finite[..., 0].any()
+
+
+def test_the_table_is_what_the_configuration_knows():
+    assert set(SOLVERS) | {"r6p"} == set(SOLVER_NAMES)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("r6p", "r6p .* not available in this version; choose one of p3p"),
+     ("epnp", "unknown solver 'epnp'; choose one of p3p")],
+)  # fmt: skip
+def test_a_solver_that_is_not_there_is_refused(name, said):
+    with pytest.raises(ValueError, match=said):
+        find_solver(name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"points": np.zeros((2, 5, 3))}, r"takes points \(h,6,3\).* got \(2, 5, 3\)"),
+        ({"rays": np.zeros((2, 6, 3))}, r"rays \(h,6,2\)"),
+        ({"tau": np.zeros((1, 6))}, r"tau \(h,6\)"),
+        ({"rotation": np.eye(4)}, r"rotation must be \(3,3\) or \(2,3,3\), got \(4, 4\)"),
+        ({"iterations": 0}, "iterations must be 1 or more, got 0"),
+    ],
+)
+def test_wrong_input_is_refused_with_what_was_found(changes, said):
+    given = {
+        "points": np.zeros((2, 6, 3)), "rays": np.zeros((2, 6, 2)), "tau": np.zeros((2, 6)),
+        "rotation": np.eye(3), "iterations": 1,
+    }  # fmt: skip
+    with pytest.raises(ValueError, match=said):
+        solve_minimal("r6p_vcwt", **(given | changes))
+
+
+@pytest.mark.parametrize("name", list(SOLVERS))
+def test_no_samples_give_no_solutions(name):
+    n, k = SOLVERS[name].sample_size, SOLVERS[name].solutions
+    found = solve_minimal(name, np.zeros((0, n, 3)), np.zeros((0, n, 2)), np.zeros((0, n)))
+    assert [part.shape for part in found] == [(0, k, 3, 3), (0, k, 3), (0, k, 3), (0, k, 3)]
