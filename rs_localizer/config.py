@@ -138,9 +138,7 @@ class LocalizerConfig:
     def __post_init__(self) -> None:
         _check(self)
         if not isinstance(self.velocity_prior, VelocityPrior):
-            raise ValueError(
-                f"velocity_prior must be a VelocityPrior, got {self.velocity_prior!r}"
-            )
+            raise ValueError(f"velocity_prior must be a VelocityPrior, got {self.velocity_prior!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +169,4 @@ class NodeConfig(LocalizerConfig):
         "the exposure of the middle row",
         choices=tuple(time.value for time in PoseTime),
     )
-    autostart: bool = setting(
-        True, "Configure and activate the node at start", read_only=True
-    )
+    autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)

@@ -262,7 +262,11 @@ class Localizer:
         self, solver: Solver, block: int, score_scale: float, final_scale: float, prior: Array
     ) -> Hypotheses:
         def solve(
-            points: Array, rays: Array, tau: Array, samples: IntArray, rotations: Array,
+            points: Array,
+            rays: Array,
+            tau: Array,
+            samples: IntArray,
+            rotations: Array,
             models: Array,
         ) -> None:
             solver.solve(

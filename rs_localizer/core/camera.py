@@ -170,8 +170,10 @@ class Camera:
         """Pixel axis along which the shutter moves, its sign, and the sensor's size there."""
         columns = self.scan_direction in (ScanDirection.LEFT_TO_RIGHT, ScanDirection.RIGHT_TO_LEFT)
         forward = self.scan_direction in (ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT)
-        return (0, 1 if forward else -1, self.width) if columns else (
-            1, 1 if forward else -1, self.height
+        return (
+            (0, 1 if forward else -1, self.width)
+            if columns
+            else (1, 1 if forward else -1, self.height)
         )
 
     def _offset(self) -> Array:
@@ -184,8 +186,8 @@ class Camera:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the delivered image, in delivered pixels."""
-        width, height = (self.width, self.height) if self.roi is None else (
-            self.roi.width, self.roi.height
+        width, height = (
+            (self.width, self.height) if self.roi is None else (self.roi.width, self.roi.height)
         )
         return width // self.binning[0], height // self.binning[1]
 

@@ -141,9 +141,7 @@ def _inliers(observations: Observations, candidate: Candidate, scale: float) -> 
     return inliers
 
 
-def _missed(
-    inliers: BoolArray, pools: Sequence[Pool], drawn: IntArray, size: int
-) -> float:
+def _missed(inliers: BoolArray, pools: Sequence[Pool], drawn: IntArray, size: int) -> float:
     """Chance that none of the samples drawn from the pools held inliers alone."""
     missed = 1.0
     for pool, count in zip(pools, drawn, strict=True):

@@ -90,8 +90,15 @@ def solve_positive(matrix: Array, right: Array) -> tuple[Array, bool]:
 
 @kernel
 def _posterior(
-    data: Array, state: Array, gradient: Array, scale: float, softness: float,
-    prior: Array, noise: float, information: Array, slope: Array,
+    data: Array,
+    state: Array,
+    gradient: Array,
+    scale: float,
+    softness: float,
+    prior: Array,
+    noise: float,
+    information: Array,
+    slope: Array,
 ) -> float:
     """Normal equations and cost with the velocity prior, in squared pixels."""
     cost = normal_equations(data, state, gradient, scale, softness, information, slope)
@@ -105,8 +112,14 @@ def _posterior(
 
 @kernel
 def refine(
-    data: Array, start: Array, gradient: Array, scale: float, softness: float, prior: Array,
-    noise: float, iterations: int,
+    data: Array,
+    start: Array,
+    gradient: Array,
+    scale: float,
+    softness: float,
+    prior: Array,
+    noise: float,
+    iterations: int,
 ) -> tuple[Array, Array, float, bool]:
     """Minimize the robust cost of all points plus the prior.
 

@@ -125,9 +125,7 @@ class _View:
         for p, q in self.by_ray:
             depth = self.inverse_depth
             by_camera_point = [p * depth, q * depth, -((p * u + q * v) * depth)]
-            b = [
-                dot(by_camera_point, [self.turn[i][j] for i in range(3)]) for j in range(3)
-            ]
+            b = [dot(by_camera_point, [self.turn[i][j] for i in range(3)]) for j in range(3)]
             r = cross(b, self.shifted)
             r_alpha = cross(r, alpha)
             r_alpha2 = cross(r_alpha, alpha)
@@ -163,9 +161,7 @@ def _accumulate(values: list[Lanes]) -> Vector:
             totals.append(sums[k] + weighted[0][i] * first[j] + weighted[1][i] * second[j])
             k += 1
     for i in range(PARAMETERS):
-        totals.append(
-            sums[k + i] + weighted[0][i] * view.error[0] + weighted[1][i] * view.error[1]
-        )
+        totals.append(sums[k + i] + weighted[0][i] * view.error[0] + weighted[1][i] * view.error[1])
     totals.append(sums[-1] + cost)
     return totals
 

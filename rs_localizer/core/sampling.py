@@ -62,9 +62,7 @@ def _next(random: Any) -> Any:
 
 
 @kernel
-def draw(
-    pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, samples: Any
-) -> None:
+def draw(pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, samples: Any) -> None:
     """Fill ``samples`` (h,n) with distinct points of the pool, row by row.
 
     Sample ``h`` comes from the first ``prefixes[h]`` points, which must be at least n.

@@ -59,8 +59,14 @@ def best_models(
 
 @kernel
 def optimize(
-    states: Array, costs: Array, data: Array, gradient: Array, first_scale: float,
-    last_scale: float, prior: Array, noise: float,
+    states: Array,
+    costs: Array,
+    data: Array,
+    gradient: Array,
+    first_scale: float,
+    last_scale: float,
+    prior: Array,
+    noise: float,
 ) -> tuple[Array, float]:
     """Local optimisation of the states with finite cost; the best state and its truncated cost.
 

@@ -21,7 +21,12 @@ _solve_vcwt = r6p_vcwt.solve_batch
 
 @kernel
 def solve_batch(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""

@@ -64,9 +64,7 @@ def _real_root(c2: Any, c1: Any, c0: Any) -> Any:
     at_inflection = value(inflection)
     slope = c1 - c2 * c2 / 3.0
     plain = inflection - at_inflection / (slope + sqrt(sqrt(at_inflection * at_inflection)))
-    x = select(
-        discriminant > 0.0, select(at_left > 0.0, from_left, from_right), plain
-    )
+    x = select(discriminant > 0.0, select(at_left > 0.0, from_left, from_right), plain)
     for _ in range(_CUBIC_STEPS):
         x = x - value(x) / ((3.0 * x + (c2 + c2)) * x + c1)
     return x
@@ -197,7 +195,12 @@ _lanes = traced(_solve, _INPUTS)
 
 @kernel
 def solve_batch(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`; takes no initial rotation."""

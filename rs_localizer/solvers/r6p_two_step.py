@@ -79,9 +79,7 @@ def _first_step(sample: Sample, w: Vector, t: Vector | None) -> tuple[Vector, Ve
     return common[:3], translations[0], t if t is not None else translations[1]
 
 
-def _second_step(
-    sample: Sample, v: Vector, c: Vector, t: Vector | None
-) -> tuple[Vector, Vector]:
+def _second_step(sample: Sample, v: Vector, c: Vector, t: Vector | None) -> tuple[Vector, Vector]:
     """w and t given v, C, and given t where it is not None."""
     rays, tau = sample.rays, sample.tau
     turned = _turned(sample, v)
@@ -129,7 +127,12 @@ _vct_wt_lanes = traced(
 
 @kernel
 def solve_vc_wt(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
@@ -145,7 +148,12 @@ def solve_vc_wt(
 
 @kernel
 def solve_vct_w(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""
@@ -161,7 +169,12 @@ def solve_vct_w(
 
 @kernel
 def solve_vct_wt(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """Arguments and result as in :mod:`rs_localizer.solvers.batch`."""

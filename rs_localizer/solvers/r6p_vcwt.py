@@ -96,7 +96,12 @@ _frozen_end_lanes = traced(_frozen_end, _INPUTS + _STATE)
 
 @kernel
 def solve_batch(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """Relinearised; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
@@ -111,7 +116,12 @@ def solve_batch(
 
 @kernel
 def solve_batch_frozen(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """With v^ frozen, as published; arguments and result as :func:`solve_batch`."""

@@ -104,7 +104,12 @@ _lanes_as_published = traced(lambda values: _solve(values, fix_trace=False), _IN
 
 @kernel
 def solve_batch(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """Trace fixed; arguments and result as in :mod:`rs_localizer.solvers.batch`."""
@@ -118,7 +123,12 @@ def solve_batch(
 
 @kernel
 def solve_batch_as_published(
-    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, iterations: int,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    samples: Any,
+    rotations: Array,
+    iterations: int,
     models: Array,
 ) -> None:
     """With the gauge free, as published; arguments and result as :func:`solve_batch`."""

@@ -9,6 +9,7 @@ from rs_localizer.core.ransac import Candidate, Hypotheses, Observations, search
 from rs_localizer.core.sampling import Pool, generator
 
 NOTHING = Candidate(np.zeros(18), math.inf)
+IDENTITY = np.eye(3)
 
 
 class Solver:
@@ -47,7 +48,7 @@ def problem(scene):
     return make
 
 
-def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotations=(np.eye(3),),
+def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotations=(IDENTITY,),
         start=NOTHING, seed=1):  # fmt: skip
     hypotheses = Hypotheses(
         solve=solver, sample_size=6, solutions=1, block=50, score_scale=8.0, final_scale=2.0,
@@ -106,7 +107,9 @@ def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
 
 def test_pools_that_are_too_small_are_left_out(problem):
     observations, model, outliers = problem(0.0)
-    found = run(observations, Solver(model, outliers), [Pool(np.arange(5)), everything(observations)])
+    found = run(
+        observations, Solver(model, outliers), [Pool(np.arange(5)), everything(observations)]
+    )
     assert found.found
     nothing = run(observations, Solver(model, outliers), [Pool(np.arange(5))])
     assert not nothing.found

@@ -92,7 +92,9 @@ def test_the_minimum_has_no_slope_of_the_posterior(scene):
         )
 
     for e in np.eye(12):
-        slope = (posterior(apply_step(state, h * e)) - posterior(apply_step(state, -h * e))) / (2 * h)
+        slope = (posterior(apply_step(state, h * e)) - posterior(apply_step(state, -h * e))) / (
+            2 * h
+        )
         curvature = (
             posterior(apply_step(state, 1e-4 * e)) + posterior(apply_step(state, -1e-4 * e))
             - 2 * posterior(state)

@@ -14,7 +14,10 @@ DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"
 def test_the_error_is_measured_at_the_row_where_the_model_puts_the_point(scene, direction):
     camera, motion, points, true, measured = scene.frame(direction, speed=0.3, noise=0.3)
     found = residuals.squared_errors(
-        scene.pack(camera, points, measured), len(points), scene.state_of(motion), camera.row_time_gradient
+        scene.pack(camera, points, measured),
+        len(points),
+        scene.state_of(motion),
+        camera.row_time_gradient,
     )
     expected = np.linalg.norm(measured - true, axis=1)
     # The naive error, with the pose of the measured row, is off by up to a third here.
@@ -106,7 +109,11 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
 
 def test_robust_costs_are_those_of_the_formulas(scene):
     camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5)
-    data, state, gradient = scene.pack(camera, points, measured), scene.state_of(motion), np.zeros(2)
+    data, state, gradient = (
+        scene.pack(camera, points, measured),
+        scene.state_of(motion),
+        np.zeros(2),
+    )
     squared, c2 = residuals.squared_errors(data, len(points), state, gradient), 9.0
     assert (squared > c2).any()
     assert (squared < c2).any()

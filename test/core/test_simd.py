@@ -93,9 +93,7 @@ def test_least_squares_is_that_of_numpy(rows, columns):
 def test_a_singular_lane_is_not_finite_and_leaves_the_others_alone():
     given = values(9 + 3, seed=3)
     given[3:6, 2] = given[0:3, 2]  # two equal columns in lane 2
-    solution = run(
-        traced(lambda v: least_squares([v[0:3], v[3:6], v[6:9]], v[9:12]), 12), given, 3
-    )
+    solution = run(traced(lambda v: least_squares([v[0:3], v[3:6], v[6:9]], v[9:12]), 12), given, 3)
     size = np.abs(solution).max(axis=0)
     assert not size[2] < 1e12
     assert (np.delete(size, 2) < 1e3).all()
@@ -105,7 +103,7 @@ def test_cross_and_nearest_rotation():
     given = values(6)
     result = run(
         traced(
-            lambda v: [*cross(v[0:3], v[3:6]), *(x for row in nearest_rotation(v[0:3]) for x in row)],
+            lambda v: cross(v[0:3], v[3:6]) + [x for r in nearest_rotation(v[0:3]) for x in r],
             6,
         ),
         given, 12,

@@ -69,7 +69,7 @@ def two_step(points, rays, tau, rotation, iterations, first, second):
     for _ in range(iterations):
         for names in (first, second):
 
-            def residual(x, names=names):
+            def residual(x, names=names, now=now):
                 values = now | dict(zip(names, x.reshape(-1, 3), strict=True))
                 return cross_rows(rays, camera_points(points, tau, **values))
 
@@ -113,9 +113,7 @@ def oracle(name, points, rays, tau, rotation, iterations, as_published=False):
     return solve(points, rays, tau, rotation, iterations, as_published)
 
 
-def problem(
-    count, size, turn=0.0, travel=0.0, start_error=0.0, noise=0.0, seed=0, model="exact"
-):
+def problem(count, size, turn=0.0, travel=0.0, start_error=0.0, noise=0.0, seed=0, model="exact"):
     """Samples of points in [-1, 1]^3 seen from 2 to 3 away by a moving camera.
 
     ``model``: ``exact`` rotations (model A) or the ``double`` linearised one.

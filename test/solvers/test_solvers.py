@@ -134,7 +134,9 @@ def test_p3p_finds_the_solutions_that_opencv_finds(minimal):
         for turn, shift in zip(turns, shifts, strict=True):
             matrix = cv2.Rodrigues(turn)[0]
             seen = p.points[i] @ matrix.T + shift.T
-            if (seen[:, 2] <= 0).any() or np.abs(seen[:, :2] / seen[:, 2:] - p.rays[i]).max() > 1e-6:
+            if (seen[:, 2] <= 0).any() or np.abs(
+                seen[:, :2] / seen[:, 2:] - p.rays[i]
+            ).max() > 1e-6:
                 continue  # not a solution at all
             total += 1
             missing += not np.nanmin(np.abs(rotation[i] - matrix).max(axis=(1, 2))) < 1e-3
@@ -176,7 +178,8 @@ def test_turning_the_world_turns_only_the_rotation(minimal, name):
 def degenerate_samples(size, count, seed):
     """Random and adversarial samples: what a robust loop may draw by bad luck."""
     rng = np.random.default_rng(seed)
-    points = rng.uniform(-1, 1, (count, size, 3)) + [0, 0, 2.5]
+    points = rng.uniform(-1, 1, (count, size, 3))
+    points[..., 2] += 2.5
     rays = rng.uniform(-0.5, 0.5, (count, size, 2))
     tau = rng.uniform(-0.5, 0.5, (count, size))
     kind = rng.integers(0, 12, count)

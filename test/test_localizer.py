@@ -1,0 +1,309 @@
+"""The whole method on simulated frames whose truth comes from elsewhere: SciPy's rotations, and a
+root finder that looks for the row which sees a point."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+
+K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
+D = np.array([-0.1, 0.02, 0.001, 0.001, 0.0])
+DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
+READOUT = 0.03
+ROLLING = ["r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p", "joint"]
+
+
+def camera(**changes):
+    settings = {"width": 640, "height": 480, "K": K, "D": D, "readout_time": READOUT}
+    return rsl.Camera(**(settings | changes))
+
+
+class Path:
+    """A camera that turns at a constant body rate (rad/s) and moves straight (m/s, map axes)."""
+
+    def __init__(self, seed=0, turn=2.0, speed=2.0):
+        rng = np.random.default_rng(seed)
+        self.start = Rotation.random(random_state=seed)  # map_from_camera
+        self.rate = turn * rng.normal(size=3) / np.sqrt(3)
+        self.velocity = speed * rng.normal(size=3) / np.sqrt(3)
+        self.centre = rng.uniform(-1, 1, 3)
+
+    def pose(self, t):
+        """Rotation and position map_from_camera at t seconds from the middle row."""
+        turn = Rotation.from_rotvec(t * self.rate)
+        return (self.start * turn).as_matrix(), self.centre + t * self.velocity
+
+    def in_camera(self, point, t):
+        rotation, position = self.pose(t)
+        return rotation.T @ (point - position)
+
+
+def frame(cam, path, count=80, noise=0.0, outliers=0.0, seed=0, depth=(2.0, 5.0)):
+    """Points (n,3), raw pixels (n,2) and which are no outliers."""
+    rng = np.random.default_rng(seed)
+    points, pixels = [], []
+    while len(points) < count:
+        middle = np.array([*rng.uniform(-0.45, 0.45, 2), 1.0]) * rng.uniform(*depth)
+        rotation, position = path.pose(0.0)
+        point = rotation @ middle + position
+
+        def seen(tau, point=point):
+            return cam.project(path.in_camera(point, tau * cam.readout_time)[None])
+
+        def mismatch(tau, seen=seen):
+            return cam.row_time(seen(tau))[0] - tau
+
+        if mismatch(-0.5) < 0.0 or mismatch(0.5) > 0.0:
+            continue
+        pixel = seen(brentq(mismatch, -0.5, 0.5, xtol=1e-13))[0]
+        if cam.inside(pixel[None])[0]:
+            points.append(point)
+            pixels.append(pixel)
+    pixels = np.array(pixels) + noise * rng.normal(size=(count, 2))
+    wrong = np.arange(count) < outliers * count
+    pixels[wrong] = rng.uniform([0, 0], np.array(cam.size) - 1, (wrong.sum(), 2))
+    return np.array(points), pixels, ~wrong
+
+
+def angle(rotation, other):
+    return np.degrees(Rotation.from_matrix(rotation @ other.T).magnitude())
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_pose_and_velocities_without_noise_have_the_right_size_sign_and_frame(direction):
+    cam, path = camera(scan_direction=direction), Path(1)
+    result = rsl.Localizer(cam, velocity_prior=rsl.VelocityPrior(0.0, 0.0)).localize(
+        *frame(cam, path)[:2]
+    )
+    assert result
+    h = 1e-5
+    (rotation, position), (ahead, there), (_, before) = (path.pose(t) for t in (0.0, h, -h))
+    assert angle(result.rotation, rotation.T) < 1e-5
+    np.testing.assert_allclose(result.position, position, atol=1e-6)
+    np.testing.assert_allclose(
+        result.translation, -result.rotation @ result.position, atol=1e-12
+    )
+    rate = Rotation.from_matrix(rotation.T @ ahead).as_rotvec() / h
+    np.testing.assert_allclose(result.angular_velocity, READOUT * rate, atol=1e-6)
+    velocity = rotation.T @ (there - before) / (2 * h)
+    np.testing.assert_allclose(result.linear_velocity, READOUT * velocity, atol=1e-6)
+    for tau in (-0.5, 0.3):
+        rotation, position = path.pose(tau * READOUT)
+        estimated, translation = result.at(tau)
+        assert angle(estimated, rotation.T) < 1e-5
+        np.testing.assert_allclose(-estimated.T @ translation, position, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", ROLLING)
+def test_every_rolling_shutter_solver_finds_inliers_and_pose(solver):
+    cam = camera()
+    localizer = rsl.Localizer(cam, solver=solver)
+    for seed in range(3):
+        path = Path(seed)
+        points, pixels, inliers = frame(cam, path, 120, noise=0.5, outliers=0.4, seed=seed)
+        result = localizer.localize(points, pixels)
+        assert result, str(result)
+        assert (result.inliers == inliers).mean() > 0.97
+        rotation, position = path.pose(0.0)
+        assert angle(result.rotation, rotation.T) < 0.3
+        assert np.linalg.norm(result.position - position) < 0.03
+        assert np.degrees(np.linalg.norm(result.angular_velocity - READOUT * path.rate)) < 0.8
+        assert 0.3 < result.residual_rms / np.sqrt(2) < 0.7
+        assert result.global_shutter_inliers < 0.8 * inliers.sum()
+
+
+def test_p3p_is_a_global_shutter_and_knows_no_motion():
+    cam, still, moving = camera(), Path(3, 0.0, 0.0), Path(3, 3.0, 2.0)
+    localizer = rsl.Localizer(cam, solver="p3p")
+    points, pixels, inliers = frame(cam, still, 100, noise=0.5, outliers=0.3)
+    result = localizer.localize(points, pixels)
+    assert (result.inliers == inliers).mean() > 0.97
+    assert angle(result.rotation, still.pose(0)[0].T) < 0.2
+    np.testing.assert_allclose(result.angular_velocity, 0.0, atol=1e-12)
+    np.testing.assert_allclose(result.linear_velocity, 0.0, atol=1e-12)
+    points, pixels, inliers = frame(cam, moving, 100, noise=0.5, outliers=0.3)
+    lost = localizer.localize(points, pixels)
+    assert not lost or lost.inliers.sum() < 0.5 * inliers.sum()
+    assert rsl.Localizer(cam).localize(points, pixels).inliers.sum() > 0.95 * inliers.sum()
+
+
+def test_same_seed_same_bits_and_no_memory_of_earlier_frames():
+    cam = camera()
+    data = [frame(cam, Path(seed), 60, 0.5, 0.3, seed)[:2] for seed in (1, 2)]
+    localizer = rsl.Localizer(cam, seed=7)
+    first = localizer.localize(*data[0])
+    localizer.localize(*data[1])
+    for again in (localizer.localize(*data[0]), rsl.Localizer(cam, seed=7).localize(*data[0])):
+        for name in ("rotation", "translation", "angular_velocity", "linear_velocity",
+                     "covariance", "inliers", "residuals"):  # fmt: skip
+            np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+
+
+def test_a_far_origin_and_turned_map_change_nothing_but_the_map():
+    cam, path = camera(), Path(4)
+    points, pixels, _ = frame(cam, path, 80, 0.5, 0.3)
+    here = rsl.Localizer(cam).localize(points, pixels)
+    turn, shift = Rotation.random(random_state=5).as_matrix(), np.array([5e6, -4e6, 3e5])
+    there = rsl.Localizer(cam).localize(points @ turn.T + shift, pixels)
+    assert angle(there.rotation, here.rotation @ turn.T) < 1e-4
+    np.testing.assert_allclose(there.position, turn @ here.position + shift, atol=1e-5)
+    np.testing.assert_allclose(there.linear_velocity, here.linear_velocity, atol=1e-5)
+    np.testing.assert_array_equal(there.inliers, here.inliers)
+
+
+def test_binning_and_roi_give_the_same_pose():
+    path = Path(6)
+    whole = camera()
+    part = camera(binning=(2, 2), roi=rsl.Roi(64, 48, 512, 384))
+    points, pixels, _ = frame(part, path, 60)
+    result = rsl.Localizer(part, velocity_prior=rsl.VelocityPrior(0, 0)).localize(points, pixels)
+    again = rsl.Localizer(whole, velocity_prior=rsl.VelocityPrior(0, 0)).localize(
+        points, pixels * 2 + (64, 48)
+    )
+    for estimate in (result, again):
+        assert angle(estimate.rotation, path.pose(0)[0].T) < 1e-4
+        np.testing.assert_allclose(estimate.angular_velocity, READOUT * path.rate, atol=1e-5)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_scores_help_when_right_and_do_not_harm_when_wrong(right):
+    cam, path = camera(), Path(8)
+    points, pixels, inliers = frame(cam, path, 150, 0.5, 0.6)
+    scores = inliers + 0.1 * np.random.default_rng(0).normal(size=150)
+    result = rsl.Localizer(cam).localize(points, pixels, scores if right else -scores)
+    assert (result.inliers == inliers).mean() > 0.97
+
+
+def test_covariance_covers_the_error():
+    """Mahalanobis distances against the chi-squared distribution with 12 degrees of freedom."""
+    cam = camera()
+    localizer = rsl.Localizer(cam)
+    distances = []
+    for seed in range(60):
+        path = Path(seed, 1.0, 1.0)
+        result = localizer.localize(*frame(cam, path, 80, noise=0.5, seed=seed)[:2])
+        rotation, position = path.pose(0.0)
+        error = np.concatenate(
+            [
+                Rotation.from_matrix(result.rotation @ rotation).as_rotvec(),
+                result.rotation @ (position - result.position),
+                READOUT * path.rate - result.angular_velocity,
+                READOUT * rotation.T @ path.velocity - result.linear_velocity,
+            ]
+        )
+        distances.append(error @ np.linalg.solve(result.covariance, error))
+    # Median 11.34; with 60 draws it stays within these bounds unless a scale is off by a quarter.
+    assert 9.0 < np.median(distances) < 14.5
+    assert np.mean(np.array(distances) < 21.03) > 0.85
+
+
+def test_random_matches_have_no_pose():
+    cam = camera()
+    rng = np.random.default_rng(0)
+    localizer = rsl.Localizer(cam)
+    for _ in range(10):
+        points = rng.uniform([-2, -2, 3], [2, 2, 7], (100, 3))
+        result = localizer.localize(points, rng.uniform([0, 0], [639, 479], (100, 2)))
+        assert not result
+        assert result.reason == rsl.Reason.TOO_FEW_INLIERS
+        assert "12 are needed" in result.detail
+
+
+@pytest.mark.parametrize("count", [0, 1, 11])
+def test_too_few_points_are_a_failure_and_no_error(count):
+    result = rsl.Localizer(camera()).localize(np.zeros((count, 3)), np.zeros((count, 2)))
+    assert not result
+    assert result.reason == rsl.Reason.TOO_FEW_POINTS
+    assert f"{count} usable points of {count}, 12 are needed" in str(result)
+
+
+def test_pixels_beyond_the_lens_are_left_out_and_marked():
+    cam = camera(D=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
+    points, pixels, _ = frame(camera(D=np.zeros(0)), Path(0, 0, 0), 40)
+    pixels[0] = (3000.0, 239.5)
+    result = rsl.Localizer(cam, inlier_threshold=500.0).localize(points, pixels)
+    assert result
+    assert not result.inliers[0]
+    assert np.isnan(result.residuals[0])
+    assert np.isfinite(result.residuals[1:]).all()
+
+
+def adversarial():
+    rng = np.random.default_rng(0)
+    n = 30
+    pixels = rng.uniform([0, 0], [639, 479], (n, 2))
+    yield "one point", np.ones((n, 3)), pixels
+    yield "one pixel", rng.normal(size=(n, 3)), np.full((n, 2), 100.0)
+    yield "all the same", np.ones((n, 3)), np.full((n, 2), 100.0)
+    yield "a line", np.outer(np.arange(n), [1.0, 2.0, 3.0]), pixels
+    yield "one row", rng.normal(size=(n, 3)), np.column_stack([pixels[:, 0], np.full(n, 7.0)])
+    yield "huge points", 1e200 * rng.normal(size=(n, 3)), pixels
+    yield "tiny points", 1e-200 * rng.normal(size=(n, 3)), pixels
+    yield "far pixels", rng.normal(size=(n, 3)), 1e12 * pixels
+
+
+@pytest.mark.parametrize(
+    ("points", "pixels"), [case[1:] for case in adversarial()], ids=[c[0] for c in adversarial()]
+)
+@pytest.mark.parametrize("solver", ["p3p", "r6p_vcwt", "r9p", "joint"])
+def test_no_input_crashes_or_warns(solver, points, pixels):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = rsl.Localizer(camera(D=np.zeros(0)), solver=solver).localize(points, pixels)
+    if result:
+        assert np.isfinite(result.covariance).all()
+        assert np.isfinite(result.rotation).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((np.zeros((4, 2)), np.zeros((4, 2))), r"points must be \(n,3\)"),
+        ((np.zeros((4, 3)), np.zeros((5, 2))), r"got \(4, 3\) and \(5, 2\)"),
+        ((np.zeros((4, 3)), np.full((4, 2), np.nan)), "pixels must be finite"),
+        ((np.full((4, 3), np.inf), np.zeros((4, 2))), "points must be finite"),
+        ((np.zeros((4, 3)), np.zeros((4, 2)), np.zeros(3)), r"scores must be \(4,\), got \(3,\)"),
+    ],
+)
+def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        rsl.Localizer(camera()).localize(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"solver": "epnp"}, "solver must be one of p3p, .*; got 'epnp'"),
+        ({"solver": "r6p"}, "r6p .* not available in this version"),
+        ({"inlier_threshold": -1.0}, "inlier_threshold must lie between .* got -1.0"),
+        ({"max_iterations": 2.5}, "max_iterations must be of type int, got 2.5"),
+        ({"iterations": 3}, "unknown setting: .*iterations"),
+        ({"velocity_prior": 0.1}, "velocity_prior must be a VelocityPrior, got 0.1"),
+    ],
+)
+def test_wrong_settings_are_refused_with_what_was_found(settings, said):
+    with pytest.raises(ValueError, match=said):
+        rsl.Localizer(camera(), **settings)
+
+
+def test_config_and_settings_exclude_each_other():
+    with pytest.raises(ValueError, match="either config or settings, got both: seed"):
+        rsl.Localizer(camera(), rsl.LocalizerConfig(), seed=1)
+
+
+def test_warming_up_compiles_all_that_a_frame_needs():
+    from rs_localizer.core import refine, residuals, scoring
+
+    cam = camera()
+    localizer = rsl.Localizer(cam, solver="joint")
+    localizer.warm_up()
+    kernels = [refine.refine, residuals.pack, residuals.squared_errors, residuals.set_weights,
+               scoring.best_models, scoring.optimize]  # fmt: skip
+    before = [len(kernel.signatures) for kernel in kernels]
+    points, pixels, inliers = frame(cam, Path(0), 40, 0.5, 0.2)
+    assert localizer.localize(points, pixels, inliers.astype(float))
+    assert [len(kernel.signatures) for kernel in kernels] == before
