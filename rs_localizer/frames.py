@@ -9,7 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from rs_localizer.config import NodeConfig, PoseTime
+from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration, read_camera_info
@@ -30,6 +33,18 @@ _ANY_CALIBRATION = Calibration(
     "camera", 640, 480, (500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0), (), "plumb_bob",
     (1, 1), None,
 )  # fmt: skip
+# Something to publish before there is anything.
+_STILL = Estimate(
+    rotation=np.eye(3),
+    translation=np.zeros(3),
+    angular_velocity=np.zeros(3),
+    linear_velocity=np.zeros(3),
+    inliers=np.zeros(0, dtype=np.bool_),
+    residuals=np.zeros(0),
+    covariance=np.zeros((12, 12)),
+    global_shutter_inliers=0,
+    iterations=0,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +88,10 @@ class FrameLocalizer:
         self._config = config
 
     def warm_up(self) -> None:
-        """Compile all that the present settings need."""
+        """Compile all that the present settings need, from points to messages."""
         self._localizer.warm_up()
+        so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
+        twist_at(_STILL, 0.5, 1.0)
 
     def take_camera_info(self, message: Any) -> None:
         """Use this sensor_msgs/CameraInfo from the next frame on.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -31,12 +33,18 @@ _OUTPUT_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
 class LocalizerNode(LifecycleNode):
     """A managed node; only while active it takes and publishes messages.
 
+    Args:
+        compiling: entered while kernels are compiled.
+
     Raises:
         ValueError: when it is started with parameters that are refused, saying what was found.
     """
 
-    def __init__(self, **kwargs) -> None:
+    def __init__(
+        self, compiling: Callable[[], AbstractContextManager[None]] = nullcontext, **kwargs
+    ) -> None:
         super().__init__(NODE_NAME, **kwargs)
+        self._compiling = compiling
         config = parameters.declare(self)
         FrameLocalizer(config)  # refuses what it cannot do
         parameters.on_change(self, check=FrameLocalizer, apply=self._take_config)
@@ -51,7 +59,7 @@ class LocalizerNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             frames = FrameLocalizer(parameters.read(self))
-            frames.warm_up()
+            self._warm_up(frames)
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
@@ -117,7 +125,7 @@ class LocalizerNode(LifecycleNode):
     def _take_config(self, config: NodeConfig) -> None:
         if self._frames is not None:
             self._frames.config = config
-            self._frames.warm_up()
+            self._warm_up(self._frames)
 
     def _take_camera_info(self, message: CameraInfo) -> None:
         try:
@@ -133,6 +141,10 @@ class LocalizerNode(LifecycleNode):
         for name, output in messages(result, make_message).items():
             self._outputs[name].publish(output)
 
+    def _warm_up(self, frames: FrameLocalizer) -> None:
+        with self._compiling():
+            frames.warm_up()
+
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
 
@@ -141,7 +153,7 @@ def main(args: list[str] | None = None) -> int:
     """Run the node until Ctrl-C or SIGTERM; the exit code."""
     with StopSignals() as stop:
         try:
-            return _run(args)
+            return _run(args, stop)
         except (KeyboardInterrupt, ExternalShutdownException):
             return 0
         except Exception:
@@ -153,10 +165,10 @@ def main(args: list[str] | None = None) -> int:
             rclpy.try_shutdown()
 
 
-def _run(args: list[str] | None) -> int:
+def _run(args: list[str] | None, stop: StopSignals) -> int:
     try:
         rclpy.init(args=args)
-        node = LocalizerNode()
+        node = LocalizerNode(compiling=stop.at_once)
     except (ValueError, RuntimeError) as error:
         rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
         return 1

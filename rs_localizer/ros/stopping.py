@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
+from collections.abc import Iterator
 from types import FrameType
 from typing import Self
 
@@ -11,7 +14,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 class StopSignals:
     """Within ``with``, the first SIGINT or SIGTERM raises KeyboardInterrupt wherever the main
-    thread is, so that compiling ends as well; more of them change nothing.
+    thread is; more of them change nothing.
 
     Enter it before ``rclpy.init``: rclpy's own handlers, which wake a waiting executor, call
     those that they found. Leaving it ignores both signals for good, since the process is about to
@@ -20,6 +23,7 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.requested = False
+        self._at_once = False
 
     def __enter__(self) -> Self:
         for number in _SIGNALS:
@@ -30,7 +34,22 @@ class StopSignals:
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
+    @contextlib.contextmanager
+    def at_once(self) -> Iterator[None]:
+        """While compiling: a signal ends the process here and now, with exit code 0.
+
+        Compiling takes up to a minute and calls back from C, where an exception is printed and
+        lost. Nothing is published meanwhile, and the cache on disk is written atomically.
+        """
+        self._at_once = True
+        try:
+            yield
+        finally:
+            self._at_once = False
+
     def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self._at_once:
+            os._exit(0)
         if not self.requested:
             self.requested = True
             raise KeyboardInterrupt

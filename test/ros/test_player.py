@@ -1,0 +1,113 @@
+"""``rs_localizer replay --ros``: the recording's messages in the graph, paced, with /clock."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.lab.recording import write_frame
+
+FRAMES = 8
+PERIOD_NS = 100_000_000
+START_NS = 1_700_000_000_000_000_000
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / "bag") as bag:
+        for i in range(FRAMES):
+            points, pixels = rng.normal(size=(20, 3)), rng.uniform(0, 400, size=(20, 2))
+            stamp_ns = START_NS + i * PERIOD_NS
+            write_frame(bag, Camera(640, 480, K), stamp_ns, points, pixels, np.arange(20))
+    return tmp_path / "bag"
+
+
+def play(recording: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", "replay", str(recording), "--ros", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def test_everything_arrives_in_scaled_time(recording: Path, peer: Any) -> None:
+    clouds: list[PointCloud2] = []
+    infos: list[CameraInfo] = []
+    clocks: list[tuple[float, int]] = []
+    subscribe = peer.node.create_subscription
+    subscribe(PointCloud2, "/correspondences", clouds.append, qos_profile_sensor_data)
+    subscribe(CameraInfo, "/camera_info", infos.append, qos_profile_sensor_data)
+    subscribe(
+        Clock,
+        "/clock",
+        lambda message: clocks.append((time.monotonic(), nanoseconds(message.clock))),
+        qos_profile_sensor_data,
+    )
+    player = play(recording, "--rate", "0.5")
+    assert peer.spin_until(lambda: player.poll() is not None)
+    assert player.communicate() == ("", "")
+    assert player.returncode == 0
+    peer.spin_until(lambda: len(clouds) == FRAMES, 1.0)
+
+    with open_bag(recording) as bag:
+        recorded = [message for _, _, message in bag.messages(["/correspondences"])]
+    assert [nanoseconds(c.header.stamp) for c in clouds] == [
+        nanoseconds(message.header.stamp) for message in recorded
+    ]
+    assert all(bytes(c.data) == m.data.tobytes() for c, m in zip(clouds, recorded, strict=True))
+    assert len(infos) == FRAMES
+    assert infos[0].k.tolist() == K.ravel().tolist()
+    times, stamps = np.array([t for t, _ in clocks]), np.array([s for _, s in clocks])
+    assert np.all(np.diff(stamps) >= 0)
+    assert stamps[-1] == START_NS + (FRAMES - 1) * PERIOD_NS
+    assert len(stamps) > 5 * FRAMES
+    assert (stamps[-1] - stamps[0]) * 1e-9 / (times[-1] - times[0]) == pytest.approx(0.5, abs=0.1)
+
+
+def test_ctrl_c_ends_it_in_one_line(recording: Path, peer: Any) -> None:
+    heard: list[PointCloud2] = []
+    for kind, topic in ((PointCloud2, "/correspondences"), (CameraInfo, "/camera_info")):
+        peer.node.create_subscription(kind, topic, heard.append, qos_profile_sensor_data)
+    player = play(recording, "--rate", "0.01")
+    assert peer.spin_until(lambda: heard)
+    player.send_signal(signal.SIGINT)
+    player.send_signal(signal.SIGINT)
+    output, errors = player.communicate(timeout=30)
+    assert (player.returncode, output) == (1, "")
+    assert errors == "rs_localizer replay: interrupted\n"
+
+
+def test_without_ros_it_says_what_is_missing(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "rclpy.py").write_text("raise ImportError(\"No module named 'rclpy'\")")
+    done = subprocess.run(
+        [sys.executable, "-m", "rs_localizer", "replay", str(recording), "--ros"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    text = "rs_localizer replay: --ros needs ROS 2 (No module named 'rclpy')"
+    assert done.stderr.startswith(text)
+    assert done.stderr.count("\n") == 1
