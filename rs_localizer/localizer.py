@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.ransac import Candidate, Hypotheses, Observations, search
-from rs_localizer.core.refine import Posterior, invert_information, refine
-from rs_localizer.core.residuals import set_weights
+from rs_localizer.core.posterior import Posterior, maximum_a_posteriori, prefer_rest
+from rs_localizer.core.prior import (
+    Prior,
+    PriorTerms,
+    held_terms,
+    state_in,
+    velocity_terms,
+    with_prior,
+)
+from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, Observations, search
 from rs_localizer.core.sampling import IntArray, Pool, Random, generator
 from rs_localizer.core.scoring import optimize
 from rs_localizer.core.so3 import Array
@@ -25,24 +33,32 @@ _POOL_SCALE = 0.12
 # Minimal models are scored at this multiple of the inlier threshold: noise makes a six-point
 # model miss the other inliers by several times their own noise.
 _SCORE_SCALE = 4.0
+# A prediction may be off by this multiple of the inlier threshold.
+_PREDICTION_SCALE = 16.0
+# Points that agree with a prediction's optimum, as a share of those that agreed before.
+_STILL_TRACKED = 0.7
 _GLOBAL_SHUTTER_BLOCK = 48
 _BLOCK = 64
 _GLOBAL_SHUTTER_MOST_SAMPLES = 384
-# Velocities of a global-shutter motion are held at zero by a prior.
-_HELD = np.full(6, 1e18)
-# Inliers of the final estimate lie within this many standard deviations of the measured noise
-# (99.8 % of Rayleigh-distributed errors), but the threshold is widened at most twofold.
-_GATE = 3.5
-_WIDEST = 2.0
-_FINAL_ROUNDS = 3
-_FINAL_ITERATIONS = 10
-# Positions of image points are never better than this, in pixels; it also keeps noise-free data
-# from claiming an infinite information.
-_LEAST_NOISE = 1e-4
 # Of the information matrix scaled to a unit diagonal.
 _LEAST_EIGENVALUE = 1e-11
-# Beyond this the camera turns by more than the motion model is meant for.
+# Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5
+# Errors as large as the gate lets them be are those of points strewn over it.
+_MOST_NOISE = 1.0  # inlier thresholds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """One frame on its way through the steps."""
+
+    observations: Observations
+    usable: IntArray  # which of the given points are observed
+    count: int  # of the given points
+    centre: Array  # (3,) map frame: origin of the observed points
+    ranking: IntArray | None  # observed points from the best to the worst
+    terms: PriorTerms  # velocity prior and whatever else is known but the pose
+    random: Random
 
 
 class Localizer:
@@ -79,7 +95,12 @@ class Localizer:
         self.localize(depth[:, None] * np.column_stack([rays, np.ones(len(rays))]), pixels)
 
     def localize(
-        self, points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None = None
+        self,
+        points: ArrayLike,
+        pixels: ArrayLike,
+        scores: ArrayLike | None = None,
+        prior: Prior | None = None,
+        expected_share: float = 0.5,
     ) -> Estimate | Failure:
         """Estimate pose and velocities from one frame.
 
@@ -87,6 +108,9 @@ class Localizer:
             points: (n,3) in the map frame, metres.
             pixels: (n,2) raw image coordinates, first pixel centre at 0, 0.
             scores: (n,) quality of the matches, higher is better.
+            prior: what else is known of the motion. A prior motion is also a first guess; if the
+                points do not agree with it, it is dropped and the whole search runs.
+            expected_share: share of inliers among the points that a prior motion should find.
 
         Returns:
             an :class:`Estimate`, or a :class:`Failure` with its reason. Same seed and same input
@@ -104,7 +128,35 @@ class Localizer:
                 f"{len(usable)} usable points of {len(points)}, "
                 f"{self.config.min_inliers} are needed",
             )
+        frame = self._frame(points, pixels, rays, usable, scores, prior)
+        if prior is not None and prior.motion is not None:
+            tracked = self._track(frame, prior, expected_share)
+            if tracked:
+                return tracked
+        start = self._global_shutter(frame)
+        if not start.found:
+            return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
+        best = self._motion(frame, start)
+        return self._accept(frame, start, best, self._final(frame, best, frame.terms))
+
+    # -- steps ------------------------------------------------------------------------------
+
+    def _frame(
+        self,
+        points: Array,
+        pixels: Array,
+        rays: Array,
+        usable: IntArray,
+        scores: Array | None,
+        prior: Prior | None,
+    ) -> _Frame:
         centre = points[usable].mean(axis=0)
+        deviations = self.config.velocity_prior
+        terms = (
+            velocity_terms(deviations.angular, deviations.linear)
+            if self._solver.rolling_shutter
+            else held_terms()
+        )
         observations = Observations.of(
             points[usable] - centre,
             rays[usable],
@@ -112,106 +164,109 @@ class Localizer:
             self.camera.pixel_jacobian(rays[usable]),
             self.camera.row_time_gradient,
         )
-        ranking = None if scores is None else np.argsort(-scores[usable], kind="stable")
-        random = generator(self.config.seed)
+        return _Frame(
+            observations,
+            usable,
+            len(points),
+            centre,
+            None if scores is None else np.argsort(-scores[usable], kind="stable"),
+            terms if prior is None else with_prior(terms, prior.without_motion(), centre),
+            generator(self.config.seed),
+        )
 
-        start = self._global_shutter(observations, ranking, random)
-        if not start.found:
-            return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
-        best = self._motion(observations, ranking, start, random)
-        posterior = self._final(observations, best)
-        return self._result(observations, usable, len(points), centre, start, best, posterior)
+    def _track(self, frame: _Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
+        """The motion nearest to the prior one, if the points agree with it."""
+        assert prior.motion is not None
+        threshold = self.config.inlier_threshold
+        predicted = state_in(prior.motion, frame.centre)
+        terms = with_prior(frame.terms, prior.motion_only(), frame.centre)
+        best = self._optimize(frame, predicted, _PREDICTION_SCALE * threshold, terms)
+        start = Candidate(predicted, best.cost)
+        result = self._accept(frame, start, best, self._final(frame, best, terms))
+        if result and np.count_nonzero(result.inliers) < (
+            _STILL_TRACKED * expected_share * len(frame.usable)
+        ):
+            return Failure(
+                Reason.TOO_FEW_INLIERS,
+                f"{np.count_nonzero(result.inliers)} inliers near the prior motion, "
+                f"{expected_share:.0%} of {len(frame.usable)} were expected",
+            )
+        return result
 
-    # -- steps ------------------------------------------------------------------------------
-
-    def _global_shutter(
-        self, observations: Observations, ranking: IntArray | None, random: Random
-    ) -> Candidate:
+    def _global_shutter(self, frame: _Frame) -> Candidate:
         """A pose that fits all rows roughly, by P3P and a wide threshold."""
-        rolling = self._solver.rolling_shutter
         threshold = self.config.inlier_threshold
         wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
+        most = self.config.max_iterations
+        if self._solver.rolling_shutter:
+            score_scale, final_scale = wide, wide
+            most = min(_GLOBAL_SHUTTER_MOST_SAMPLES, most)
+        else:
+            score_scale, final_scale = _SCORE_SCALE * threshold, threshold
         hypotheses = self._hypotheses(
-            find_solver("p3p"),
-            block=_GLOBAL_SHUTTER_BLOCK,
-            score_scale=wide if rolling else _SCORE_SCALE * threshold,
-            final_scale=wide if rolling else threshold,
-            prior=_HELD,
+            find_solver("p3p"), _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
         )
         return search(
-            observations, hypotheses, [np.eye(3)], _pools(observations, ranking), _NOTHING,
+            frame.observations,
+            hypotheses,
+            [np.eye(3)],
+            _pools(frame),
+            NOTHING,
             self.config.confidence,
-            min(_GLOBAL_SHUTTER_MOST_SAMPLES, self.config.max_iterations)
-            if rolling
-            else self.config.max_iterations,
-            random,
-        )  # fmt: skip
+            most,
+            frame.random,
+        )
 
-    def _motion(
-        self, observations: Observations, ranking: IntArray | None, start: Candidate, random: Random
-    ) -> Candidate:
+    def _motion(self, frame: _Frame, start: Candidate) -> Candidate:
         """The motion that most points agree on, from the solver's hypotheses."""
         if not self._solver.rolling_shutter:
             return start
         threshold = self.config.inlier_threshold
-        errors = observations.squared_errors(start.state)
+        errors = frame.observations.squared_errors(start.state)
         near = np.flatnonzero(errors < (_POOL_SCALE * self._focal_length) ** 2)
-        hypotheses = self._hypotheses(
-            self._solver,
-            block=_BLOCK,
-            score_scale=_SCORE_SCALE * threshold,
-            final_scale=threshold,
-            prior=self._prior,
-        )
         # The global-shutter pose is a hypothesis, too: at rest it is the best one.
-        state, cost = optimize(
-            start.state[None], np.zeros(1), observations.packed, observations.row_time_gradient,
-            _POOL_SCALE * self._focal_length, threshold, self._prior, hypotheses.noise,
-        )  # fmt: skip
-        pools = [Pool(near), *_pools(observations, ranking)]
+        first = self._optimize(frame, start.state, _POOL_SCALE * self._focal_length, frame.terms)
+        hypotheses = self._hypotheses(
+            self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, frame.terms
+        )
         return search(
-            observations, hypotheses, [start.state[:9].reshape(3, 3)], pools,
-            Candidate(state, cost), self.config.confidence, self.config.max_iterations, random,
-        )  # fmt: skip
+            frame.observations,
+            hypotheses,
+            [start.state[:9].reshape(3, 3)],
+            [Pool(near), *_pools(frame)],
+            first,
+            self.config.confidence,
+            self.config.max_iterations,
+            frame.random,
+        )
 
-    def _final(self, observations: Observations, best: Candidate) -> Posterior:
-        """The maximum a posteriori motion of the inliers, which its noise decides."""
+    def _final(self, frame: _Frame, best: Candidate, terms: PriorTerms) -> Posterior:
+        """The maximum a posteriori motion of the inliers, or rest if they show no motion."""
         threshold = self.config.inlier_threshold
-        prior = self._prior if self._solver.rolling_shutter else _HELD
-        state, gate, freedom = best.state, threshold, 0.0
-        errors = observations.squared_errors(state)
-        for _ in range(_FINAL_ROUNDS):
-            noise = noise_deviation(errors, gate, freedom)
-            gate = min(max(threshold, _GATE * noise), _WIDEST * threshold)
-            set_weights(observations.packed, (errors < gate * gate).astype(np.float64))
-            state, information, _, _ = refine(
-                observations.packed, state, observations.row_time_gradient, 1e6, 0.0, prior,
-                noise, _FINAL_ITERATIONS,
-            )  # fmt: skip
-            errors = observations.squared_errors(state)
-            inverse, smallest = invert_information(information)
-            # The prior takes a part of the twelve degrees of freedom.
-            freedom = 12.0 - noise**2 * float(prior @ np.diag(inverse)[6:])
-        noise = noise_deviation(errors, gate, freedom)
-        return Posterior(state, noise**2 * inverse, smallest, errors < gate * gate, errors)
+        posterior = maximum_a_posteriori(frame.observations, best.state, terms, threshold)
+        # Only the velocity prior of the configuration says nothing of this very frame.
+        uninformed = len(terms.informations) == 1 and self._solver.rolling_shutter
+        if uninformed and posterior.smallest_eigenvalue > _LEAST_EIGENVALUE:
+            return prefer_rest(frame.observations, posterior)
+        return posterior
 
-    def _result(
-        self,
-        observations: Observations,
-        usable: IntArray,
-        count: int,
-        centre: Array,
-        start: Candidate,
-        best: Candidate,
-        posterior: Posterior,
+    def _accept(
+        self, frame: _Frame, start: Candidate, best: Candidate, posterior: Posterior
     ) -> Estimate | Failure:
         """Accept the motion or say what is wrong with it."""
-        found = int(np.count_nonzero(posterior.inliers))
-        if found < self.config.min_inliers:
+        state = posterior.state
+        found, needed = int(np.count_nonzero(posterior.inliers)), self.config.min_inliers
+        if found < needed:
+            behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
+            if 2 * behind > len(frame.usable):
+                return Failure(
+                    Reason.BEHIND_CAMERA,
+                    f"{behind} of {len(frame.usable)} points lie behind the camera",
+                )
             return Failure(
                 Reason.TOO_FEW_INLIERS,
-                f"{found} inliers of {len(usable)} points after {best.samples} samples, "
-                f"{self.config.min_inliers} are needed",
+                f"{found} inliers of {len(frame.usable)} points after {best.samples} samples, "
+                f"{needed} are needed",
             )
         if not posterior.smallest_eigenvalue > _LEAST_EIGENVALUE:
             return Failure(
@@ -219,27 +274,47 @@ class Localizer:
                 f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
                 f"information {posterior.smallest_eigenvalue:.1e}",
             )
-        state = posterior.state
+        threshold = self.config.inlier_threshold
+        if posterior.noise > _MOST_NOISE * threshold:
+            return Failure(
+                Reason.RESIDUAL,
+                f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
+                f"inlier_threshold of {threshold:g} px: no motion fits them",
+            )
         turn = float(np.linalg.norm(state[12:15]))
         if turn > _MOST_TURN:
             return Failure(
                 Reason.IMPLAUSIBLE,
                 f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
             )
+        depth = _median_depth(frame.observations.points[posterior.inliers], state)
+        travel = float(np.linalg.norm(state[15:18]))
+        if travel > depth:
+            return Failure(
+                Reason.IMPLAUSIBLE,
+                f"the camera would move by {travel:.3g} m per readout in front of points "
+                f"{depth:.3g} m away",
+            )
+        return self._estimate(frame, start, best, posterior)
+
+    def _estimate(
+        self, frame: _Frame, start: Candidate, best: Candidate, posterior: Posterior
+    ) -> Estimate:
+        state = posterior.state
         rotation = state[:9].reshape(3, 3)
-        residuals = np.full(count, np.nan)
-        residuals[usable] = np.sqrt(posterior.squared_errors)
-        inliers = np.zeros(count, dtype=np.bool_)
-        inliers[usable] = posterior.inliers
+        residuals = np.full(frame.count, np.nan)
+        residuals[frame.usable] = np.sqrt(posterior.squared_errors)
+        inliers = np.zeros(frame.count, dtype=np.bool_)
+        inliers[frame.usable] = posterior.inliers
         return Estimate(
             rotation=rotation,
-            translation=state[9:12] - rotation @ centre,
+            translation=state[9:12] - rotation @ frame.centre,
             angular_velocity=state[12:15],
             linear_velocity=state[15:18],
             inliers=inliers,
             residuals=residuals,
             covariance=posterior.covariance,
-            global_shutter_inliers=self._global_shutter_inliers(observations, start),
+            global_shutter_inliers=self._global_shutter_inliers(frame, start),
             iterations=best.samples,
         )
 
@@ -252,15 +327,20 @@ class Localizer:
         return float(math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1]))
 
     @property
-    def _prior(self) -> Array:
-        deviations = self.config.velocity_prior
-        return np.repeat(
-            [0.0 if d == 0.0 else d**-2 for d in (deviations.angular, deviations.linear)], 3
-        )
+    def _expected_noise(self) -> float:
+        """px, before it has been measured."""
+        return 0.5 * self.config.inlier_threshold
 
     def _hypotheses(
-        self, solver: Solver, block: int, score_scale: float, final_scale: float, prior: Array
+        self,
+        solver: Solver,
+        block: int,
+        score_scale: float,
+        final_scale: float,
+        terms: PriorTerms,
     ) -> Hypotheses:
+        iterations = self.config.solver_iterations
+
         def solve(
             points: Array,
             rays: Array,
@@ -269,9 +349,7 @@ class Localizer:
             rotations: Array,
             models: Array,
         ) -> None:
-            solver.solve(
-                points, rays, tau, samples, rotations, self.config.solver_iterations, models
-            )
+            solver.solve(points, rays, tau, samples, rotations, iterations, models)
 
         return Hypotheses(
             solve=solve,
@@ -280,52 +358,44 @@ class Localizer:
             block=block,
             score_scale=score_scale,
             final_scale=final_scale,
-            prior=prior,
-            noise=0.5 * self.config.inlier_threshold,
+            prior=terms,
+            noise=self._expected_noise,
         )
 
-    def _global_shutter_inliers(self, observations: Observations, start: Candidate) -> int:
+    def _optimize(
+        self, frame: _Frame, state: Array, first_scale: float, terms: PriorTerms
+    ) -> Candidate:
+        """Local optimisation of one state down to the inlier threshold."""
+        optimized, cost = optimize(
+            state[None],
+            np.zeros(1),
+            frame.observations.packed,
+            frame.observations.row_time_gradient,
+            first_scale,
+            self.config.inlier_threshold,
+            terms,
+            self._expected_noise,
+        )
+        return Candidate(optimized, cost)
+
+    def _global_shutter_inliers(self, frame: _Frame, start: Candidate) -> int:
         """How many points a global-shutter pose explains at the inlier threshold."""
         threshold = self.config.inlier_threshold
-        set_weights(observations.packed, np.ones(len(observations)))
-        state, _ = optimize(
-            start.state[None], np.zeros(1), observations.packed, observations.row_time_gradient,
-            2.0 * _SCORE_SCALE * threshold, threshold, _HELD, 0.5 * threshold,
-        )  # fmt: skip
-        return int(np.count_nonzero(observations.squared_errors(state) < threshold**2))
+        still = np.concatenate([start.state[:12], np.zeros(6)])
+        pose = self._optimize(frame, still, 2.0 * _SCORE_SCALE * threshold, held_terms())
+        return int(np.count_nonzero(frame.observations.squared_errors(pose.state) < threshold**2))
 
 
-_NOTHING = Candidate(np.zeros(18), math.inf)
-
-
-def _pools(observations: Observations, ranking: IntArray | None) -> list[Pool]:
-    everything = Pool(np.arange(len(observations)))
+def _pools(frame: _Frame) -> list[Pool]:
+    everything = Pool(np.arange(len(frame.observations)))
     # Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
-    return [everything] if ranking is None else [Pool(ranking, ranked=True), everything]
+    if frame.ranking is None:
+        return [everything]
+    return [Pool(frame.ranking, ranked=True), everything]
 
 
-def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float:
-    """Standard deviation of the pixel noise from the errors within a gate.
-
-    Args:
-        squared_errors: (n,) of all points.
-        gate: px.
-        freedom: degrees of freedom that the fit has used up.
-
-    The errors of true inliers are Rayleigh distributed; cutting them off at the gate lowers their
-    mean square by a factor that depends on the deviation itself, hence the fixed point.
-    """
-    within = squared_errors[squared_errors < gate * gate]
-    left = 2 * len(within) - freedom
-    if left <= 0.0:
-        return gate / _GATE
-    mean = float(within.sum()) / left
-    variance = mean
-    for _ in range(20):
-        u = gate * gate / (2.0 * max(variance, 1e-12 * gate * gate))
-        kept = 1.0 - u * math.exp(-u) / -math.expm1(-u)
-        variance = min(mean / max(kept, 1e-3), gate * gate)
-    return max(math.sqrt(variance), _LEAST_NOISE)
+def _median_depth(points: Array, state: Array) -> float:
+    return float(np.median(points @ state[6:9] + state[11]))
 
 
 def _checked(

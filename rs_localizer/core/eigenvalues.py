@@ -18,7 +18,7 @@ import numpy as np
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES
 from rs_localizer.core.so3 import Array
-from rs_localizer.core.vectors import load, root, store, uniform, where_less
+from rs_localizer.core.vectors import absolute, load, root, store, uniform, where_less
 
 _EPSILON = 2.0**-52
 _SWEEPS = 8  # per eigenvalue of the slowest lane; the usual number is below two
@@ -102,14 +102,13 @@ def _sweep(h: Array, n: int, first: Array, last: Array, bulge: Array) -> None:
             store(h, left + row, where_less(zero, moves, zero, below))
             below = load(h, left + row + row)
             store(h, left + row + row, where_less(zero, moves, zero, below))
+        # I - (x, y, z)^T (1, q, r)
         head = p + norm
-        inverse = one / norm
-        x = where_less(zero, works, head * inverse, zero)
-        y = where_less(zero, works, q * inverse, zero)
-        z = where_less(zero, works, r * inverse, zero)
-        inverse = one / head
-        q = where_less(zero, works, q * inverse, zero)
-        r = where_less(zero, works, r * inverse, zero)
+        inverse = where_less(zero, works, one / (norm * head), zero)
+        over_norm, over_head = head * inverse, norm * inverse
+        x = head * over_norm
+        y, z = q * over_norm, r * over_norm
+        q, r = q * over_head, r * over_head
         for at in range(k * row + k, k * row + end + 1):
             a, b, c = load(h, at), load(h, at + row), load(h, at + row + row)
             s = a + q * b + r * c
@@ -126,6 +125,70 @@ def _sweep(h: Array, n: int, first: Array, last: Array, bulge: Array) -> None:
 
 
 @kernel
+def _find_windows(h: Array, n: int, first: Array, last: Array) -> None:
+    """Set ``first`` to the top of the unreduced block that ends at ``last``, in every lane."""
+    row = n + 1
+    zero, epsilon = uniform(0.0), uniform(_EPSILON)
+    bottom = load(last, 0) + uniform(0.5)
+    top = zero
+    above = absolute(load(h, 0))
+    for k in range(1, n):
+        at = k * row + k
+        here = absolute(load(h, at))
+        left = load(h, at - 1)
+        small = where_less(epsilon * (above + here), absolute(left), zero, uniform(1.0))
+        store(h, at - 1, where_less(zero, small, zero, left))
+        index = uniform(float(k))
+        top = where_less(index * small, bottom, where_less(zero, small, index, top), top)
+        above = here
+    store(first, 0, top)
+
+
+@kernel
+def _deflate(
+    h: Array, n: int, lane: int, begin: int, end: int, bound: float, counts: Any, found: Array
+) -> None:
+    """Take the real eigenvalues of the diagonal block ``begin .. end`` of size one or two."""
+    at = (end * (n + 1) + end) * LANES + lane
+    near = far = h[at]
+    if begin < end:
+        half = 0.5 * (h[at - (n + 2) * LANES] - near)
+        product = h[at - LANES] * h[at - (n + 1) * LANES]
+        square = half * half + product
+        if not square >= 0.0:
+            return
+        span = half + (np.sqrt(square) if half >= 0.0 else -np.sqrt(square))
+        far = near + span
+        if span != 0.0:
+            near -= product / span
+    for value in (near, far) if begin < end else (near, np.inf):
+        if abs(value) <= bound:
+            found[counts[lane] * LANES + lane] = value
+            counts[lane] += 1
+
+
+@kernel
+def _shift(
+    h: Array, n: int, lane: int, begin: int, end: int, exceptional: bool, bulge: Array
+) -> None:
+    """First column of (H - a)(H - b) in the window, a and b being eigenvalues of its last 2x2."""
+    row = (n + 1) * LANES
+    at = (end * (n + 1) + end) * LANES + lane
+    up = at - row - LANES
+    x, y, w = h[at], h[up], h[at - LANES] * h[at - row]
+    if exceptional:
+        s = abs(h[at - LANES]) + abs(h[up - LANES])
+        x = y = x + 0.75 * s
+        w = -0.4375 * s * s
+    at = (begin * (n + 1) + begin) * LANES + lane
+    z, below = h[at], h[at + row]
+    r, s = x - z, y - z
+    bulge[lane] = r * s - w + h[at + LANES] * below
+    bulge[LANES + lane] = below * (h[at + row + LANES] - z - r - s)
+    bulge[2 * LANES + lane] = below * h[at + 2 * row + LANES]
+
+
+@kernel
 def real_eigenvalues(
     h: Array, n: int, bound: float, work: Array, counts: Any, eigenvalues: Array
 ) -> None:
@@ -138,72 +201,35 @@ def real_eigenvalues(
         counts: (LANES,) result: how many each lane has.
         eigenvalues: result (n values, of which a lane's first ``counts[lane]`` are set).
     """
-    row = n + 1
     first, last, bulge = work[:LANES], work[LANES : 2 * LANES], work[2 * LANES :]
+    total = uniform(0.0)
+    for at in range((n + 1) * (n + 1)):
+        total = total + load(h, at) * uniform(0.0)
+    store(first, 0, total)  # NaN where anything is not finite
     tries = np.zeros(LANES, np.int64)
     for lane in range(LANES):
-        total = 0.0
-        for i in range(n):
-            for j in range(max(i - 1, 0), n):
-                total += h[(i * row + j) * LANES + lane]
+        last[lane] = n - 1.0 if first[lane] == 0.0 else -1.0
         counts[lane] = 0
-        first[lane] = 0.0
-        last[lane] = n - 1.0 if np.isfinite(total) else -1.0
     for _ in range(_SWEEPS * n):
-        waiting = 0
+        deflated = True
+        while deflated:
+            deflated = False
+            _find_windows(h, n, first, last)
+            for lane in range(LANES):
+                begin, end = int(first[lane]), int(last[lane])
+                if end >= 0 and end - begin < 2:
+                    _deflate(h, n, lane, begin, end, bound, counts, eigenvalues)
+                    last[lane] = begin - 1.0
+                    tries[lane] = 0
+                    deflated = True
+        waiting = False
         for lane in range(LANES):
-            end = int(last[lane])
-            begin = end
-            while end >= 0:
-                begin = end
-                while begin > 0:
-                    at = (begin * row + begin) * LANES + lane
-                    up = at - (row + 1) * LANES
-                    if abs(h[at - LANES]) <= _EPSILON * (abs(h[at]) + abs(h[up])):
-                        h[at - LANES] = 0.0
-                        break
-                    begin -= 1
-                if end - begin > 1:
-                    break
-                at = (end * row + end) * LANES + lane
-                if begin == end:
-                    if abs(h[at]) <= bound:
-                        eigenvalues[counts[lane] * LANES + lane] = h[at]
-                        counts[lane] += 1
-                else:
-                    up = at - (row + 1) * LANES
-                    half = 0.5 * (h[up] - h[at])
-                    product = h[at - LANES] * h[at - row * LANES]
-                    square = half * half + product
-                    if square >= 0.0:
-                        far = half + (np.sqrt(square) if half >= 0.0 else -np.sqrt(square))
-                        near = h[at] - product / far if far != 0.0 else h[at]
-                        for value in (h[at] + far, near):
-                            if abs(value) <= bound:
-                                eigenvalues[counts[lane] * LANES + lane] = value
-                                counts[lane] += 1
-                end = begin - 1
-                tries[lane] = 0
-            last[lane] = end
-            first[lane] = begin if end >= 0 else 0.0
-            if end < 0:
-                continue
-            waiting += 1
-            tries[lane] += 1
-            at = (end * row + end) * LANES + lane
-            up = at - (row + 1) * LANES
-            x, y, w = h[at], h[up], h[at - LANES] * h[at - row * LANES]
-            if tries[lane] % 10 == 0:  # a cycle: any other shifts break it
-                s = abs(h[at - LANES]) + abs(h[up - LANES])
-                x = y = x + 0.75 * s
-                w = -0.4375 * s * s
-            at = (begin * row + begin) * LANES + lane
-            below = h[at + row * LANES]
-            z = h[at]
-            r, s = x - z, y - z
-            bulge[lane] = r * s - w + h[at + LANES] * below
-            bulge[LANES + lane] = below * (h[at + (row + 1) * LANES] - z - r - s)
-            bulge[2 * LANES + lane] = below * h[at + (2 * row + 1) * LANES]
-        if waiting == 0:
+            begin, end = int(first[lane]), int(last[lane])
+            if end >= 0:
+                waiting = True
+                tries[lane] += 1
+                exceptional = tries[lane] % 10 == 0  # other shifts break a cycle
+                _shift(h, n, lane, begin, end, exceptional, bulge)
+        if not waiting:
             return
         _sweep(h, n, first, last, bulge)

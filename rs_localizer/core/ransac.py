@@ -5,11 +5,13 @@ It knows a solver only as a function that turns samples into models.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from rs_localizer.core.prior import PriorTerms
 from rs_localizer.core.residuals import pack, squared_errors
 from rs_localizer.core.sampling import IntArray, Pool, Random, draw
 from rs_localizer.core.scoring import best_models, optimize
@@ -63,7 +65,7 @@ class Hypotheses:
     block: int  # samples per block
     score_scale: float  # px, truncation of the error of minimal models
     final_scale: float  # px, truncation after local optimisation: the inlier threshold
-    prior: Array  # (6,) precisions of the velocities
+    prior: PriorTerms
     noise: float  # px, expected standard deviation
 
 
@@ -78,6 +80,9 @@ class Candidate:
     @property
     def found(self) -> bool:
         return bool(np.isfinite(self.cost))
+
+
+NOTHING = Candidate(np.zeros(18), math.inf)
 
 
 def search(

@@ -1,4 +1,4 @@
-"""Refinement of a motion on many points: Levenberg-Marquardt in model B, with a velocity prior.
+"""Refinement of a motion on many points: Levenberg-Marquardt in model B, with a prior.
 
 Parameters of a step, as in ``Estimate.covariance``: the camera turns by ``exp([phi]x)`` in its own
 axes, moves by ``rho`` along them, and the two velocities change additively.
@@ -6,29 +6,16 @@ axes, moves by ``rho`` along them, and the two velocities change additively.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from rs_localizer.core.jit import kernel
+from rs_localizer.core.prior import PriorTerms, add_prior
 from rs_localizer.core.residuals import PARAMETERS, STATE_SIZE, normal_equations
-from rs_localizer.core.so3 import Array, exp
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.so3 import Array, exp, log
 
 # A step that gains less than this part of the noise variance changes nothing.
 _CONVERGED = 1e-6
 _MOST_DAMPING = 1e8
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Posterior:
-    """The refined motion of one frame and what the points say of it."""
-
-    state: Array  # (18,)
-    covariance: Array  # (12,12)
-    smallest_eigenvalue: float  # of the information scaled to a unit diagonal
-    inliers: BoolArray  # (n,)
-    squared_errors: Array  # (n,) px^2
 
 
 @kernel
@@ -49,6 +36,12 @@ def apply_step(state: Array, step: Array) -> Array:
     for i in range(6):
         moved[12 + i] = state[12 + i] + step[6 + i]
     return moved
+
+
+def step_between(state: Array, other: Array) -> Array:
+    """The step (12,) that leads from one state to another."""
+    turn = state[:9].reshape(3, 3) @ other[:9].reshape(3, 3).T
+    return np.concatenate([log(turn), state[9:12] - turn @ other[9:12], other[12:] - state[12:]])
 
 
 @kernel
@@ -95,19 +88,22 @@ def _posterior(
     gradient: Array,
     scale: float,
     softness: float,
-    prior: Array,
+    prior: PriorTerms,
     noise: float,
     information: Array,
     slope: Array,
 ) -> float:
-    """Normal equations and cost with the velocity prior, in squared pixels."""
+    """Normal equations and cost with the prior, in squared pixels."""
     cost = normal_equations(data, state, gradient, scale, softness, information, slope)
-    for i in range(6):
-        weight = noise * noise * prior[i]
-        information[6 + i, 6 + i] += weight
-        slope[6 + i] += weight * state[12 + i]
-        cost += weight * state[12 + i] * state[12 + i]
-    return cost
+    return cost + add_prior(
+        prior.informations,
+        prior.references,
+        prior.gravity,
+        state,
+        noise * noise,
+        information,
+        slope,
+    )
 
 
 @kernel
@@ -117,7 +113,7 @@ def refine(
     gradient: Array,
     scale: float,
     softness: float,
-    prior: Array,
+    prior: PriorTerms,
     noise: float,
     iterations: int,
 ) -> tuple[Array, Array, float, bool]:
@@ -128,7 +124,7 @@ def refine(
         start: state (18,).
         gradient: (2,) row time by pixel.
         scale, softness: of the robust loss, see :mod:`rs_localizer.core.residuals`.
-        prior: (6,) precisions of a zero-mean prior on angular and linear velocity.
+        prior: see :mod:`rs_localizer.core.prior`.
         noise: standard deviation of the pixels, against which the prior is weighed.
         iterations: most steps.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.jit import kernel
+from rs_localizer.core.prior import PriorTerms
 from rs_localizer.core.refine import refine
 from rs_localizer.core.residuals import STATE_SIZE, robust_cost
 from rs_localizer.core.so3 import Array
@@ -65,7 +66,7 @@ def optimize(
     gradient: Array,
     first_scale: float,
     last_scale: float,
-    prior: Array,
+    prior: PriorTerms,
     noise: float,
 ) -> tuple[Array, float]:
     """Local optimisation of the states with finite cost; the best state and its truncated cost.

@@ -21,7 +21,8 @@ class Reason(StrEnum):
     TOO_FEW_POINTS = "too_few_points"
     NO_HYPOTHESIS = "no_hypothesis"
     TOO_FEW_INLIERS = "too_few_inliers"
-    NOT_CONVERGED = "not_converged"
+    BEHIND_CAMERA = "behind_camera"
+    RESIDUAL = "residual"
     DEGENERATE = "degenerate"
     IMPLAUSIBLE = "implausible"
 

@@ -11,45 +11,55 @@ Arrays are flat float64 arrays with ``LANES`` doubles per value, as :func:`simd.
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core.cgutils import get_or_insert_function
-from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.core import cgutils
+from numba.core.typing import templates
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES
 from rs_localizer.core.so3 import Array
 
+# Numba has types, but not for these.
+_get_or_insert_function: Any = cgutils.get_or_insert_function
+_infer_global: Any = templates.infer_global
+_lower_builtin: Any = lower_builtin
+_make_model: Any = models.PrimitiveModel
+_register_model: Any = register_model
+_signature: Any = templates.signature
+
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 _FLAGS = ("contract", "nsz", "arcp")  # as in simd.py: NaN keeps its meaning
 
 
-class _Vector(types.Type):  # type: ignore[misc]  # numba has no types
-    def __init__(self) -> None:
-        super().__init__(name=f"vector{LANES}")
+class _Vector(types.Type):
+    """Numba's name for ``LANES`` doubles in a register."""
 
 
-_vector = _Vector()
+_make_type: Any = _Vector
+_vector = _make_type(name=f"vector{LANES}")
+_register_model(_Vector)(lambda manager, kind: _make_model(manager, kind, _VECTOR))
 
 
-@register_model(_Vector)  # type: ignore[untyped-decorator]
-class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
-    def __init__(self, manager: Any, numba_type: Any) -> None:
-        super().__init__(manager, numba_type, _VECTOR)
+def _inline(function: Callable[..., Any]) -> Any:
+    # Any: for type checkers, kernels would otherwise miss an argument, the typing context.
+    return intrinsic(function)
 
 
 def _define(function: Any, instruction: str, operands: int) -> None:
-    @infer_global(function)  # type: ignore[untyped-decorator]
-    class _Signature(ConcreteTemplate):  # type: ignore[misc]
-        cases = [signature(_vector, *[_vector] * operands)]  # noqa: RUF012  # numba's interface
+    @_infer_global(function)
+    class _Signature(templates.ConcreteTemplate):
+        cases = [_signature(_vector, *[_vector] * operands)]  # noqa: RUF012  # numba's interface
 
-    @lower_builtin(function, *[_Vector] * operands)  # type: ignore[untyped-decorator]
-    def _emit(context: Any, builder: Any, call: Any, args: Any) -> Any:
+    def emit(context: Any, builder: Any, call: Any, args: Any) -> Any:
         return getattr(builder, instruction)(*args, flags=_FLAGS)
+
+    _lower_builtin(function, *[_Vector] * operands)(emit)
 
 
 _define(operator.add, "fadd", 2)
@@ -64,7 +74,7 @@ def _element(context: Any, builder: Any, array_type: Any, array: Any, index: Any
     return builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [index])
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_inline
 def load(typingctx: Any, array: Any, index: Any) -> Any:
     """The value ``index`` of an array."""
 
@@ -75,7 +85,7 @@ def load(typingctx: Any, array: Any, index: Any) -> Any:
     return _vector(array, index), emit
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_inline
 def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     """Write the value ``index`` of an array."""
 
@@ -88,7 +98,7 @@ def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, index, value), emit
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_inline
 def uniform(typingctx: Any, number: Any) -> Any:
     """The same number in all lanes."""
 
@@ -102,20 +112,24 @@ def uniform(typingctx: Any, number: Any) -> Any:
     return _vector(number), emit
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def root(typingctx: Any, number: Any) -> Any:
-    """Square root; NaN where negative."""
+def _unary(name: str) -> Any:
+    @_inline
+    def call(typingctx: Any, number: Any) -> Any:
+        def emit(context: Any, builder: Any, call: Any, args: Any) -> Any:
+            kind = ir.FunctionType(_VECTOR, [_VECTOR])
+            function = _get_or_insert_function(builder.module, kind, f"{name}.v{LANES}f64")
+            return builder.call(function, args)
 
-    def emit(context: Any, builder: Any, call: Any, args: Any) -> Any:
-        function = get_or_insert_function(
-            builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), f"llvm.sqrt.v{LANES}f64"
-        )
-        return builder.call(function, args)
+        return _vector(number), emit
 
-    return _vector(number), emit
+    return call
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+root = _unary("llvm.sqrt")  # NaN where negative
+absolute = _unary("llvm.fabs")
+
+
+@_inline
 def where_less(typingctx: Any, left: Any, right: Any, if_true: Any, if_false: Any) -> Any:
     """Lane by lane ``if_true`` where left < right, else (NaN too) ``if_false``."""
 

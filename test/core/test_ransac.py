@@ -1,14 +1,12 @@
 """The loop with mock solvers: what it draws, when it stops, what it keeps."""
 
-import math
-
 import numpy as np
 import pytest
 
-from rs_localizer.core.ransac import Candidate, Hypotheses, Observations, search
+from rs_localizer.core.prior import velocity_terms
+from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, Observations, search
 from rs_localizer.core.sampling import Pool, generator
 
-NOTHING = Candidate(np.zeros(18), math.inf)
 IDENTITY = np.eye(3)
 
 
@@ -52,7 +50,7 @@ def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotation
         start=NOTHING, seed=1):  # fmt: skip
     hypotheses = Hypotheses(
         solve=solver, sample_size=6, solutions=1, block=50, score_scale=8.0, final_scale=2.0,
-        prior=np.zeros(6), noise=1.0,
+        prior=velocity_terms(0.0, 0.0), noise=1.0,
     )  # fmt: skip
     return search(
         observations, hypotheses, rotations, pools, start, confidence, max_samples, generator(seed)

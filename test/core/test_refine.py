@@ -2,9 +2,16 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.core.refine import apply_step, invert_information, refine, solve_positive
+from rs_localizer.core.prior import held_terms, velocity_terms
+from rs_localizer.core.refine import (
+    apply_step,
+    invert_information,
+    refine,
+    solve_positive,
+    step_between,
+)
 
-NO_PRIOR = np.zeros(6)
+NO_PRIOR = velocity_terms(0.0, 0.0)
 
 
 def distance(scene, state, motion):
@@ -64,9 +71,9 @@ def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
 def test_the_noise_decides_between_prior_and_data(scene):
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
     data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
-    held = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, np.full(6, 1e18), 1.0, 30)[0]
+    held = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, held_terms(), 1.0, 30)[0]
     np.testing.assert_allclose(held[12:], 0.0, atol=1e-9)
-    prior = np.full(6, 100.0)
+    prior = velocity_terms(0.1, 0.1)
     free, weak, strong = (
         refine(data, scene.state_of(motion), gradient, 1e3, 0.0, p, noise, 30)[0][12:]
         for p, noise in ((NO_PRIOR, 1.0), (prior, 0.5), (prior, 50.0))
@@ -82,13 +89,14 @@ def test_the_minimum_has_no_slope_of_the_posterior(scene):
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
     # Without the row's part the cost is exactly that of the residuals.
     data, gradient = scene.pack(camera, points, measured), np.zeros(2)
-    prior, noise, h = np.array([30.0] * 3 + [100.0] * 3), 0.5, 1e-6
+    prior, noise, h = velocity_terms(0.2, 0.1), 0.5, 1e-6
+    precisions = np.repeat([25.0, 100.0], 3)
     state = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, prior, noise, 50)[0]
 
     def posterior(s):
         velocities = s[12:]
         return robust_cost(data, s, gradient, 1e3, 0.0, np.inf) + noise**2 * velocities @ (
-            prior * velocities
+            precisions * velocities
         )
 
     for e in np.eye(12):
@@ -129,3 +137,10 @@ def test_the_inverse_and_the_eigenvalue_do_not_depend_on_units():
     inverse, smallest = invert_information(matrix)
     np.testing.assert_allclose(inverse @ matrix, np.eye(12), atol=1e-8)
     assert invert_information(units @ matrix @ units)[1] == pytest.approx(smallest, rel=1e-6)
+
+
+def test_a_step_between_states_leads_from_one_to_the_other(scene):
+    first = scene.state_of(scene.frame(seed=1)[1])
+    step = 0.3 * np.random.default_rng(0).normal(size=12)
+    second = apply_step(first, step)
+    np.testing.assert_allclose(step_between(first, second), step, atol=1e-12)

@@ -1,0 +1,255 @@
+"""What is known of the motion before the image: Gaussian priors and the direction of gravity."""
+
+from __future__ import annotations
+
+import math
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.so3 import Array, log
+
+# A precision that holds a velocity at its mean whatever the points say.
+_HOLDING = 1e18
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """What else is known of one frame; give any of the three.
+
+    Args:
+        motion, covariance: expected motion and its (12,12) covariance, in the order of
+            ``Estimate.covariance``; infinite variances leave a parameter free.
+        angular_velocity, angular_velocity_deviation: a gyroscope's body rate (3,) in camera axes
+            times the readout time (rad per readout), and its standard deviation.
+        gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
+            along ``gravity_in_map``, of any length, and the standard deviation of its direction
+            in rad.
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, deviations that are not positive.
+    """
+
+    motion: Motion | None = None
+    covariance: Array | None = None
+    angular_velocity: ArrayLike | None = None
+    angular_velocity_deviation: float = math.nan
+    gravity: ArrayLike | None = None
+    gravity_deviation: float = math.nan
+    gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
+
+    def __post_init__(self) -> None:
+        if (self.motion is None) != (self.covariance is None):
+            raise ValueError("a prior motion and its covariance go together")
+        if self.covariance is not None and np.shape(self.covariance) != (12, 12):
+            raise ValueError(f"covariance must be (12,12), got {np.shape(self.covariance)}")
+        for name in ("angular_velocity", "gravity", "gravity_in_map"):
+            vector = getattr(self, name)
+            if vector is None:
+                continue
+            array = np.array(vector, dtype=np.float64)
+            if array.shape != (3,) or not np.all(np.isfinite(array)):
+                raise ValueError(f"{name} must be three finite numbers, got {vector!r}")
+            if name != "angular_velocity" and not np.linalg.norm(array) > 0.0:
+                raise ValueError(f"{name} has no direction: {vector!r}")
+            deviation = getattr(self, f"{name}_deviation", 1.0)
+            if not deviation > 0.0:
+                raise ValueError(f"{name}_deviation must be positive, got {deviation}")
+
+    def without_motion(self) -> Prior:
+        """The same but for the motion."""
+        return replace(self, motion=None, covariance=None)
+
+    def motion_only(self) -> Prior:
+        """Nothing but the motion."""
+        return Prior(motion=self.motion, covariance=self.covariance)
+
+
+class PriorTerms(NamedTuple):
+    """A prior as the kernels take it: a sum of Gaussians, and a direction."""
+
+    informations: Array  # (k,12,12)
+    references: Array  # (k,18) states of their means
+    gravity: Array  # (7,) in the map, in the camera, precision
+
+
+_NO_GRAVITY = np.zeros(7)
+_STILL = np.concatenate([np.eye(3).ravel(), np.zeros(9)])
+
+
+def velocity_terms(angular: float, linear: float) -> PriorTerms:
+    """Zero-mean prior of these standard deviations per readout; 0: none."""
+    precisions = [0.0 if d == 0.0 else d**-2 for d in (angular, linear)]
+    return _single(np.diag(np.concatenate([np.zeros(6), np.repeat(precisions, 3)])), _STILL)
+
+
+def held_terms() -> PriorTerms:
+    """A global shutter: velocities are zero."""
+    return _single(np.diag(np.concatenate([np.zeros(6), np.full(6, _HOLDING)])), _STILL)
+
+
+def _single(information: Array, reference: Array) -> PriorTerms:
+    return PriorTerms(information[None], reference[None].copy(), _NO_GRAVITY)
+
+
+def with_prior(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
+    """The terms and a prior given in the map frame, for points taken relative to ``centre``."""
+    informations, references, gravity = [*terms.informations], [*terms.references], terms.gravity
+    if prior.motion is not None and prior.covariance is not None:
+        informations.append(_inverse(prior.covariance))
+        references.append(state_in(prior.motion, centre))
+    if prior.angular_velocity is not None:
+        information = np.zeros((12, 12))
+        information[6:9, 6:9] = np.eye(3) / prior.angular_velocity_deviation**2
+        informations.append(information)
+        references.append(np.concatenate([_STILL[:12], prior.angular_velocity, np.zeros(3)]))
+    if prior.gravity is not None:
+        gravity = np.concatenate(
+            [
+                _unit(prior.gravity_in_map),
+                _unit(prior.gravity),
+                [prior.gravity_deviation**-2],
+            ]
+        )
+    return PriorTerms(np.array(informations), np.array(references), gravity)
+
+
+def state_in(motion: Motion, centre: Array) -> Array:
+    """State (18,) of a motion for points taken relative to ``centre`` (3,)."""
+    translation = motion.translation + motion.rotation @ centre
+    return np.concatenate(
+        [motion.rotation.ravel(), translation, motion.angular_velocity, motion.linear_velocity]
+    )
+
+
+def _unit(vector: ArrayLike) -> Array:
+    array = np.asarray(vector, float)
+    unit: Array = array / np.linalg.norm(array)
+    return unit
+
+
+def _inverse(covariance: Array) -> Array:
+    """Information of a covariance, zero for parameters of infinite variance."""
+    information = np.zeros((12, 12))
+    known = np.flatnonzero(np.isfinite(np.diag(covariance)))
+    block = np.ix_(known, known)
+    information[block] = np.linalg.inv(np.asarray(covariance, float)[block])
+    return information
+
+
+@kernel
+def add_prior(
+    informations: Array,
+    references: Array,
+    gravity: Array,
+    state: Array,
+    weight: float,
+    information: Array,
+    slope: Array,
+) -> float:
+    """Add the prior's part, times ``weight``, to the normal equations; returns its cost."""
+    cost = 0.0
+    offset = np.empty(12)
+    pulled = np.empty(12)
+    # Derivative of the offset by a step: identity but for the rotation and position blocks.
+    by_turn, by_move = np.empty((3, 3)), np.empty((3, 3))
+    for term in range(len(informations)):
+        prior, reference = informations[term], references[term]
+        posed = (
+            prior[0, 0] + prior[1, 1] + prior[2, 2] + prior[3, 3] + prior[4, 4] + prior[5, 5] > 0
+        )
+        first = 0 if posed else 6
+        for i in range(6):
+            offset[i] = 0.0
+            offset[6 + i] = state[12 + i] - reference[12 + i]
+        if posed:
+            _pose_offset(state, reference, offset, by_turn, by_move)
+        for i in range(first, 12):
+            total = 0.0
+            for j in range(first, 12):
+                total += prior[i, j] * offset[j]
+            pulled[i] = weight * total
+            cost += offset[i] * pulled[i]
+        if not posed:
+            for i in range(6, 12):
+                slope[i] += pulled[i]
+                for j in range(6, 12):
+                    information[i, j] += weight * prior[i, j]
+            continue
+        jacobian = np.eye(12)
+        jacobian[0:3, 0:3] = by_turn
+        jacobian[3:6, 3:6] = by_move
+        information += weight * (jacobian.T @ prior @ jacobian)
+        slope += jacobian.T @ pulled
+    if gravity[6] > 0.0:
+        cost += _add_gravity(gravity, state, weight, information, slope)
+    return cost
+
+
+@kernel
+def _pose_offset(
+    state: Array, reference: Array, offset: Array, by_turn: Array, by_move: Array
+) -> None:
+    """The step (turn, move) from the reference pose to the state's and its derivatives."""
+    relative = np.empty((3, 3))  # reference from state: exp([turn]x)
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += reference[3 * i + k] * state[3 * j + k]
+            relative[i, j] = total
+            by_move[i, j] = total
+    turn = log(relative)
+    x, y, z = turn[0], turn[1], turn[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    # Inverse right Jacobian of the exponential; its second coefficient is 1/12 at zero.
+    if angle < 1e-3:
+        second = 1.0 / 12.0
+    else:
+        second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
+    by_turn[0, 0] = 1.0 - second * (y * y + z * z)
+    by_turn[1, 1] = 1.0 - second * (x * x + z * z)
+    by_turn[2, 2] = 1.0 - second * (x * x + y * y)
+    by_turn[0, 1], by_turn[1, 0] = -0.5 * z + second * x * y, 0.5 * z + second * x * y
+    by_turn[0, 2], by_turn[2, 0] = 0.5 * y + second * x * z, -0.5 * y + second * x * z
+    by_turn[1, 2], by_turn[2, 1] = -0.5 * x + second * y * z, 0.5 * x + second * y * z
+    for i in range(3):
+        offset[i] = turn[i]
+        moved = 0.0
+        for j in range(3):
+            moved += relative[i, j] * state[9 + j]
+        offset[3 + i] = reference[9 + i] - moved
+
+
+@kernel
+def _add_gravity(
+    gravity: Array, state: Array, weight: float, information: Array, slope: Array
+) -> float:
+    """Part of the measured direction: |R g - m|^2 times its precision."""
+    precision = weight * gravity[6]
+    seen = np.empty(3)
+    for i in range(3):
+        total = 0.0
+        for j in range(3):
+            total += state[3 * i + j] * gravity[j]
+        seen[i] = total
+    # A turn phi of the camera moves the direction by seen x phi.
+    derivative = np.zeros((3, 3))
+    derivative[0, 1], derivative[0, 2] = -seen[2], seen[1]
+    derivative[1, 0], derivative[1, 2] = seen[2], -seen[0]
+    derivative[2, 0], derivative[2, 1] = -seen[1], seen[0]
+    cost = 0.0
+    for k in range(3):
+        error = seen[k] - gravity[3 + k]
+        cost += precision * error * error
+        for i in range(3):
+            slope[i] += precision * derivative[k, i] * error
+            for j in range(3):
+                information[i, j] += precision * derivative[k, i] * derivative[k, j]
+    return cost

@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.core.prior import (
+    Prior,
+    add_prior,
+    held_terms,
+    state_in,
+    velocity_terms,
+    with_prior,
+)
+from rs_localizer.core.refine import apply_step
+from rs_localizer.core.shutter import Motion
+
+CENTRE = np.array([10.0, -3.0, 2.0])
+
+
+def motion(seed=0):
+    rng = np.random.default_rng(seed)
+    return Motion(so3.exp(rng.normal(size=3)), *rng.normal(size=(3, 3)))
+
+
+def covariance(seed=1):
+    factor = np.random.default_rng(seed).normal(size=(12, 12))
+    return factor @ factor.T / 12 + 0.1 * np.eye(12)
+
+
+def evaluate(terms, state, weight=1.0):
+    information, slope = np.zeros((12, 12)), np.zeros(12)
+    return add_prior(*terms, state, weight, information, slope), information, slope
+
+
+NOTHING = velocity_terms(0.0, 0.0)
+PRIORS = {
+    "velocity": velocity_terms(0.2, 0.1),
+    "motion": with_prior(NOTHING, Prior(motion=motion(), covariance=covariance()), CENTRE),
+    "gyroscope": with_prior(
+        NOTHING, Prior(angular_velocity=[0.1, 0.2, 0.3], angular_velocity_deviation=0.01), CENTRE
+    ),
+    "gravity": with_prior(NOTHING, Prior(gravity=[1.0, 2.0, 0.5], gravity_deviation=0.05), CENTRE),
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_the_slope_is_the_finite_difference_of_the_cost(name):
+    state = apply_step(state_in(motion(), CENTRE), 0.2 * np.random.default_rng(2).normal(size=12))
+    _, _, slope = evaluate(PRIORS[name], state, 3.0)
+    h = 1e-6
+    for k, e in enumerate(np.eye(12)):
+        ahead, behind = (
+            evaluate(PRIORS[name], apply_step(state, sign * h * e), 3.0)[0] for sign in (1, -1)
+        )
+        assert (ahead - behind) / (2 * h) == pytest.approx(2 * slope[k], rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_the_information_is_the_curvature_at_the_minimum(name):
+    state = state_in(motion(), CENTRE)
+    if name == "gravity":  # a rotation that sees gravity where it was measured
+        seen = np.array([1.0, 2.0, 0.5]) / np.linalg.norm([1.0, 2.0, 0.5])
+        axis = np.cross([0, 0, -1.0], seen)
+        angle = np.arccos(-seen[2])
+        state[:9] = so3.exp(angle * axis / np.linalg.norm(axis)).ravel()
+    elif name != "motion":
+        state[12:] = PRIORS[name].references[-1][12:]
+    cost, information, slope = evaluate(PRIORS[name], state)
+    assert cost == pytest.approx(0.0, abs=1e-20)
+    np.testing.assert_allclose(slope, 0.0, atol=1e-10)
+    h = 1e-4
+    for k, e in enumerate(np.eye(12)):
+        bent = evaluate(PRIORS[name], apply_step(state, h * e))[0] / h**2
+        assert bent == pytest.approx(information[k, k], rel=1e-4, abs=1e-4)
+
+
+def test_a_motion_prior_costs_the_mahalanobis_distance():
+    mean, spread = motion(), covariance()
+    terms = with_prior(NOTHING, Prior(motion=mean, covariance=spread), CENTRE)
+    step = 0.5 * np.random.default_rng(3).normal(size=12)
+    cost, _, _ = evaluate(terms, apply_step(state_in(mean, CENTRE), step))
+    assert cost == pytest.approx(step @ np.linalg.solve(spread, step), rel=1e-9)
+
+
+def test_infinite_variances_leave_parameters_free():
+    spread = np.diag(np.concatenate([np.full(6, np.inf), np.full(6, 0.01)]))
+    terms = with_prior(NOTHING, Prior(motion=motion(), covariance=spread), CENTRE)
+    _, information, _ = evaluate(terms, state_in(motion(5), CENTRE))
+    np.testing.assert_allclose(information, np.diag([0.0] * 6 + [100.0] * 6))
+
+
+def test_velocity_terms_are_precisions_and_none_for_zero():
+    state = state_in(motion(), CENTRE)
+    _, information, slope = evaluate(velocity_terms(0.2, 0.0), state)
+    np.testing.assert_allclose(information, np.diag([0.0] * 6 + [25.0] * 3 + [0.0] * 3))
+    np.testing.assert_allclose(slope[6:9], 25.0 * state[12:15])
+    assert evaluate(velocity_terms(0.0, 0.0), state)[0] == 0.0
+    assert evaluate(held_terms(), state)[0] > 1e15
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"motion": motion()}, "a prior motion and its covariance go together"),
+        ({"motion": motion(), "covariance": np.eye(6)}, r"covariance must be \(12,12\), got \(6, 6\)"),
+        ({"angular_velocity": [1, 2]}, "angular_velocity must be three finite numbers"),
+        ({"angular_velocity": [0, 0, np.nan], "angular_velocity_deviation": 1}, "three finite"),
+        ({"angular_velocity": [0, 0, 0]}, "angular_velocity_deviation must be positive, got nan"),
+        ({"gravity": [0, 0, 0], "gravity_deviation": 1}, "gravity has no direction"),
+        ({"gravity": [0, 0, 1], "gravity_deviation": -1}, "gravity_deviation must be positive"),
+    ],
+)  # fmt: skip
+def test_an_impossible_prior_is_refused_with_what_was_found(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        Prior(**arguments)
