@@ -146,9 +146,7 @@ def run(args: argparse.Namespace) -> None:
         frames = simulate_frames(
             camera, motion, map_points, settings, stamps_ns=stamps, seed=args.seed
         )
-        for frame in tqdm(
-            frames, total=len(stamps), unit="frame", desc="simulate", disable=None
-        ):
+        for frame in tqdm(frames, total=len(stamps), unit="frame", desc="simulate", disable=None):
             write_simulated(bag, camera, frame)
             points += len(frame.points)
     print(

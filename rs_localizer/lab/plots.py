@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+from numpy.lib.stride_tricks import sliding_window_view
 
 from rs_localizer.core.so3 import Array
 from rs_localizer.io.trajectories import Trajectory
@@ -35,6 +36,12 @@ _TRUTH = "#c9c9c9"
 _DPI = 130
 # A pause of more frames than this breaks the lines.
 _LONGEST_GAP = 4.0
+# Frames of the running median that is drawn through the single errors.
+_WINDOW = 15
+# Zero has no logarithm.
+_LEAST = 1e-9
+# What is shown of an image around the points (px).
+_RIM = 60.0
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -93,25 +100,27 @@ def _draw_way(axes: Axes, truth: Trajectory, a: int, b: int) -> None:
 
 def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
     """Errors over time on logarithmic scales, with their medians; twists where there are any."""
-    panels: list[tuple[str, Mapping[str, Errors], Callable[[Errors], Array]]] = [
-        ("position error (mm)", poses, lambda e: np.multiply(1e3, e.linear)),
-        ("orientation error (deg)", poses, lambda e: e.angular),
+    panels: list[tuple[str, str, Mapping[str, Errors], Callable[[Errors], Array]]] = [
+        ("position error", "mm", poses, lambda e: np.multiply(1e3, e.linear)),
+        ("orientation error", "deg", poses, lambda e: e.angular),
     ]
     if twists:
         panels += [
-            ("angular velocity\nerror (deg/s)", twists, lambda e: e.angular),
-            ("linear velocity\nerror (m/s)", twists, lambda e: e.linear),
+            ("angular velocity\nerror", "deg/s", twists, lambda e: e.angular),
+            ("linear velocity\nerror", "m/s", twists, lambda e: e.linear),
         ]
     figure = _figure(10.0, 1.0 + 2.1 * len(panels))
     start = min(int(e.stamps_ns[0]) for e in poses.values() if len(e.stamps_ns))
     rows = figure.subplots(len(panels), 1, sharex=True, subplot_kw={"yscale": "log"})
-    for axes, (label, series, values) in zip(rows, panels, strict=True):
+    for axes, (label, unit, series, values) in zip(rows, panels, strict=True):
         for name, style in _methods(poses):
             if name in series:
                 one = series[name]
-                _draw_series(axes, name, style, one.stamps_ns, values(one), start)
+                _draw_series(
+                    axes, name, style, one.stamps_ns, np.maximum(values(one), _LEAST), start, unit
+                )
         _plain_numbers(axes)
-        axes.set_ylabel(label)
+        axes.set_ylabel(f"{label} ({unit})")
         _tidy(axes)
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False,
                     borderaxespad=0.1)  # fmt: skip
@@ -120,13 +129,31 @@ def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
 
 
 def _draw_series(
-    axes: Axes, name: str, style: _Style, stamps_ns: Stamps, values: Array, start: int
+    axes: Axes,
+    name: str,
+    style: _Style,
+    stamps_ns: Stamps,
+    values: Array,
+    start: int,
+    unit: str,
 ) -> None:
-    t, shown = _broken(stamps_ns, _seconds(stamps_ns, start), values)
-    label = f"{name}: median {np.median(values):.3g}" if len(values) else name
+    """Single values as pale marks, their running median as a line."""
+    t = _seconds(stamps_ns, start)
     axes.plot(
-        t, shown, style.line, color=style.color, linewidth=1.1, zorder=style.layer, label=label
-    )
+        t, values, linestyle="none", marker=style.marker, markersize=3.0, markeredgewidth=0.6,
+        color=style.color, alpha=0.35, zorder=style.layer,
+    )  # fmt: skip
+    x, y = _broken(stamps_ns, t, _running_median(values))
+    label = f"{name}: median {np.median(values):.3g} {unit}".rstrip() if len(values) else name
+    axes.plot(x, y, style.line, color=style.color, linewidth=2.0, zorder=style.layer, label=label)
+
+
+def _running_median(values: Array) -> Array:
+    if len(values) < _WINDOW:
+        return values
+    half = _WINDOW // 2
+    padded = np.pad(values, half, mode="reflect")
+    return np.asarray(np.median(sliding_window_view(padded, _WINDOW), axis=1))
 
 
 def inliers(
@@ -150,7 +177,7 @@ def inliers(
     t = _seconds(stamps_ns, int(stamps_ns[0]))
     upper.fill_between(t, most, step="mid", color="#ececec", zorder=0, label=most_label)
     for (name, style), values in zip(_methods(counts), counts.values(), strict=True):
-        _draw_series(upper, name, style, stamps_ns, values, int(stamps_ns[0]))
+        _draw_series(upper, name, style, stamps_ns, values, int(stamps_ns[0]), "")
     upper.set_ylim(bottom=0.0)
     upper.set_ylabel("inliers in the frame")
     upper.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False,
@@ -186,11 +213,11 @@ def residuals(
             pixels[:, 0], pixels[:, 1], offset[:, 0], offset[:, 1], angles="xy",
             scale_units="xy", scale=1.0 / magnification, color=style.color, width=0.005,
         )  # fmt: skip
-        axes.set_title(f"{name}: {rms:.3f} px rms")
-        axes.set_xlabel(f"residuals, {magnification:g} times enlarged")
+        axes.set_title(f"{name}: residual {rms:.3f} px rms")
+        axes.set_xlabel(f"arrows: residuals, {magnification:g} times enlarged")
         axes.set_xticks([])
         axes.set_yticks([])
-        low, high = pixels.min(axis=0) - 40.0, pixels.max(axis=0) + 40.0
+        low, high = pixels.min(axis=0) - _RIM, pixels.max(axis=0) + _RIM
         axes.set_xlim(max(low[0], -0.5), min(high[0], image.shape[1] - 0.5))
         axes.set_ylim(min(high[1], image.shape[0] - 0.5), max(low[1], -0.5))
     return figure

@@ -98,9 +98,7 @@ def bearings(frame: SimulatedFrame) -> Array:
 @pytest.mark.parametrize("direction", list(ScanDirection))
 def test_truth_against_finite_differences(direction: str) -> None:
     t = np.arange(0.0, 2.0, 1 / 120)
-    quaternions = np.stack(
-        [np.sin(t), np.cos(2 * t), np.sin(1.5 * t), 2 + np.cos(t)], axis=1
-    )
+    quaternions = np.stack([np.sin(t), np.cos(2 * t), np.sin(1.5 * t), 2 + np.cos(t)], axis=1)
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     positions = 0.3 * np.stack([np.sin(3 * t), np.cos(2 * t), t], axis=1)
     motion = RecordedMotion(Trajectory((t * 1e9).astype(np.int64), positions, quaternions))

@@ -67,9 +67,7 @@ def test_constant_velocity_is_what_it_says() -> None:
     np.testing.assert_allclose(
         state.rotations[1] @ [0, 0, 1], [np.cos(0.5), -np.sin(0.5), 0], atol=1e-15
     )
-    np.testing.assert_allclose(
-        state.linear[1], [-2 * np.sin(0.5), 0, 2 * np.cos(0.5)], atol=1e-14
-    )
+    np.testing.assert_allclose(state.linear[1], [-2 * np.sin(0.5), 0, 2 * np.cos(0.5)], atol=1e-14)
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("smoothed", 1e-3), ("interpolated", 1e-6)])

@@ -1,0 +1,123 @@
+"""Errors of known size come out of `evaluate`, whatever holds the poses."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
+
+STAMPS = 1_500_000_000_000_000_000 + np.arange(40, dtype=np.int64) * 33_333_333
+RNG = np.random.default_rng(0)
+TURNS = Rotation.random(40, rng=2)
+TRUTH = Trajectory(STAMPS, np.cumsum(RNG.normal(size=(40, 3)), axis=0), TURNS.as_quat())
+TWISTS = Twists(STAMPS, RNG.normal(size=(40, 3)), RNG.normal(size=(40, 3)))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """Truth, and an estimate that is 0.1 m, 2 degrees, 0.05 rad/s and 0.5 m/s off."""
+    off = TURNS * Rotation.from_rotvec([0.0, np.radians(2.0), 0.0])
+    estimate = Trajectory(
+        STAMPS + 400_000, TRUTH.positions + np.array([0.06, 0.0, 0.08]), off.as_quat()
+    )
+    write_tum(tmp_path / "truth.txt", TRUTH)
+    write_twists(tmp_path / "truth_twists.txt", TWISTS)
+    (tmp_path / "replayed").mkdir()
+    write_tum(tmp_path / "replayed" / "poses.txt", estimate)
+    twists = Twists(
+        STAMPS,
+        TWISTS.angular + np.array([0.03, 0.04, 0.0]),
+        TWISTS.linear + np.array([0, 0.3, 0.4]),
+    )
+    write_twists(tmp_path / "replayed" / "twists.txt", twists)
+    return tmp_path
+
+
+def evaluate(files: Path, *words: str, estimate: str = "replayed") -> int:
+    return main(["evaluate", str(files / estimate), str(files / "truth.txt"), *words])
+
+
+def rows(text: str) -> dict[str, list[float]]:
+    """Figures of each line of the table by its name."""
+    found = re.findall(r"^([^\d\n]+?(?:\([^)]*\))?) {2,}((?:\s*[\d.]+)+)$", text, re.MULTILINE)
+    return {name.strip(): [float(word) for word in figures.split()] for name, figures in found}
+
+
+def test_table(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate(files, "--truth-twists", str(files / "truth_twists.txt")) == 0
+    text = capsys.readouterr().out
+    assert "40 of 40 poses compared" in text
+    found = rows(text)
+    for name, error in {
+        "position (m)": 0.1,
+        "orientation (deg)": 2.0,
+        "angular velocity (deg/s)": np.degrees(0.05),
+        "linear velocity (m/s)": 0.5,
+    }.items():
+        np.testing.assert_allclose(found[name], [40, error, error, error, error], atol=1e-4)
+
+
+def test_files_alone_have_no_twists(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate(files, estimate="replayed/poses.txt") == 0
+    assert set(rows(capsys.readouterr().out)) == {"position (m)", "orientation (deg)"}
+
+
+def test_ate_and_rpe(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("evo", reason="the optional extra evo")
+    assert evaluate(files, "--ate") == 0
+    found = rows(capsys.readouterr().out)
+    # A shift of all positions goes away in the alignment.
+    np.testing.assert_allclose(found["ATE (m rms)"], [0.0], atol=1e-5)
+    assert found["RPE, next frame (deg rms)"][0] < 4.0
+
+
+def test_missing_evo_is_named(
+    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "evo", None)
+    monkeypatch.setitem(sys.modules, "evo.core", None)
+    assert evaluate(files, "--ate") == 1
+    assert "needs the package evo, which is not installed" in capsys.readouterr().err
+
+
+def test_plots(files: Path) -> None:
+    words = ("--truth-twists", str(files / "truth_twists.txt"), "--plot", str(files / "plots"))
+    assert evaluate(files, *words) == 0
+    for name in ("trajectories.png", "errors.png"):
+        image = cv2.imread(str(files / "plots" / name))
+        assert image.shape[1] > 1000
+        assert image.std() > 5.0
+
+
+def test_simulated_bag_against_itself(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = str(files / "bag")
+    assert main(["simulate", bag, "--duration", "0.3"]) == 0
+    assert main(["evaluate", bag, bag]) == 0
+    found = rows(capsys.readouterr().out)
+    assert found["position (m)"] == [18, 0, 0, 0, 0]
+    assert found["linear velocity (m/s)"] == [18, 0, 0, 0, 0]
+    # Nothing of the one bag is near the other file in time.
+    assert main(["evaluate", bag, str(files / "truth.txt")]) == 1
+    error = capsys.readouterr().err
+    assert "no pose of" in error
+    assert "1.000 to 1.282 s against 1500000000.000 to 1500000001.300 s" in error
+    assert main(["evaluate", bag, bag, "--pose-topic", "/pose"]) == 1
+    assert "no geometry_msgs/msg/PoseStamped on /pose; found /truth/pose" in capsys.readouterr().err
+
+
+def test_tolerance(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate(files, "--tolerance", "0.0001") == 1
+    assert "is within 0.0001 s of" in capsys.readouterr().err
+
+
+def test_missing_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "only_one"]) == 2
+    assert "TRUTH" in capsys.readouterr().err

@@ -1,0 +1,69 @@
+"""The demo as a user starts it, with a few frames; and what Ctrl-C leaves of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import pytest
+
+DEMO = [sys.executable, "-m", "rs_localizer", "demo", "--quick"]
+PICTURES = (
+    "flight_trajectories.png",
+    "flight_errors.png",
+    "flight_inliers.png",
+    "webcam_residuals.png",
+)
+
+
+def figures(text: str, label: str) -> list[list[float]]:
+    """Rolling and global shutter, in each table that has this row."""
+    lines = [line for line in text.splitlines() if line.strip().startswith(label)]
+    return [[float(word) for word in line[44:].split() if word[0].isdigit()] for line in lines]
+
+
+def test_quick_demo(tmp_path: Path) -> None:
+    demo = subprocess.run(
+        [*DEMO, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=280
+    )
+    assert demo.returncode == 0, demo.stderr
+    assert figures(demo.stdout, "frames") == [[12.0, 12.0], [12.0, 12.0]]
+    assert demo.stdout.count("12 (100.0 %)") == 4
+    (webcam, flight) = figures(demo.stdout, "residual of the inliers")
+    assert webcam[0] < webcam[1] < 0.2
+    assert flight[0] < 2.0
+    ((rolling, static),) = figures(demo.stdout, "position error")
+    assert rolling < 0.5 * static
+    assert figures(demo.stdout, "angular velocity error")[0][0] < 40.0
+    for name in PICTURES:
+        assert cv2.imread(str(tmp_path / "out" / name)).std() > 5.0
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(PICTURES)
+
+
+def children(pid: int) -> list[int]:
+    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+    return [int(word) for word in found.stdout.split()]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_no_process_behind(tmp_path: Path, number: int) -> None:
+    with (tmp_path / "log").open("w") as log:
+        demo = subprocess.Popen(
+            [*DEMO, "--out", str(tmp_path / "out")], stdout=log, stderr=log, start_new_session=True
+        )
+    deadline = time.monotonic() + 60.0
+    while len(nodes := children(demo.pid)) < 2:
+        assert demo.poll() is None, (tmp_path / "log").read_text()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    demo.send_signal(number)
+    assert demo.wait(30.0) == 1
+    assert (tmp_path / "log").read_text().endswith("rs_localizer demo: interrupted\n")
+    for node in nodes:
+        with pytest.raises(ProcessLookupError):
+            os.kill(node, 0)
