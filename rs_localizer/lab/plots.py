@@ -49,8 +49,10 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path)
 
 
-def _figure(width: float, height: float) -> Figure:
-    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+def _figure(title: str, height: float) -> Figure:
+    figure = Figure(figsize=(10.0, height), dpi=_DPI, layout="constrained")
+    figure.suptitle(title)
+    return figure
 
 
 def _methods(named: Mapping[str, object]) -> list[tuple[str, _Style]]:
@@ -66,7 +68,7 @@ def _tidy(axes: Axes) -> None:
 
 def trajectories(truth: Trajectory | None, estimates: Mapping[str, Trajectory]) -> Figure:
     """Where the camera was, from above and from the side."""
-    figure = _figure(10.0, 5.2)
+    figure = _figure("Position of the camera in each frame", 5.5)
     left, right = figure.subplots(1, 2)
     for axes, (a, b), title in ((left, (0, 1), "from above"), (right, (0, 2), "from the side")):
         if truth is not None:
@@ -109,7 +111,9 @@ def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
             ("angular velocity\nerror", "deg/s", twists, lambda e: e.angular),
             ("linear velocity\nerror", "m/s", twists, lambda e: e.linear),
         ]
-    figure = _figure(10.0, 1.0 + 2.1 * len(panels))
+    figure = _figure(
+        f"Error of each frame, and the running median of {_WINDOW}", 1.3 + 2.1 * len(panels)
+    )
     start = min(int(e.stamps_ns[0]) for e in poses.values() if len(e.stamps_ns))
     rows = figure.subplots(len(panels), 1, sharex=True, subplot_kw={"yscale": "log"})
     for axes, (label, unit, series, values) in zip(rows, panels, strict=True):
@@ -172,7 +176,7 @@ def inliers(
         angular_rate: (n,) deg/s.
         most_label: what ``most`` is.
     """
-    figure = _figure(10.0, 5.4)
+    figure = _figure("Matches that fit the pose of their frame", 5.7)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
     t = _seconds(stamps_ns, int(stamps_ns[0]))
     upper.fill_between(t, most, step="mid", color="#ececec", zorder=0, label=most_label)
@@ -202,7 +206,7 @@ def residuals(
         predicted: (n,2) where each method's pose puts them.
         magnification: length of an arrow in image pixels per pixel of residual.
     """
-    figure = _figure(10.0, 4.6)
+    figure = _figure("From where the pose puts the points to where they are seen", 4.9)
     for axes, (name, style), seen in zip(
         figure.subplots(1, len(predicted)), _methods(predicted), predicted.values(), strict=True
     ):
@@ -210,11 +214,11 @@ def residuals(
         rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
         axes.imshow(0.55 * image + 0.45 * 255, cmap="gray", vmin=0, vmax=255)
         axes.quiver(
-            pixels[:, 0], pixels[:, 1], offset[:, 0], offset[:, 1], angles="xy",
+            seen[:, 0], seen[:, 1], offset[:, 0], offset[:, 1], angles="xy",
             scale_units="xy", scale=1.0 / magnification, color=style.color, width=0.005,
         )  # fmt: skip
         axes.set_title(f"{name}: residual {rms:.3f} px rms")
-        axes.set_xlabel(f"arrows: residuals, {magnification:g} times enlarged")
+        axes.set_xlabel(f"arrows {magnification:g} times enlarged")
         axes.set_xticks([])
         axes.set_yticks([])
         low, high = pixels.min(axis=0) - _RIM, pixels.max(axis=0) + _RIM

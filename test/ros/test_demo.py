@@ -33,7 +33,8 @@ def test_quick_demo(tmp_path: Path) -> None:
     )
     assert demo.returncode == 0, demo.stderr
     assert figures(demo.stdout, "frames") == [[12.0, 12.0], [12.0, 12.0]]
-    assert demo.stdout.count("12 (100.0 %)") == 4
+    # Global shutter may miss a frame or two; rolling shutter must not.
+    assert [counts[0] for counts in figures(demo.stdout, "localized")] == [12.0, 12.0]
     (webcam, flight) = figures(demo.stdout, "residual of the inliers")
     assert webcam[0] < webcam[1] < 0.2
     assert flight[0] < 2.0
