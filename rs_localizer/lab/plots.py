@@ -41,7 +41,7 @@ _WINDOW = 15
 # Zero has no logarithm.
 _LEAST = 1e-9
 # What is shown of an image around the points (px).
-_RIM = 60.0
+_RIM = 80.0
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -66,6 +66,13 @@ def _tidy(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
+def _legend(axes: Axes, columns: int) -> None:
+    """Above the axes, where it covers nothing."""
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, borderaxespad=0.1
+    )
+
+
 def trajectories(truth: Trajectory | None, estimates: Mapping[str, Trajectory]) -> Figure:
     """Where the camera was, from above and from the side."""
     figure = _figure("Position of the camera in each frame", 5.5)
@@ -88,10 +95,9 @@ def trajectories(truth: Trajectory | None, estimates: Mapping[str, Trajectory]) 
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("x (m)")
         axes.set_ylabel(f"{'xyz'[b]} (m)")
-        axes.set_title(title)
+        axes.text(0.03, 0.96, title, transform=axes.transAxes, va="top", style="italic")
         _tidy(axes)
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    _legend(left, 3)
     return figure
 
 
@@ -126,8 +132,7 @@ def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
         _plain_numbers(axes)
         axes.set_ylabel(f"{label} ({unit})")
         _tidy(axes)
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False,
-                    borderaxespad=0.1)  # fmt: skip
+        _legend(axes, 2)
     rows[-1].set_xlabel("time (s)")
     return figure
 
@@ -183,9 +188,8 @@ def inliers(
     for (name, style), values in zip(_methods(counts), counts.values(), strict=True):
         _draw_series(upper, name, style, stamps_ns, values, int(stamps_ns[0]), "")
     upper.set_ylim(bottom=0.0)
-    upper.set_ylabel("inliers in the frame")
-    upper.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False,
-                 borderaxespad=0.1)  # fmt: skip
+    upper.set_ylabel("inliers (0: frame refused)")
+    _legend(upper, 3)
     lower.fill_between(t, angular_rate, color="#8a8a8a", linewidth=0.0)
     lower.set_ylim(bottom=0.0)
     lower.set_ylabel("the camera turns\nat (deg/s)")

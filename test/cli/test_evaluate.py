@@ -16,7 +16,7 @@ from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_tw
 
 STAMPS = 1_500_000_000_000_000_000 + np.arange(40, dtype=np.int64) * 33_333_333
 RNG = np.random.default_rng(0)
-TURNS = Rotation.random(40, rng=2)
+TURNS = Rotation.from_quat(RNG.normal(size=(40, 4)))
 TRUTH = Trajectory(STAMPS, np.cumsum(RNG.normal(size=(40, 3)), axis=0), TURNS.as_quat())
 TWISTS = Twists(STAMPS, RNG.normal(size=(40, 3)), RNG.normal(size=(40, 3)))
 
