@@ -5,6 +5,7 @@ Householder's reduction to Hessenberg form and Francis' implicit double shifts, 
 14, 1970), without eigenvectors. All lanes take part in every sweep; each has its own window and
 shifts, and outside of its window its reflections are the identity.
 
+Nothing is scaled: entries should lie within 1e-70 and 1e70, or a lane loses its eigenvalues.
 A matrix of size n is stored with row length n + 1, ``(n + 1)^2`` values in all: the row and
 column of zeros let a sweep run over the end of its window.
 """
@@ -161,7 +162,7 @@ def _deflate(
         far = near + span
         if span != 0.0:
             near -= product / span
-    for value in (near, far) if begin < end else (near, np.inf):
+    for value in (near, far) if begin < end else (near, np.nan):
         if abs(value) <= bound:
             found[counts[lane] * LANES + lane] = value
             counts[lane] += 1

@@ -1,0 +1,372 @@
+"""R6P against an oracle in NumPy that shares neither algebra nor numerics with it.
+
+The oracle evaluates the fifteen minors by ``np.linalg.det`` at points and fits the quartics to
+the values, multiplies by a random combination of v's components, takes eigenvectors of the dense
+matrix, and polishes in all twelve unknowns of the camera model itself.
+"""
+
+import itertools
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.solvers import r6p
+
+BOUND = 0.6
+MONOMIALS = sorted(
+    (m for m in itertools.product(range(5), repeat=3) if sum(m) <= 4), key=lambda m: (sum(m), m)
+)
+MINORS = list(itertools.combinations(range(6), 4))
+
+
+def residuals(p, v, c, w, t):
+    """The model of the solver: two rows of ``[x]x`` times the camera points, (h,12)."""
+    turned = p.points + np.cross(v[:, None], p.points)
+    r = p.tau[..., None]
+    seen = turned + r * np.cross(w[:, None], turned) + c[:, None] + r * t[:, None]
+    return (seen[..., :2] - p.rays * seen[..., 2:]).reshape(len(v), 12)
+
+
+def by_coordinate(p, unknowns):
+    """Exact Jacobian (h,12,n) of residuals that are affine in every single coordinate."""
+    at = residuals(p, *np.moveaxis(unknowns.reshape(-1, 4, 3), 1, 0))
+    columns = [
+        residuals(p, *np.moveaxis((unknowns + e).reshape(-1, 4, 3), 1, 0)) - at for e in np.eye(12)
+    ]
+    return at, np.stack(columns, axis=-1)
+
+
+def matrices(p, v):
+    """A(v) (h,6,4) for one v: the equations that no C and t can change, by columns w and 1."""
+    h = len(p.points)
+    v = np.broadcast_to(v, (h, 3))
+
+    def bracket(w, c, t):
+        return residuals(p, v, *(np.broadcast_to(x, (h, 3)) for x in (c, w, t)))
+
+    zero, axes = np.zeros(3), np.eye(3)
+    constant = bracket(zero, zero, zero)
+    lateral = [bracket(zero, e, zero) - constant for e in axes]
+    lateral += [bracket(zero, zero, e) - constant for e in axes]
+    free = np.linalg.qr(np.stack(lateral, axis=-1), mode="complete")[0][..., 6:]
+    columns = [bracket(e, zero, zero) - constant for e in axes] + [constant]
+    return free.swapaxes(1, 2) @ np.stack(columns, axis=-1)
+
+
+def oracle(p, rng):
+    """Real solutions with |v| < BOUND: samples (m,), v (m,3)."""
+    h = len(p.points)
+    nodes = rng.uniform(-1, 1, (70, 3))
+    a = np.stack([matrices(p, v) for v in nodes], axis=1)
+    a /= np.sqrt((a**2).sum(axis=(1, 2, 3), keepdims=True))
+    values = np.stack([np.linalg.det(a[:, :, rows]) for rows in MINORS], axis=-1)
+    monomials = np.prod(nodes[:, None] ** np.array(MONOMIALS), axis=-1)
+    quartics = (np.linalg.pinv(monomials) @ values).swapaxes(1, 2)  # (h,15,35)
+    reduction = -np.linalg.solve(quartics[..., 20:], quartics[..., :20])
+    multiplication = np.zeros((h, 20, 20))
+    for weight, axis in zip(rng.normal(size=3), np.eye(3, dtype=int), strict=True):
+        for i, m in enumerate(MONOMIALS[:20]):
+            j = MONOMIALS.index(tuple(np.add(m, axis)))
+            multiplication[:, i] += weight * (np.eye(20)[j] if j < 20 else reduction[:, j - 20])
+    values, vectors = np.linalg.eig(multiplication)
+    sample, number = np.nonzero(np.abs(values.imag) < 1e-6)
+    vector = vectors[sample, :, number].real
+    v = vector[:, [MONOMIALS.index(tuple(e)) for e in np.eye(3, dtype=int)]] / vector[:, :1]
+    near = np.linalg.norm(v, axis=1) < 1.1 * BOUND
+    sample, v = sample[near], v[near]
+    one = SimpleNamespace(points=p.points[sample], rays=p.rays[sample], tau=p.tau[sample])
+    unknowns = np.concatenate([v, np.zeros((len(v), 9))], axis=1)
+    rest = by_coordinate(one, unknowns)  # at fixed v the model is linear in C, w and t
+    start = -np.linalg.pinv(rest[1][..., 3:]) @ rest[0][..., None]
+    unknowns[:, 3:] = start[..., 0]
+    for _ in range(5):
+        value, jacobian = by_coordinate(one, unknowns)
+        step = (np.linalg.pinv(jacobian) @ value[..., None])[..., 0]
+        unknowns = unknowns - step
+    found, shift = unknowns[:, :3], np.linalg.norm(unknowns[:, :3] - v, axis=1)
+    good = np.abs(residuals(one, *np.moveaxis(unknowns.reshape(-1, 4, 3), 1, 0))).max(1) < 1e-9
+    good &= (np.linalg.norm(step, axis=1) < 1e-6 * np.linalg.norm(unknowns, axis=1)) & (shift < 0.1)
+    good &= np.linalg.norm(found, axis=1) < BOUND
+    return sample[good], found[good]
+
+
+def directions(rng, length):
+    vector = rng.normal(size=(len(length), 3))
+    return vector * (length / np.linalg.norm(vector, axis=1))[:, None]
+
+
+def problems(h, seed, *, physical, rotation=30.0, translation=0.3, error=6.0, noise=0.0):
+    """The paper's set-up (theory.md, sec. 6), row times those of the image rows.
+
+    Points in [-1, 1]^3, distance 2 to 3, 45 degrees of view, motions up to ``rotation`` degrees
+    and ``translation``, an initial rotation that is up to ``error`` degrees off; ``physical``
+    has exact rotations, otherwise the double-linearised model is the truth.
+    """
+    rng = np.random.default_rng(seed)
+    start = Rotation.random(h, random_state=seed).as_matrix()
+    points = rng.uniform(-1, 1, (h, 6, 3)) @ start.swapaxes(1, 2)
+    v = directions(rng, np.radians(rng.uniform(0, error, h)))
+    w = directions(rng, np.radians(rng.uniform(0, rotation, h)))
+    t = directions(rng, rng.uniform(0, translation, h))
+    c = np.stack([np.zeros(h), np.zeros(h), rng.uniform(2, 3, h)], axis=1)
+    scale = 0.5 / np.tan(np.radians(22.5))
+    tau = np.zeros((h, 6))
+    for _ in range(100):  # until every point is seen by its own row
+        r = tau[..., None]
+        if physical:
+            placed = points @ Rotation.from_rotvec(v).as_matrix().swapaxes(1, 2)
+            turns = Rotation.from_rotvec((r * w[:, None]).reshape(-1, 3))
+            placed = turns.apply(placed.reshape(-1, 3)).reshape(h, 6, 3)
+        else:
+            placed = points + np.cross(v[:, None], points)
+            placed = placed + r * np.cross(w[:, None], placed)
+        seen = placed + c[:, None] + r * t[:, None]
+        rays = seen[..., :2] / seen[..., 2:]
+        previous, tau = tau, scale * rays[..., 1]
+    settled = np.abs(tau - previous).max(axis=1) < 1e-13
+    assert settled.mean() > 0.98
+    rays = rays + noise / scale / 1000 * rng.normal(size=rays.shape)
+    problem = SimpleNamespace(
+        points=points, rays=rays, tau=scale * rays[..., 1] if noise else tau,
+        start=start, v=v, c=c, w=w, t=t,
+    )  # fmt: skip
+    return SimpleNamespace(**{name: x[settled] for name, x in vars(problem).items()})
+
+
+def solutions(p, **bound):
+    return r6p.find_solutions(p.points, p.rays, p.tau, **bound)
+
+
+def check_residuals(p, v, c, w, t, limit=1e-9):
+    sample, number = np.nonzero(np.isfinite(v[..., 0]))
+    one = SimpleNamespace(points=p.points[sample], rays=p.rays[sample], tau=p.tau[sample])
+    value = residuals(one, *(x[sample, number] for x in (v, c, w, t)))
+    assert np.abs(value).max() < limit
+    return sample, v[sample, number]
+
+
+def distances(sample, v, others, other_v):
+    """How far each v is from the nearest of the other v of the same sample."""
+    order = np.argsort(others, kind="stable")
+    others, other_v = others[order], other_v[order]
+    begin, end = np.searchsorted(others, sample), np.searchsorted(others, sample, "right")
+    return np.array(
+        [
+            np.linalg.norm(other_v[i:j] - x, axis=1).min(initial=np.inf)
+            for i, j, x in zip(begin, end, v, strict=True)
+        ]
+    )
+
+
+FAMILIES = {
+    "paper": {"physical": True},
+    "noisy": {"physical": True, "noise": 1.0},
+    "model": {"physical": False},
+    "slow": {"physical": True, "rotation": 3.0, "translation": 0.03, "noise": 1.0},
+    "far": {"physical": False, "error": 30.0},
+    "still": {"physical": True, "rotation": 0.0, "translation": 0.0, "error": 0.0},
+    "random": None,
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_all_real_solutions_are_found_and_nothing_else(family):
+    if FAMILIES[family] is None:  # bearings that fit no motion at all
+        rng = np.random.default_rng(6)
+        p = SimpleNamespace(
+            points=rng.uniform(-1, 1, (2000, 6, 3)),
+            rays=rng.uniform(-0.5, 0.5, (2000, 6, 2)),
+            tau=rng.uniform(-0.5, 0.5, (2000, 6)),
+        )
+    else:
+        p = problems(2000, 7, **FAMILIES[family])
+    expected = oracle(p, np.random.default_rng(8))
+    found = check_residuals(p, *solutions(p))
+    assert len(expected[0]) > 0.05 * len(p.points)
+    assert (np.linalg.norm(found[1], axis=1) < BOUND).all()
+    assert np.mean(distances(*expected, *found) < 1e-6) >= 0.999
+    assert np.mean(distances(*found, *expected) < 1e-6) >= 0.999
+    # Each of them once.
+    assert abs(len(found[0]) - len(expected[0])) <= 0.001 * len(expected[0])
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {},
+        {"error": 30.0},
+        {"rotation": 0.0, "translation": 0.0, "error": 0.0},
+        {"rotation": 0.0},
+        {"translation": 0.0, "error": 0.0},
+    ],
+)
+def test_the_truth_is_among_the_solutions(motion):
+    p = problems(1500, 9, physical=False, **motion)
+    found = solutions(p)
+    error = sum(
+        np.linalg.norm(x - truth[:, None], axis=2)
+        for x, truth in zip(found, (p.v, p.c, p.w, p.t), strict=True)
+    )
+    assert np.mean(np.nanmin(error, axis=1) < 1e-7) > 0.999
+
+
+def test_solutions_come_first_and_by_the_length_of_v():
+    v = solutions(problems(1003, 10, physical=True))[0]
+    length = np.linalg.norm(v, axis=2)
+    count = np.isfinite(length).sum(axis=1)
+    assert count.max() >= 3
+    for lengths, n in zip(length, count, strict=True):
+        assert np.isfinite(lengths[:n]).all()
+        assert (np.diff(lengths[:n]) >= 0).all()
+
+
+def test_the_bound_is_a_parameter():
+    p = problems(1000, 11, physical=True, noise=1.0)
+    narrow, usual, wide = (solutions(p, bound=b)[0] for b in (0.1, 0.6, 3.0))
+    lengths = np.linalg.norm(usual, axis=2)
+    np.testing.assert_allclose(
+        np.nan_to_num(narrow), np.where(lengths[..., None] < 0.1, usual, 0.0), atol=1e-12
+    )
+    in_range = np.linalg.norm(wide, axis=2) < 0.6
+    assert in_range.sum() == np.isfinite(lengths).sum()
+    assert np.isfinite(wide[..., 0]).sum() > 1.5 * in_range.sum()
+    check_residuals(p, *solutions(p, bound=3.0))
+
+
+def batch(points, rays, tau, rotations):
+    """The kernel's own interface: (h,20,18)."""
+    h = len(points)
+    models = np.zeros((20, 18, h))
+    r6p.solve_batch(
+        points.reshape(-1, 3), rays.reshape(-1, 2), tau.ravel(),
+        np.arange(6 * h).reshape(h, 6), rotations, 1, models,
+    )  # fmt: skip
+    return np.moveaxis(models, (2, 0), (0, 1))
+
+
+def test_models_are_the_nearest_rotation_times_the_initial_one():
+    p = problems(101, 12, physical=True)
+    v, c, w, t = solutions(p)
+    models = batch(p.points @ p.start, p.rays, p.tau, p.start)
+    exists = np.isfinite(v[..., 0])
+    assert (np.isfinite(models).all(axis=2) == exists).all()
+    assert (np.isfinite(models).any(axis=2) == exists).all()
+    for sample, number in zip(*np.nonzero(exists), strict=True):
+        x, y, z = v[sample, number]
+        u, _, vt = np.linalg.svd(np.array([[1, -z, y], [z, 1, -x], [-y, x, 1]]))
+        expected = [(u @ vt @ p.start[sample]).ravel()]
+        expected += [part[sample, number] for part in (c, w, t)]
+        np.testing.assert_allclose(
+            models[sample, number], np.concatenate(expected), rtol=1e-6, atol=1e-8
+        )
+
+
+def test_the_unit_of_length_and_the_origin_do_not_matter():
+    p = problems(500, 13, physical=True, noise=1.0)
+    v, c, w, t = solutions(p)
+    for factor, shift in ((1e4, 0.0), (1e-4, 0.0), (1.0, np.array([5.0, -3.0, 2.0]))):
+        changed = SimpleNamespace(points=factor * p.points + shift, rays=p.rays, tau=p.tau)
+        other = solutions(changed)
+        same = np.isfinite(v[..., 0]) == np.isfinite(other[0][..., 0])
+        assert same.all(axis=1).mean() > 0.998
+        assert np.nanmedian(np.abs(other[0] - v)) < 1e-12
+        assert np.nanmedian(np.abs(other[2] - w)) < 1e-11
+        if not np.any(shift):
+            assert np.nanmedian(np.abs(other[1] / factor - c)) < 1e-11
+            assert np.nanmedian(np.abs(other[3] / factor - t)) < 1e-11
+
+
+def spoil(p, kind, rng):
+    """Make every sample degenerate in one way."""
+    h = len(p.points)
+    points, rays, tau = p.points.copy(), p.rays.copy(), p.tau.copy()
+    some = np.arange(h)
+    match kind:
+        case "coplanar":
+            normal = directions(rng, np.ones(h))
+            points -= (points @ normal[..., None]) * normal[:, None]
+        case "frontal":
+            points[..., 2] = 0.0
+        case "collinear":
+            points = points[:, :1] + rng.uniform(-1, 1, (h, 6, 1)) * points[:, 1:2]
+        case "one point":
+            points[:] = points[:, :1]
+        case "one bearing":
+            rays[:] = rays[:, :1]
+        case "repeated":
+            i, j = rng.integers(0, 6, (2, h))
+            points[some, i], rays[some, i], tau[some, i] = (
+                points[some, j], rays[some, j], tau[some, j],
+            )  # fmt: skip
+        case "one row":
+            tau[:] = tau[:, :1]
+        case "two rows":
+            tau = np.where(np.arange(6) % 2, tau[:, :1], tau[:, 1:2])
+        case "behind":
+            points[..., 2] -= 10.0
+        case "zero":
+            points[:] = 0.0
+            rays[:] = 0.0
+            tau[:] = 0.0
+        case "huge":
+            points *= 1e200
+        case "tiny":
+            points *= 1e-200
+        case "no number":
+            points[some, rng.integers(0, 6, h)] = np.nan
+        case "infinite":
+            rays[some, rng.integers(0, 6, h)] = np.inf
+        case "integers":
+            points, rays, tau = points.round(), rays.round(1), tau.round(1)
+    return points, rays, tau
+
+
+KINDS = (
+    "coplanar", "frontal", "collinear", "one point", "one bearing", "repeated", "one row",
+    "two rows", "behind", "zero", "huge", "tiny", "no number", "infinite", "integers",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_degenerate_samples_end_without_noise_and_leave_others_alone(kind):
+    p = problems(600, 14, physical=True)
+    bad = spoil(p, kind, np.random.default_rng(15))
+    good = batch(p.points, p.rays, p.tau, np.eye(3)[None])
+    odd = np.arange(len(p.points)) % 2 == 1
+    mixed = [np.where(odd.reshape(-1, *[1] * (x.ndim - 1)), y, x) for x, y in
+             zip((p.points, p.rays, p.tau), bad, strict=True)]  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = batch(*mixed, np.eye(3)[None])
+        alone = batch(*bad, np.eye(3)[None])
+    np.testing.assert_array_equal(found[~odd], good[~odd])
+    for models in (found, alone):
+        assert not np.isinf(models).any()
+        exists = np.isfinite(models)
+        assert (exists.all(axis=2) == exists.any(axis=2)).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"points": np.zeros((2, 5, 3))}, r"r6p takes points \(h,6,3\).* got \(2, 5, 3\)"),
+        ({"rays": np.zeros((2, 6, 3))}, r"\(2, 6, 3\)"),
+        ({"tau": np.zeros((1, 6))}, r"\(1, 6\)"),
+    ],
+)
+def test_wrong_shapes_are_refused_with_what_was_found(changes, said):
+    given = {
+        "points": np.zeros((2, 6, 3)),
+        "rays": np.zeros((2, 6, 2)),
+        "tau": np.zeros((2, 6)),
+    }
+    with pytest.raises(ValueError, match=said):
+        r6p.find_solutions(**(given | changes))
+
+
+def test_no_samples_give_no_solutions():
+    found = r6p.find_solutions(np.zeros((0, 6, 3)), np.zeros((0, 6, 2)), np.zeros((0, 6)))
+    assert [x.shape for x in found] == [(0, 20, 3)] * 4
