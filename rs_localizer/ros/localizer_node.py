@@ -22,7 +22,7 @@ from rs_localizer.io.outputs import TYPES, messages
 from rs_localizer.ros import parameters
 from rs_localizer.ros.conversion import make_message, message_class
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.stopping import StopSignals
+from rs_localizer.ros.stopping import StopSignals, shut_down
 from rs_localizer.settings import NODE_NAME
 
 # Sensor data: the newest counts, and a late one is worth less than none.
@@ -162,7 +162,7 @@ def main(args: list[str] | None = None) -> int:
                 return 0
             raise
         finally:
-            rclpy.try_shutdown()
+            shut_down()
 
 
 def _run(args: list[str] | None, stop: StopSignals) -> int:

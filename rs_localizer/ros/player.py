@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from rs_localizer.ros.conversion import copy_message, message_class
-from rs_localizer.ros.stopping import StopSignals
+from rs_localizer.ros.stopping import StopSignals, shut_down
 
 _CLOCK_PERIOD = 0.01  # s of real time between two messages on /clock
 _DISCOVERY_TIMEOUT = 5.0  # s to wait for somebody who listens
@@ -36,7 +36,7 @@ def play(
         try:
             _play(messages, types, rate)
         finally:
-            rclpy.try_shutdown()
+            shut_down()
 
 
 def _play(messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], rate: float) -> None:

@@ -9,7 +9,16 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Self
 
+import rclpy
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def shut_down() -> None:
+    """End the default context, if nobody else has."""
+    # After a signal rclpy does the same in a thread of its own, and whoever comes second fails.
+    with contextlib.suppress(RuntimeError):
+        rclpy.try_shutdown()
 
 
 class StopSignals:
