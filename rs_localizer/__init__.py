@@ -2,6 +2,7 @@
 
 from rs_localizer.config import LocalizerConfig, VelocityPrior
 from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection
+from rs_localizer.core.prior import Prior
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.localizer import Localizer
@@ -17,6 +18,7 @@ __all__ = [
     "Localizer",
     "LocalizerConfig",
     "Motion",
+    "Prior",
     "Reason",
     "Roi",
     "ScanDirection",

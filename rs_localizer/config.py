@@ -101,6 +101,27 @@ class VelocityPrior:
 
 
 @dataclass(frozen=True, slots=True)
+class Acceleration:
+    """How fast the camera changes its velocities, for the prediction of the next frame."""
+
+    angular: float = setting(
+        10.0,
+        "Standard deviation of the camera's angular acceleration, in rad/s^2",
+        minimum=0.001,
+        maximum=10000.0,
+    )
+    linear: float = setting(
+        5.0,
+        "Standard deviation of the camera's linear acceleration, in m/s^2",
+        minimum=0.001,
+        maximum=10000.0,
+    )
+
+    def __post_init__(self) -> None:
+        _check(self, "acceleration.")
+
+
+@dataclass(frozen=True, slots=True)
 class LocalizerConfig:
     """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
 
@@ -169,4 +190,9 @@ class NodeConfig(LocalizerConfig):
         "the exposure of the middle row",
         choices=tuple(time.value for time in PoseTime),
     )
+    tracking: bool = setting(
+        True,
+        "Use the previous pose and twist as first guess and prior; needs readout_time",
+    )
+    acceleration: Acceleration = field(default_factory=Acceleration)
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.posterior import Posterior, maximum_a_posteriori, prefer_rest
+from rs_localizer.core.posterior import Posterior, maximum_a_posteriori, weigh_against_rest
 from rs_localizer.core.prior import (
     Prior,
     PriorTerms,
@@ -20,6 +20,7 @@ from rs_localizer.core.prior import (
     with_prior,
 )
 from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, Observations, search
+from rs_localizer.core.refine import step_between
 from rs_localizer.core.sampling import IntArray, Pool, Random, generator
 from rs_localizer.core.scoring import optimize
 from rs_localizer.core.so3 import Array
@@ -35,6 +36,9 @@ _POOL_SCALE = 0.12
 _SCORE_SCALE = 4.0
 # A prediction may be off by this multiple of the inlier threshold.
 _PREDICTION_SCALE = 16.0
+# Squared Mahalanobis distance of a prediction; a chi-squared variable of 12 degrees of freedom
+# exceeds this once in a million.
+_MOST_INNOVATION = 51.0
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
 _GLOBAL_SHUTTER_BLOCK = 48
@@ -130,9 +134,9 @@ class Localizer:
             )
         frame = self._frame(points, pixels, rays, usable, scores, prior)
         if prior is not None and prior.motion is not None:
-            tracked = self._track(frame, prior, expected_share)
-            if tracked:
-                return tracked
+            near = self._track(frame, prior, expected_share)
+            if near:
+                return replace(near, tracked=True)
         start = self._global_shutter(frame)
         if not start.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
@@ -177,12 +181,17 @@ class Localizer:
     def _track(self, frame: _Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
         assert prior.motion is not None
+        assert prior.covariance is not None
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, frame.centre)
         terms = with_prior(frame.terms, prior.motion_only(), frame.centre)
         best = self._optimize(frame, predicted, _PREDICTION_SCALE * threshold, terms)
         start = Candidate(predicted, best.cost)
-        result = self._accept(frame, start, best, self._final(frame, best, terms))
+        posterior = self._final(frame, best, terms)
+        innovation = step_between(predicted, posterior.state)
+        if innovation @ np.linalg.solve(prior.covariance, innovation) > _MOST_INNOVATION:
+            posterior = self._final(frame, best, frame.terms)  # a jump: the points know better
+        result = self._accept(frame, start, best, posterior)
         if result and np.count_nonzero(result.inliers) < (
             _STILL_TRACKED * expected_share * len(frame.usable)
         ):
@@ -241,13 +250,13 @@ class Localizer:
         )
 
     def _final(self, frame: _Frame, best: Candidate, terms: PriorTerms) -> Posterior:
-        """The maximum a posteriori motion of the inliers, or rest if they show no motion."""
+        """The maximum a posteriori motion of the inliers, nearer to rest if they show none."""
         threshold = self.config.inlier_threshold
         posterior = maximum_a_posteriori(frame.observations, best.state, terms, threshold)
-        # Only the velocity prior of the configuration says nothing of this very frame.
+        # Unless more is known of this very frame than the velocity prior of the configuration.
         uninformed = len(terms.informations) == 1 and self._solver.rolling_shutter
         if uninformed and posterior.smallest_eigenvalue > _LEAST_EIGENVALUE:
-            return prefer_rest(frame.observations, posterior)
+            return weigh_against_rest(frame.observations, posterior)
         return posterior
 
     def _accept(

@@ -14,7 +14,7 @@ K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
 D = np.array([-0.1, 0.02, 0.001, 0.001, 0.0])
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 READOUT = 0.03
-ROLLING = ["r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p", "joint"]
+ROLLING = ["r6p", "r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p", "joint"]
 
 
 def camera(**changes):
@@ -84,9 +84,7 @@ def test_pose_and_velocities_without_noise_have_the_right_size_sign_and_frame(di
     (rotation, position), (ahead, there), (_, before) = (path.pose(t) for t in (0.0, h, -h))
     assert angle(result.rotation, rotation.T) < 1e-5
     np.testing.assert_allclose(result.position, position, atol=1e-6)
-    np.testing.assert_allclose(
-        result.translation, -result.rotation @ result.position, atol=1e-12
-    )
+    np.testing.assert_allclose(result.translation, -result.rotation @ result.position, atol=1e-12)
     rate = Rotation.from_matrix(rotation.T @ ahead).as_rotvec() / h
     np.testing.assert_allclose(result.angular_velocity, READOUT * rate, atol=1e-6)
     velocity = rotation.T @ (there - before) / (2 * h)
@@ -278,7 +276,6 @@ def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
     ("settings", "said"),
     [
         ({"solver": "epnp"}, "solver must be one of p3p, .*; got 'epnp'"),
-        ({"solver": "r6p"}, "r6p .* not available in this version"),
         ({"inlier_threshold": -1.0}, "inlier_threshold must lie between .* got -1.0"),
         ({"max_iterations": 2.5}, "max_iterations must be of type int, got 2.5"),
         ({"iterations": 3}, "unknown setting: .*iterations"),

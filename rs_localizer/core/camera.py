@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 import cv2
 import numpy as np
@@ -203,17 +204,10 @@ class Camera:
         if len(self.D) == 0:
             plain: Array = (sensor - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
             return plain
-        undistort = (
-            cv2.fisheye.undistortPoints
-            if self.distortion_model == DistortionModel.EQUIDISTANT
-            else cv2.undistortPoints
-        )
         usable = np.all(np.isfinite(sensor), axis=1)
         rays = np.full(sensor.shape, np.nan)
         if np.any(usable):
-            rays[usable] = undistort(
-                sensor[usable, None], self.K, self.D, criteria=_UNDISTORT_CRITERIA
-            )[:, 0]
+            rays[usable] = self._undistort(sensor[usable])
         back = self._distort(rays)
         lost = ~(np.abs(back - pixels).max(axis=1) < _ROUND_TRIP_TOLERANCE)
         rays[lost] = np.nan
@@ -235,13 +229,24 @@ class Camera:
         offsets = np.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
         pixels = self._distort((rays[None] + offsets[:, None]).reshape(-1, 2))
         ahead, behind = pixels.reshape(4, -1, 2)[0::2], pixels.reshape(4, -1, 2)[1::2]
-        return np.moveaxis((ahead - behind) / (2.0 * step), 0, 2)
+        # Contiguous: kernels are compiled for one layout of their arguments.
+        return np.ascontiguousarray(np.moveaxis((ahead - behind) / (2.0 * step), 0, 2))
 
     def inside(self, pixels: Array) -> NDArray[np.bool_]:
         """Which raw pixels (n,2) lie in the delivered image."""
         limit = np.array(self.size) - 0.5
         inside: NDArray[np.bool_] = np.all((pixels > -0.5) & (pixels < limit), axis=1)
         return inside  # NaN compares false
+
+    def _undistort(self, sensor: Array) -> Array:
+        points, K, D = sensor[:, None], self.K, self.D
+        if self.distortion_model == DistortionModel.EQUIDISTANT:
+            rays: Any = cv2.fisheye.undistortPoints(points, K, D, criteria=_UNDISTORT_CRITERIA)
+        elif hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+            rays = cv2.undistortPointsIter(points, K, D, None, None, _UNDISTORT_CRITERIA)
+        else:
+            rays = cv2.undistortPoints(points, K, D, criteria=_UNDISTORT_CRITERIA)
+        return np.asarray(rays[:, 0], np.float64)
 
     def _distort(self, rays: Array) -> Array:
         if len(self.D) == 0:

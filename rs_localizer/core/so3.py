@@ -105,6 +105,17 @@ def hat(vector: Array) -> Array:
     return matrix
 
 
+def right_jacobian(vector: Array) -> Array:
+    """Right Jacobian (3,3) of the exponential at a rotation vector (3,).
+
+    ``exp(a + d) = exp(a) exp(right_jacobian(a) d)`` to first order.
+    """
+    _, second, third = coefficients(float(vector @ vector))
+    cross = hat(vector)
+    jacobian: Array = np.eye(3) - second * cross + third * cross @ cross
+    return jacobian
+
+
 def exp_many(vectors: Array) -> Array:
     """Rotation matrices (n,3,3) of rotation vectors (n,3)."""
     vectors = np.ascontiguousarray(vectors, dtype=np.float64)

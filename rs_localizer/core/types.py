@@ -40,6 +40,7 @@ class Estimate(Motion):
     covariance: Array  # (12,12)
     global_shutter_inliers: int  # of the best global-shutter pose, at the same threshold
     iterations: int  # minimal samples drawn
+    tracked: bool = False  # found near a prior motion, without a search
 
     @property
     def position(self) -> Array:

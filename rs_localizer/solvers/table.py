@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.so3 import Array
-from rs_localizer.solvers import joint, p3p, r6p_two_step, r6p_vcwt, r9p
+from rs_localizer.solvers import joint, p3p, r6p, r6p_two_step, r6p_vcwt, r9p
 from rs_localizer.solvers.batch import MODEL_SIZE
 
 
@@ -37,6 +37,7 @@ def _solver(
 
 SOLVERS: dict[str, Solver] = {
     "p3p": _solver(p3p, p3p.solve_batch, rolling_shutter=False),
+    "r6p": _solver(r6p, r6p.solve_batch),
     "r6p_vc_wt": _solver(r6p_two_step, r6p_two_step.solve_vc_wt),
     "r6p_vct_w": _solver(r6p_two_step, r6p_two_step.solve_vct_w),
     "r6p_vct_wt": _solver(r6p_two_step, r6p_two_step.solve_vct_wt),
@@ -50,16 +51,11 @@ def find_solver(name: str) -> Solver:
     """The solver of that name.
 
     Raises:
-        ValueError: unknown name, or ``r6p``, whose polynomial solver is not part of this version.
+        ValueError: unknown name.
     """
-    if name in SOLVERS:
-        return SOLVERS[name]
-    if name == "r6p":
-        raise ValueError(
-            "solver r6p (the six-point polynomial solver) is not available in this version; "
-            f"choose one of {', '.join(SOLVERS)}"
-        )
-    raise ValueError(f"unknown solver {name!r}; choose one of {', '.join(SOLVERS)}")
+    if name not in SOLVERS:
+        raise ValueError(f"unknown solver {name!r}; choose one of {', '.join(SOLVERS)}")
+    return SOLVERS[name]
 
 
 def solve_minimal(

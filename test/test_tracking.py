@@ -1,0 +1,249 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+from rs_localizer.config import Acceleration
+from rs_localizer.core.refine import apply_step, step_between
+from rs_localizer.core.shutter import project_rolling
+from rs_localizer.tracking import Tracker, acceleration_covariance, predict
+
+READOUT = 0.03
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = rsl.Camera(640, 480, K, readout_time=READOUT)
+MAP = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3)) * [1, 1, 0.7] + np.array([0, 0, 4.0])
+WALL = np.column_stack([np.random.default_rng(1).uniform(-3, 3, (400, 2)), np.full(400, 3.0)])
+
+
+class Hand:
+    """A swaying camera in SI: map_from_camera at t seconds."""
+
+    def pose(self, t):
+        turn = 0.25 * np.array([np.sin(2.1 * t), np.sin(2.9 * t + 1), np.sin(1.7 * t + 2)])
+        place = 0.3 * np.array([np.sin(1.3 * t), np.sin(2.3 * t + 2), np.sin(1.1 * t + 1)])
+        return Rotation.from_rotvec(turn).as_matrix(), place
+
+    def motion(self, t):
+        """The truth at one moment, velocities by finite differences."""
+        h = 1e-5
+        (rotation, place), (ahead, there), (_, before) = (self.pose(x) for x in (t, t + h, t - h))
+        rate = Rotation.from_matrix(rotation.T @ ahead).as_rotvec() / h
+        velocity = rotation.T @ (there - before) / (2 * h)
+        return rsl.Motion(rotation.T, -rotation.T @ place, READOUT * rate, READOUT * velocity)
+
+    def frame(self, t, count, points=MAP, noise=1.0, outliers=0.0):
+        rng = np.random.default_rng(round(t * 1e4))
+
+        def poses_at(tau):
+            pairs = [self.pose(t + x * READOUT) for x in tau]
+            rotations = np.array([r.T for r, _ in pairs])
+            return rotations, -np.einsum("nij,nj->ni", rotations, np.array([p for _, p in pairs]))
+
+        pixels, _ = project_rolling(CAMERA, poses_at, points)
+        seen = np.flatnonzero(CAMERA.inside(pixels))
+        seen = rng.choice(seen, min(count, len(seen)), replace=False)
+        pixels = pixels[seen] + noise * rng.normal(size=(len(seen), 2))
+        wrong = np.arange(len(seen)) < outliers * len(seen)
+        pixels[wrong] = rng.uniform([0, 0], [639, 479], (wrong.sum(), 2))
+        return points[seen], pixels
+
+
+def times(count, start=0.0):
+    return start + np.arange(count) / 30.0
+
+
+def ns(t):
+    return round((t + 100.0) * 1e9)
+
+
+def error(result, truth):
+    """Position (m) and linear velocity (m/s) errors."""
+    place = -truth.rotation.T @ truth.translation
+    return (
+        np.linalg.norm(result.position - place),
+        np.linalg.norm(result.linear_velocity - truth.linear_velocity) / READOUT,
+    )
+
+
+def compare(points, count, frames=90, outliers=0.0):
+    """Errors (frames,2) of single frames and of tracked ones, and which were tracked."""
+    hand, localizer = Hand(), rsl.Localizer(CAMERA, min_inliers=10)
+    tracker = Tracker(localizer, Acceleration())
+    alone, together, tracked = [], [], []
+    for t in times(frames):
+        data, truth = hand.frame(t, count, points, outliers=outliers), hand.motion(t)
+        single, result = localizer.localize(*data), tracker.localize(ns(t), *data)
+        assert result, str(result)
+        together.append(error(result, truth))
+        tracked.append(result.tracked)
+        alone.append(error(single, truth) if single else (np.nan, np.nan))
+    return np.array(alone), np.array(together), np.array(tracked)
+
+
+@pytest.mark.parametrize(("points", "count"), [(MAP, 20), (WALL, 60)], ids=["20 points", "wall"])
+def test_tracking_improves_weak_frames(points, count):
+    alone, together, tracked = compare(points, count)
+    ratio = np.median(together[1:], axis=0) / np.nanmedian(alone[1:], axis=0)
+    assert ratio[0] < 0.6
+    assert ratio[1] < 0.6
+    assert tracked[1:].mean() > 0.95
+
+
+def test_tracking_never_harms_rich_frames():
+    alone, together, tracked = compare(MAP, 150, outliers=0.3)
+    for quantile in (0.25, 0.5, 0.75):
+        assert (
+            np.quantile(together, quantile, axis=0) <= np.quantile(alone, quantile, axis=0)
+        ).all()
+    assert tracked[1:].mean() > 0.95
+
+
+def test_the_prediction_is_covered_by_its_covariance():
+    hand = Hand()
+    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+    distances = []
+    for t in times(90):
+        prior = tracker.prediction(ns(t))
+        if prior is not None:
+            truth = hand.motion(t)
+            off = step_between(state(prior.motion), state(truth))
+            distances.append(off @ np.linalg.solve(prior.covariance, off))
+        assert tracker.localize(ns(t), *hand.frame(t, 60))
+    # The default accelerations are wider than this hand's: never too sure, and not absurdly wide.
+    assert 2.0 < np.median(distances) < 12.0
+    assert np.mean(np.array(distances) < 21.03) > 0.95
+
+
+def state(motion):
+    return np.concatenate(
+        [
+            motion.rotation.ravel(),
+            motion.translation,
+            motion.angular_velocity,
+            motion.linear_velocity,
+        ]
+    )
+
+
+def motion_of(vector):
+    return rsl.Motion(vector[:9].reshape(3, 3), vector[9:12], vector[12:15], vector[15:18])
+
+
+@pytest.mark.parametrize("readouts", [0.7, 1.1, -2.0, 15.0])
+def test_prediction_and_covariance_are_those_of_the_motion_model(readouts):
+    rng = np.random.default_rng(3)
+    start = state(Hand().motion(0.4))
+    start[12:] = 0.05 * rng.normal(size=6)
+    factor = 0.1 * rng.normal(size=(12, 12))
+    spread = factor @ factor.T
+    later, covariance = predict(motion_of(start), spread, readouts)
+    rotation, translation = motion_of(start).at(readouts)
+    np.testing.assert_allclose(later.rotation, rotation, atol=1e-14)
+    np.testing.assert_allclose(later.translation, translation, atol=1e-14)
+    # The later motion continues the first: half of the way on from there is the same.
+    np.testing.assert_allclose(later.at(0.3)[1], motion_of(start).at(readouts + 0.3)[1], atol=1e-12)
+    h = 1e-6
+    jacobian = np.stack(
+        [
+            (
+                step_between(state(later), state(predict(motion_of(apply_step(start, h * e)), spread, readouts)[0]))
+                - step_between(state(later), state(predict(motion_of(apply_step(start, -h * e)), spread, readouts)[0]))
+            )
+            / (2 * h)
+            for e in np.eye(12)
+        ],
+        axis=1,
+    )  # fmt: skip
+    np.testing.assert_allclose(covariance, jacobian @ spread @ jacobian.T, rtol=1e-5, atol=1e-7)
+
+
+def test_accelerations_add_way_and_velocity_that_belong_together():
+    covariance = acceleration_covariance(Acceleration(3.0, 2.0), 0.1, READOUT)
+    rng = np.random.default_rng(0)
+    samples = []
+    for _ in range(20_000):
+        angular, linear = 3.0 * rng.normal(size=3), 2.0 * rng.normal(size=3)
+        samples.append(
+            np.concatenate(
+                [0.005 * angular, 0.005 * linear, 0.1 * READOUT * angular, 0.1 * READOUT * linear]
+            )
+        )
+    scale = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(
+        np.cov(np.array(samples).T) / np.outer(scale, scale),
+        covariance / np.outer(scale, scale),
+        atol=0.05,
+    )
+
+
+def test_a_gap_a_jump_and_a_bag_that_starts_over_need_a_search_and_are_localized():
+    hand = Hand()
+    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+
+    def step(t, shown=None):
+        return tracker.localize(ns(t), *hand.frame(t if shown is None else shown, 100))
+
+    assert not step(0.0).tracked
+    assert step(0.033).tracked
+    assert not step(2.1).tracked  # after a gap
+    assert step(2.133).tracked
+    jumped = step(2.166, shown=5.0)  # what the camera sees belongs to another time
+    assert jumped
+    assert error(jumped, hand.motion(5.0))[0] < 0.03
+    assert not step(0.0).tracked  # time goes back
+    assert step(0.033).tracked
+    tracker.reset()
+    assert not step(0.066).tracked
+    assert not step(0.066).tracked  # the same time again
+
+
+def test_failures_in_a_row_lose_the_track_and_single_ones_do_not():
+    hand = Hand()
+    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+    nothing = np.zeros((0, 3)), np.zeros((0, 2))
+    assert tracker.localize(ns(0.0), *hand.frame(0.0, 100))
+    assert not tracker.localize(ns(0.033), *nothing)
+    assert tracker.localize(ns(0.066), *hand.frame(0.066, 100)).tracked
+    for k in range(3, 8):
+        assert not tracker.localize(ns(0.033 * k), *nothing)
+    assert tracker.prediction(ns(0.033 * 8)) is None
+    assert tracker.localize(ns(0.033 * 8), *hand.frame(0.033 * 8, 100))
+
+
+def test_without_a_readout_time_there_is_nothing_to_track_with():
+    blind = rsl.Camera(640, 480, K)
+    with pytest.raises(ValueError, match="tracking needs the readout time"):
+        Tracker(rsl.Localizer(blind), Acceleration())
+
+
+@pytest.mark.parametrize("kind", ["gyroscope", "gravity"])
+def test_a_measured_rate_or_direction_helps_on_a_wall(kind):
+    hand, localizer = Hand(), rsl.Localizer(CAMERA)
+    rng = np.random.default_rng(4)
+    alone, helped = [], []
+    for t in times(40):
+        data, truth = hand.frame(t, 60, WALL), hand.motion(t)
+        if kind == "gyroscope":
+            measured = truth.angular_velocity + 1e-4 * rng.normal(size=3)
+            prior = rsl.Prior(angular_velocity=measured, angular_velocity_deviation=1e-4)
+        else:
+            down = truth.rotation @ [0, 0, -1.0] + 1e-3 * rng.normal(size=3)
+            prior = rsl.Prior(gravity=9.81 * down, gravity_deviation=1e-3)
+        for errors, result in (
+            (alone, localizer.localize(*data)),
+            (helped, localizer.localize(*data, prior=prior)),
+        ):
+            turn = Rotation.from_matrix(result.rotation @ truth.rotation.T).as_rotvec()
+            rate = result.angular_velocity - truth.angular_velocity
+            errors.append((np.linalg.norm(rate), np.linalg.norm(turn)))
+    column = 0 if kind == "gyroscope" else 1
+    assert np.median(helped, axis=0)[column] < 0.5 * np.median(alone, axis=0)[column]
+
+
+def test_a_wrong_prior_motion_is_dropped():
+    hand, localizer = Hand(), rsl.Localizer(CAMERA)
+    data, truth = hand.frame(1.0, 100), hand.motion(1.0)
+    wrong = rsl.Prior(motion=hand.motion(3.0), covariance=1e-8 * np.eye(12))
+    result = localizer.localize(*data, prior=wrong)
+    assert result
+    assert error(result, truth)[0] < 0.03
