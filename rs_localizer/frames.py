@@ -27,6 +27,7 @@ from rs_localizer.io.outputs import Frame
 from rs_localizer.localizer import Localizer
 from rs_localizer.moments import pose_at, twist_at
 from rs_localizer.solvers import find_solver
+from rs_localizer.tracking import Tracker
 
 # Stands in until the first CameraInfo: kernels are compiled and settings checked before it comes.
 _ANY_CALIBRATION = Calibration(
@@ -65,6 +66,9 @@ class Refusal:
 class FrameLocalizer:
     """Localizes correspondence messages with the latest camera and the latest settings.
 
+    With ``tracking``, and a readout time, it remembers the previous frame; new settings or a new
+    camera start it afresh.
+
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.
 
@@ -75,7 +79,7 @@ class FrameLocalizer:
     def __init__(self, config: NodeConfig) -> None:
         self._calibration: Calibration | None = None
         self._config = config
-        self._camera, self._localizer = _build(_ANY_CALIBRATION, config)
+        self._camera, self._localizer, self._tracker = _build(_ANY_CALIBRATION, config)
 
     @property
     def config(self) -> NodeConfig:
@@ -84,8 +88,15 @@ class FrameLocalizer:
     @config.setter
     def config(self, config: NodeConfig) -> None:
         # Nothing changes if this raises: camera, localizer and settings always belong together.
-        self._camera, self._localizer = _build(self._calibration or _ANY_CALIBRATION, config)
+        self._camera, self._localizer, self._tracker = _build(
+            self._calibration or _ANY_CALIBRATION, config
+        )
         self._config = config
+
+    def reset(self) -> None:
+        """Forget the previous frames."""
+        if self._tracker is not None:
+            self._tracker.reset()
 
     def warm_up(self) -> None:
         """Compile all that the present settings need, from points to messages."""
@@ -101,7 +112,7 @@ class FrameLocalizer:
         """
         calibration = read_camera_info(message)
         if calibration != self._calibration:  # drivers repeat it with every image
-            self._camera, self._localizer = _build(calibration, self._config)
+            self._camera, self._localizer, self._tracker = _build(calibration, self._config)
             self._calibration = calibration
 
     def localize(self, message: Any) -> Frame | Refusal:
@@ -114,10 +125,19 @@ class FrameLocalizer:
             return Refusal("bad_cloud", str(error))
         if self._calibration is None:
             return Refusal("no_camera_info", "no usable camera_info has come yet")
-        result = self._localizer.localize(cloud.points, cloud.pixels, cloud.scores)
+        given = (cloud.points, cloud.pixels, cloud.scores)
+        if self._tracker is None:
+            result = self._localizer.localize(*given)
+        else:
+            result = self._tracker.localize(self._middle_row_ns(cloud.stamp_ns), *given)
         if not result:
             return Refusal(str(result.reason), result.detail)
         return self._frame(cloud, result, self._calibration.frame)
+
+    def _middle_row_ns(self, stamp_ns: int) -> int:
+        """When the middle row of the frame with this stamp was exposed."""
+        delay = self._config.stamp_offset - self._config.readout_time * self._camera.first_row_time
+        return stamp_ns + round(delay * 1e9)
 
     def _frame(self, cloud: Correspondences, estimate: Estimate, body_frame: str) -> Frame:
         readout_time = self._config.readout_time
@@ -125,8 +145,7 @@ class FrameLocalizer:
         stamp_ns = cloud.stamp_ns
         if self._config.pose_time == PoseTime.MID_FRAME:
             tau = 0.0
-            delay = self._config.stamp_offset - readout_time * first_row_time
-            stamp_ns += round(delay * 1e9)
+            stamp_ns = self._middle_row_ns(stamp_ns)
         else:
             tau = first_row_time
             if readout_time > 0.0:
@@ -145,6 +164,10 @@ class FrameLocalizer:
         )
 
 
-def _build(calibration: Calibration, config: NodeConfig) -> tuple[Camera, Localizer]:
+def _build(
+    calibration: Calibration, config: NodeConfig
+) -> tuple[Camera, Localizer, Tracker | None]:
     camera = calibration.camera(config.readout_time, config.scan_direction)
-    return camera, Localizer(camera, config)
+    localizer = Localizer(camera, config)
+    follows = config.tracking and config.readout_time > 0.0
+    return camera, localizer, Tracker(localizer, config.acceleration) if follows else None

@@ -23,6 +23,7 @@ from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, Observation
 from rs_localizer.core.refine import step_between
 from rs_localizer.core.sampling import IntArray, Pool, Random, generator
 from rs_localizer.core.scoring import optimize
+from rs_localizer.core.shutter import Motion
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.solvers import Solver, find_solver
@@ -90,13 +91,17 @@ class Localizer:
 
     def warm_up(self) -> None:
         """Compile every kernel that :meth:`localize` may need, or load it from the cache."""
-        width, height = self.camera.size
-        grid = np.linspace(0.3, 0.7, 5)
-        u, v = (g.ravel() for g in np.meshgrid(grid * width, grid * height))
-        pixels = np.column_stack([u, v])
-        depth = 2.0 + np.arange(len(pixels)) % 3  # not a plane
+        # A still camera before a scene that is no plane; with half a prediction, which is dropped.
+        count = max(25, self.config.min_inliers)
+        pixels = np.random.default_rng(0).uniform(0.3, 0.7, (count, 2)) * self.camera.size
         rays = np.nan_to_num(self.camera.rays(pixels))
-        self.localize(depth[:, None] * np.column_stack([rays, np.ones(len(rays))]), pixels)
+        depth = 2.0 + np.arange(count) % 3
+        points = depth[:, None] * np.column_stack([rays, np.ones(count)])
+        still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+        prior = Prior(motion=still, covariance=1e-4 * np.eye(12), gravity=(0.0, 0.0, 1.0),
+                      gravity_deviation=1.0, gravity_in_map=(0.0, 0.0, 1.0))  # fmt: skip
+        self.localize(points, pixels, np.arange(count, dtype=np.float64), prior)
+        self.localize(points, pixels)
 
     def localize(
         self,

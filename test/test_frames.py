@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import rs_localizer.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.prior import Prior
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure, Reason
@@ -43,8 +44,8 @@ class MockLocalizer:
     made: list[MockLocalizer]
 
     def __init__(self, camera: Camera, config: LocalizerConfig) -> None:
-        if config.solver == "r6p":
-            raise ValueError("r6p does not exist yet")
+        if config.solver == "r9p":
+            raise ValueError("nine are too many")
         self.camera, self.config = camera, config
         MockLocalizer.made.append(self)
 
@@ -52,7 +53,12 @@ class MockLocalizer:
         pass
 
     def localize(
-        self, points: Array, pixels: Array, scores: Array | None = None
+        self,
+        points: Array,
+        pixels: Array,
+        scores: Array | None = None,
+        prior: Prior | None = None,
+        expected_share: float = 0.5,
     ) -> Estimate | Failure:
         if len(points) < 4:
             return Failure(Reason.TOO_FEW_POINTS, f"{len(points)} points")
@@ -250,8 +256,8 @@ def test_new_settings_count_from_the_next_frame_on(
     assert mock.made[-1].camera.width == 320
     assert mock.made[-1].config.inlier_threshold == 5.0
     assert localized(frames.localize(cloud)).twist is not None
-    with pytest.raises(ValueError, match="r6p does not exist yet"):
-        frames.config = NodeConfig(solver="r6p")
+    with pytest.raises(ValueError, match="nine are too many"):
+        frames.config = NodeConfig(solver="r9p")
     assert frames.config.inlier_threshold == 5.0
     assert localized(frames.localize(cloud)).twist is not None
 

@@ -143,17 +143,12 @@ def test_prediction_and_covariance_are_those_of_the_motion_model(readouts):
     # The later motion continues the first: half of the way on from there is the same.
     np.testing.assert_allclose(later.at(0.3)[1], motion_of(start).at(readouts + 0.3)[1], atol=1e-12)
     h = 1e-6
-    jacobian = np.stack(
-        [
-            (
-                step_between(state(later), state(predict(motion_of(apply_step(start, h * e)), spread, readouts)[0]))
-                - step_between(state(later), state(predict(motion_of(apply_step(start, -h * e)), spread, readouts)[0]))
-            )
-            / (2 * h)
-            for e in np.eye(12)
-        ],
-        axis=1,
-    )  # fmt: skip
+    def moved(step):
+        """Where the prediction goes when the start moves."""
+        other, _ = predict(motion_of(apply_step(start, step)), spread, readouts)
+        return step_between(state(later), state(other))
+
+    jacobian = np.stack([(moved(h * e) - moved(-h * e)) / (2 * h) for e in np.eye(12)], axis=1)
     np.testing.assert_allclose(covariance, jacobian @ spread @ jacobian.T, rtol=1e-5, atol=1e-7)
 
 

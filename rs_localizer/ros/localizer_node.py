@@ -7,13 +7,16 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.service import Service
+from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, PointCloud2
+from std_srvs.srv import Trigger
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.frames import FrameLocalizer
@@ -22,12 +25,14 @@ from rs_localizer.io.outputs import TYPES, messages
 from rs_localizer.ros import parameters
 from rs_localizer.ros.conversion import make_message, message_class
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.stopping import StopSignals, shut_down
+from rs_localizer.ros.stopping import StopRequest
 from rs_localizer.settings import NODE_NAME
 
 # Sensor data: the newest counts, and a late one is worth less than none.
 _INPUT_QOS = {"depth": 1, "reliability": ReliabilityPolicy.BEST_EFFORT}
 _OUTPUT_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
+# A waiting executor does not see signals: it looks up this often, in s.
+_SIGNAL_LATENCY = 0.1
 
 
 class LocalizerNode(LifecycleNode):
@@ -53,6 +58,7 @@ class LocalizerNode(LifecycleNode):
         self._frames: FrameLocalizer | None = None
         self._inputs: list[Subscription] = []
         self._outputs: dict[str, Publisher] = {}
+        self._reset_service: Service | None = None
 
     # -- life cycle -------------------------------------------------------------------------
 
@@ -73,6 +79,7 @@ class LocalizerNode(LifecycleNode):
             )
             for name, type_name in TYPES.items()
         }
+        self._reset_service = self.create_service(Trigger, "~/reset", self._reset)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -118,6 +125,9 @@ class LocalizerNode(LifecycleNode):
         for publisher in self._outputs.values():
             self.destroy_lifecycle_publisher(publisher)
         self._outputs = {}
+        if self._reset_service is not None:
+            self.destroy_service(self._reset_service)
+            self._reset_service = None
         self._frames = None
 
     # -- callbacks --------------------------------------------------------------------------
@@ -141,6 +151,11 @@ class LocalizerNode(LifecycleNode):
         for name, output in messages(result, make_message).items():
             self._outputs[name].publish(output)
 
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._frames.reset()
+        response.success, response.message = True, "the previous pose and twist are forgotten"
+        return response
+
     def _warm_up(self, frames: FrameLocalizer) -> None:
         with self._compiling():
             frames.warm_up()
@@ -151,30 +166,32 @@ class LocalizerNode(LifecycleNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until Ctrl-C or SIGTERM; the exit code."""
-    with StopSignals() as stop:
+    with StopRequest() as stop:
         try:
-            return _run(args, stop)
-        except (KeyboardInterrupt, ExternalShutdownException):
+            # rclpy's own handlers end the context from a thread while the node still uses it.
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            node = LocalizerNode(compiling=stop.at_once)
+        except (ValueError, RuntimeError) as error:
+            rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
+            rclpy.try_shutdown()
+            return 1
+        try:
+            return _run(node, stop)
+        except ExternalShutdownException:
             return 0
-        except Exception:
-            # A signal also ends the context, and with it whatever call is under way.
-            if stop.requested:
-                return 0
-            raise
         finally:
-            shut_down()
+            node.destroy_node()
+            rclpy.try_shutdown()
 
 
-def _run(args: list[str] | None, stop: StopSignals) -> int:
-    try:
-        rclpy.init(args=args)
-        node = LocalizerNode(compiling=stop.at_once)
-    except (ValueError, RuntimeError) as error:
-        rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
-        return 1
+def _run(node: LocalizerNode, stop: StopRequest) -> int:
     if node.autostart:
         for transition in (node.trigger_configure, node.trigger_activate):
             if transition() != TransitionCallbackReturn.SUCCESS:
                 return 1
-    rclpy.spin(node)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not stop.requested:
+        executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+    executor.remove_node(node)
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import os
 import signal
@@ -21,18 +22,15 @@ def shut_down() -> None:
         rclpy.try_shutdown()
 
 
-class StopSignals:
-    """Within ``with``, the first SIGINT or SIGTERM raises KeyboardInterrupt wherever the main
-    thread is; more of them change nothing.
+class _Signals(abc.ABC):
+    """Within ``with``, SIGINT and SIGTERM come to :meth:`_stop`.
 
-    Enter it before ``rclpy.init``: rclpy's own handlers, which wake a waiting executor, call
-    those that they found. Leaving it ignores both signals for good, since the process is about to
-    end: a launch file and a terminal send theirs at the same time.
+    Leaving ignores both for good, since the process is about to end: a launch file and a terminal
+    send theirs at the same time.
     """
 
     def __init__(self) -> None:
         self.requested = False
-        self._at_once = False
 
     def __enter__(self) -> Self:
         for number in _SIGNALS:
@@ -43,12 +41,37 @@ class StopSignals:
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
+    @abc.abstractmethod
+    def _stop(self, number: int, frame: FrameType | None) -> None: ...
+
+
+class StopSignals(_Signals):
+    """The first signal raises KeyboardInterrupt wherever the main thread is; more change nothing.
+
+    Enter it before ``rclpy.init``: rclpy's own handlers, which wake a waiting executor, call
+    those that they found.
+    """
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if not self.requested:
+            self.requested = True
+            raise KeyboardInterrupt
+
+
+class StopRequest(_Signals):
+    """Signals set :attr:`requested` and raise nothing.
+
+    An exception in the middle of a callback, or of rclpy's own clean-up, is lost or breaks it.
+    """
+
+    _at_once = False
+
     @contextlib.contextmanager
     def at_once(self) -> Iterator[None]:
         """While compiling: a signal ends the process here and now, with exit code 0.
 
-        Compiling takes up to a minute and calls back from C, where an exception is printed and
-        lost. Nothing is published meanwhile, and the cache on disk is written atomically.
+        Compiling takes up to a minute and cannot be interrupted. Nothing is published meanwhile,
+        and the cache on disk is written atomically.
         """
         self._at_once = True
         try:
@@ -59,6 +82,4 @@ class StopSignals:
     def _stop(self, number: int, frame: FrameType | None) -> None:
         if self._at_once:
             os._exit(0)
-        if not self.requested:
-            self.requested = True
-            raise KeyboardInterrupt
+        self.requested = True

@@ -301,7 +301,6 @@ def test_topics_are_found_or_chosen(
     ("words", "code", "text"),
     [
         (["-p", "solver:=p4p"], 2, "solver must be one of p3p,"),
-        (["-p", "solver:=r6p"], 2, "r6p"),
         (["-p", "sead:=1"], 2, "'sead' is no setting"),
         (["-p", "seed"], 2, "expected name:=value, got 'seed'"),
         (["--params", "nowhere.yaml"], 1, "nowhere.yaml cannot be read"),

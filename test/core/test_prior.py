@@ -101,7 +101,7 @@ def test_velocity_terms_are_precisions_and_none_for_zero():
     ("arguments", "said"),
     [
         ({"motion": motion()}, "a prior motion and its covariance go together"),
-        ({"motion": motion(), "covariance": np.eye(6)}, r"covariance must be \(12,12\), got \(6, 6\)"),
+        ({"motion": motion(), "covariance": np.eye(6)}, r"must be \(12,12\), got \(6, 6\)"),
         ({"angular_velocity": [1, 2]}, "angular_velocity must be three finite numbers"),
         ({"angular_velocity": [0, 0, np.nan], "angular_velocity_deviation": 1}, "three finite"),
         ({"angular_velocity": [0, 0, 0]}, "angular_velocity_deviation must be positive, got nan"),

@@ -5,6 +5,8 @@ from rs_localizer.core.residuals import robust_cost
 from rs_localizer.core.scoring import best_models, optimize, state_of_model
 from rs_localizer.core.shutter import from_model_a
 
+FREE = velocity_terms(0.0, 0.0)
+
 
 def test_models_become_states_by_the_motion_model(scene):
     model = np.random.default_rng(0).normal(size=18)

@@ -204,7 +204,6 @@ def test_parameters_of_a_running_node(recording: Path, start_node: Start, peer: 
     talk.localize(None, cloud)
     assert len(talk.received["odometry"]) > 0
     for name, value, reason in (
-        ("solver", "r6p", "solver r6p .* is not available"),
         ("solver", "p4p", "solver must be one of"),
         ("readout_time", 1.0, "out of range"),
         ("autostart", False, "read-only"),
@@ -338,7 +337,6 @@ def test_signals_while_it_compiles(start_node: Start, tmp_path: Path, number: in
     ("arguments", "text"),
     [
         (("-p", "solver:=p4p"), "solver must be one of p3p, r6p, .*; got 'p4p'"),
-        (("-p", "solver:=r6p"), "solver r6p .* is not available"),
         (("-p", "readout_time:=0"), "readout_time must be of type float"),
         (("-p", "inlier_threshold:=-1.0"), "inlier_threshold out of range"),
         (("--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
