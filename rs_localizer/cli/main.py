@@ -49,6 +49,11 @@ COMMANDS = {
         "errors of estimated poses and twists against the truth, as tables and plots",
         "rs_localizer evaluate flight_poses flight",
     ),
+    "experiments": Command(
+        "rs_localizer.cli.experiments",
+        "the experiments of the literature and ours: curves, figures, a verdict on every claim",
+        "rs_localizer experiments motion noise --out figures",
+    ),
 }
 
 

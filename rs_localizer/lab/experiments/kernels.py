@@ -1,0 +1,96 @@
+"""Loops over many frames of few points, compiled: scores, refinement, Fisher information."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.prior import PriorTerms
+from rs_localizer.core.refine import refine
+from rs_localizer.core.residuals import (
+    PARAMETERS,
+    STATE_SIZE,
+    normal_equations,
+    pack,
+    robust_cost,
+    set_weights,
+    squared_errors,
+)
+from rs_localizer.core.scoring import optimize, state_of_model
+from rs_localizer.core.so3 import Array
+
+
+@kernel
+def best_solutions(
+    models: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array,
+    scale: float,
+) -> Array:
+    """Of the solutions (h,k,18) of each frame the one with the least truncated error: (h,18).
+
+    Points (h,n,3), rays (h,n,2) and row times (h,n) are all those of the frames; ``by_ray``
+    (n,2,2) is the same for all. NaN where a frame has no solution.
+    """
+    chosen = np.full((len(models), models.shape[2]), np.nan)
+    for i in range(len(models)):
+        data = pack(points[i], rays[i], tau[i], by_ray)
+        least = np.inf
+        for s in range(models.shape[1]):
+            if np.isnan(models[i, s, 0]):
+                continue
+            state = state_of_model(models[i, s])
+            cost = robust_cost(data, state, gradient, scale, 0.0, least)
+            if cost < least:
+                least = cost
+                chosen[i] = models[i, s]
+    return chosen
+
+
+@kernel
+def refine_frames(
+    models: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array,
+    threshold: float, prior: PriorTerms,
+) -> Array:
+    """Local optimisation and final refinement of the Localizer on all points: states (h,18)."""
+    states = np.full((len(models), STATE_SIZE), np.nan)
+    noise = 0.5 * threshold
+    for i in range(len(models)):
+        if np.isnan(models[i, 0]):
+            continue
+        data = pack(points[i], rays[i], tau[i], by_ray)
+        start = state_of_model(models[i]).reshape((1, STATE_SIZE))
+        state, cost = optimize(
+            start, np.zeros(1), data, gradient, 8.0 * threshold, threshold, prior, noise
+        )
+        if not np.isfinite(cost):
+            continue
+        errors = squared_errors(data, points.shape[1], state, gradient)
+        gate = 4.0 * threshold * threshold
+        set_weights(data, np.where(errors < gate, 1.0, 0.0))
+        state, _, _, _ = refine(data, state, gradient, 1e6, 0.0, prior, noise, 10)
+        states[i] = state
+    return states
+
+
+@kernel
+def frame_errors(
+    states: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array
+) -> Array:
+    """Reprojection errors (h,n) in pixels under the states (h,18) of the frames."""
+    errors = np.empty(tau.shape)
+    for i in range(len(states)):
+        data = pack(points[i], rays[i], tau[i], by_ray)
+        errors[i] = np.sqrt(squared_errors(data, tau.shape[1], states[i], gradient))
+    return errors
+
+
+@kernel
+def informations(
+    states: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array
+) -> Array:
+    """Fisher information (h,12,12) of the states at a noise of one pixel."""
+    found = np.empty((len(states), PARAMETERS, PARAMETERS))
+    slope = np.empty(PARAMETERS)
+    for i in range(len(states)):
+        data = pack(points[i], rays[i], tau[i], by_ray)
+        normal_equations(data, states[i], gradient, 1e6, 0.0, found[i], slope)
+    return found

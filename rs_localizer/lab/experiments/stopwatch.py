@@ -1,0 +1,38 @@
+"""Times of many subjects on a machine that has other things to do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.lab.experiments.results import Track
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """Something to be timed: ``run`` does its work ``count`` times."""
+
+    run: Callable[[], object]
+    count: int
+
+
+def interleaved(
+    subjects: Mapping[str, Subject], repeats: int, track: Track
+) -> dict[str, float]:
+    """Median time per piece of work of each subject, in microseconds.
+
+    All subjects take turns, so that a slow minute of the machine hits all of them alike.
+    """
+    for subject in subjects.values():
+        subject.run()  # compiles, fills caches
+    times: dict[str, list[float]] = {name: [] for name in subjects}
+    rounds: Iterable[int] = range(repeats)
+    for _ in track(rounds, repeats):
+        for name, subject in subjects.items():
+            start = time.perf_counter()
+            subject.run()
+            times[name].append(time.perf_counter() - start)
+    return {name: 1e6 * float(np.median(times[name])) / subjects[name].count for name in subjects}

@@ -1,0 +1,28 @@
+"""The experiments by name: the only place that names them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rs_localizer.lab.experiments import (
+    convergence,
+    linearisation,
+    motion,
+    noise,
+    p3p_initialisation,
+    real,
+    timings,
+    translation,
+)
+from rs_localizer.lab.experiments.results import Context, Result
+
+EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
+    "motion": motion.run,
+    "translation": translation.run,
+    "noise": noise.run,
+    "convergence": convergence.run,
+    "linearisation": linearisation.run,
+    "p3p-initialisation": p3p_initialisation.run,
+    "timings": timings.run,
+    "real": real.run,
+}
