@@ -56,10 +56,16 @@ def predict(motion: Motion, covariance: Array, readouts: float) -> tuple[Motion,
 
 
 def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:
-    """Covariance (12,12) that random accelerations, constant over ``dt`` s, add to a prediction."""
-    # Half a t^2 of way and a t of velocity, the velocity per readout.
-    response = np.array([0.5 * dt**2, dt * readout_time])
-    block = np.outer(response, response)
+    """Covariance (12,12) that random accelerations add to a prediction over ``dt`` s.
+
+    Those of white noise that changes the velocity by the deviation times ``dt``. An acceleration
+    that is constant from frame to frame would tie the change of velocity to the way, and where the
+    poses are sharp the filter then rings: it takes every deviation of the way twice, to and fro.
+    """
+    block = np.array(
+        [[dt**2 / 3.0, 0.5 * dt * readout_time], [0.5 * dt * readout_time, readout_time**2]]
+    )
+    block *= dt**2
     covariance = np.zeros((12, 12))
     for deviation, pose, velocity in (
         (acceleration.angular, _PHI, _OMEGA),

@@ -143,6 +143,7 @@ def test_prediction_and_covariance_are_those_of_the_motion_model(readouts):
     # The later motion continues the first: half of the way on from there is the same.
     np.testing.assert_allclose(later.at(0.3)[1], motion_of(start).at(readouts + 0.3)[1], atol=1e-12)
     h = 1e-6
+
     def moved(step):
         """Where the prediction goes when the start moves."""
         other, _ = predict(motion_of(apply_step(start, step)), spread, readouts)
@@ -152,23 +153,32 @@ def test_prediction_and_covariance_are_those_of_the_motion_model(readouts):
     np.testing.assert_allclose(covariance, jacobian @ spread @ jacobian.T, rtol=1e-5, atol=1e-7)
 
 
-def test_accelerations_add_way_and_velocity_that_belong_together():
+def test_accelerations_add_what_white_noise_adds_up_to():
     covariance = acceleration_covariance(Acceleration(3.0, 2.0), 0.1, READOUT)
-    rng = np.random.default_rng(0)
-    samples = []
-    for _ in range(20_000):
-        angular, linear = 3.0 * rng.normal(size=3), 2.0 * rng.normal(size=3)
-        samples.append(
-            np.concatenate(
-                [0.005 * angular, 0.005 * linear, 0.1 * READOUT * angular, 0.1 * READOUT * linear]
-            )
-        )
+    steps = 50
+    noise = np.random.default_rng(0).normal(size=(20_000, steps, 6)) / np.sqrt(steps)
+    velocity = 0.1 * np.cumsum(noise, axis=1) * ([3.0] * 3 + [2.0] * 3)
+    way = 0.1 * velocity.mean(axis=1)
+    samples = np.hstack([way, READOUT * velocity[:, -1]])
     scale = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(
-        np.cov(np.array(samples).T) / np.outer(scale, scale),
+        np.cov(samples.T) / np.outer(scale, scale),
         covariance / np.outer(scale, scale),
         atol=0.05,
     )
+
+
+def test_sharp_poses_do_not_make_the_velocity_ring():
+    """Without noise nothing but the filter itself could swing from frame to frame."""
+    hand = Hand()
+    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+    off = []
+    for t in times(60):
+        result = tracker.localize(ns(t), *hand.frame(t, 30, WALL, noise=0.02))
+        off.append(result.angular_velocity - hand.motion(t).angular_velocity)
+    swing = np.array(off)[10:]
+    assert np.corrcoef(swing[1:].ravel(), swing[:-1].ravel())[0, 1] > -0.5
+    assert np.degrees(np.abs(swing).max()) / READOUT < 6.0
 
 
 def test_a_gap_a_jump_and_a_bag_that_starts_over_need_a_search_and_are_localized():

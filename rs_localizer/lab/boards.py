@@ -14,6 +14,7 @@ from rs_localizer.lab.video import Image
 # the next corner must stay outside, and more of the edges inside means less noise.
 _WINDOW_SHARE = 0.45
 _WINDOW_RANGE = (2, 15)
+_SMOOTHING = 1.0  # px
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 
 
@@ -55,8 +56,10 @@ def find_corners(image: Image, board: Board, previous: Array | None = None) -> A
     grid = corners.reshape(board.rows, board.columns, 2)
     gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     window = int(np.clip(_WINDOW_SHARE * min(gaps), *_WINDOW_RANGE))
+    # The gradients of the raw image are those of its noise and of JPEG's blocks, too.
+    smooth = cv2.GaussianBlur(image, (0, 0), _SMOOTHING)
     refined = cv2.cornerSubPix(
-        image, np.asarray(corners, np.float32), (window, window), (-1, -1), _REFINE_CRITERIA
+        smooth, np.asarray(corners, np.float32), (window, window), (-1, -1), _REFINE_CRITERIA
     )
     grid = np.asarray(refined, np.float64).reshape(board.rows, board.columns, 2)
     return _ordered(grid, previous).reshape(-1, 2)

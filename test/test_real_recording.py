@@ -1,0 +1,142 @@
+"""The bundled webcam recording: does a real shutter do what the model says, sign and all?"""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+from rs_localizer import data
+from rs_localizer.config import Acceleration
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.prior import PriorTerms, state_in
+from rs_localizer.core.ransac import Observations
+from rs_localizer.core.refine import refine
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.solvers import SOLVERS
+from rs_localizer.tracking import Tracker
+
+# 0.33 of the assumed frame time; the video has no time stamps.
+READOUT = 0.33 / 30
+NEIGHBOURS = 0.09  # s between the frames before and after, none left out
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Calibration and clouds."""
+    clouds, calibration = [], None
+    with open_bag(data.path("webcam_chessboard/recording")) as bag:
+        for topic, _, message in bag.messages(("/camera_info", "/correspondences")):
+            if topic == "/camera_info":
+                calibration = read_camera_info(message)
+            else:
+                clouds.append(read_correspondences(message))
+    return calibration, clouds
+
+
+def residual(camera: Camera, cloud, start: rsl.Motion, velocities) -> tuple[rsl.Motion, float]:
+    """Pose fitted to all corners with the velocities given, and its rms error in px."""
+    rays, centre = camera.rays(cloud.pixels), cloud.points.mean(axis=0)
+    observations = Observations.of(
+        cloud.points - centre, rays, camera.row_time(cloud.pixels), camera.pixel_jacobian(rays),
+        camera.row_time_gradient,
+    )  # fmt: skip
+    held = np.concatenate([np.eye(3).ravel(), np.zeros(3), velocities])
+    precision = np.diag(np.concatenate([np.zeros(6), np.full(6, 1e12)]))
+    state = state_in(start, centre)
+    state[12:] = velocities
+    state = refine(
+        observations.packed, state, camera.row_time_gradient, 1e6, 0.0,
+        PriorTerms(precision[None], held[None], np.zeros(7)), 0.1, 50,
+    )[0]  # fmt: skip
+    rotation = state[:9].reshape(3, 3)
+    motion = rsl.Motion(rotation, state[9:12] - rotation @ centre, state[12:15], state[15:])
+    return motion, float(np.sqrt(observations.squared_errors(state).mean()))
+
+
+def central_differences(poses, seconds):
+    """Angular (rad/s) and linear (m/s) velocity, camera axes, where both neighbours are there."""
+    result = {}
+    for i in range(1, len(poses) - 1):
+        dt = seconds[i + 1] - seconds[i - 1]
+        if dt < NEIGHBOURS:
+            before, after = poses[i - 1], poses[i + 1]
+            rate = Rotation.from_matrix(before.rotation @ after.rotation.T).as_rotvec() / dt
+            way = before.rotation.T @ before.translation - after.rotation.T @ after.translation
+            result[i] = (rate, poses[i].rotation @ way / dt)
+    return result
+
+
+def fast_half(velocities):
+    speeds = {i: np.linalg.norm(rate) for i, (rate, _) in velocities.items()}
+    return [i for i, speed in speeds.items() if speed > np.median(list(speeds.values()))]
+
+
+@pytest.fixture(scope="module")
+def still(recording):
+    """Global-shutter poses and residuals, and velocities between them."""
+    calibration, clouds = recording
+    camera = calibration.camera(READOUT, "top_to_bottom")
+    start = rsl.Localizer(camera, solver="p3p")
+    fits = [
+        residual(camera, cloud, start.localize(cloud.points, cloud.pixels), np.zeros(6))
+        for cloud in clouds
+    ]
+    poses, errors = zip(*fits, strict=True)
+    seconds = np.array([cloud.stamp_ns for cloud in clouds]) * 1e-9
+    return poses, np.array(errors), central_differences(poses, seconds)
+
+
+def moving_residuals(recording, still, direction):
+    """Residuals on the fast half with the neighbours' velocities, and the global-shutter ones."""
+    calibration, clouds = recording
+    poses, errors, velocities = still
+    camera = calibration.camera(READOUT, direction)
+    fast = fast_half(velocities)
+    moving = [
+        residual(camera, clouds[i], poses[i], READOUT * np.concatenate(velocities[i]))[1]
+        for i in fast
+    ]
+    return np.array(moving), errors[fast]
+
+
+def test_the_neighbours_velocities_explain_the_shear_of_the_image(recording, still):
+    moving, standing = moving_residuals(recording, still, "top_to_bottom")
+    assert np.mean(standing) > 0.1
+    assert np.mean(moving) < 0.09
+    assert np.median(moving) < 0.09
+
+
+def test_the_reversed_scan_direction_makes_it_worse_than_a_global_shutter(recording, still):
+    moving, standing = moving_residuals(recording, still, "bottom_to_top")
+    assert np.mean(moving) > 1.2 * np.mean(standing)
+
+
+def test_the_tracked_twist_is_that_of_the_poses(recording):
+    calibration, clouds = recording
+    tracker = Tracker(rsl.Localizer(calibration.camera(READOUT, "top_to_bottom")), Acceleration())
+    results = [
+        tracker.localize(cloud.stamp_ns + round(READOUT / 2 * 1e9), cloud.points, cloud.pixels)
+        for cloud in clouds
+    ]
+    assert all(results)
+    assert np.mean([result.tracked for result in results]) > 0.95
+    seconds = np.array([cloud.stamp_ns for cloud in clouds]) * 1e-9
+    expected = central_differences(results, seconds)
+    fast = fast_half(expected)
+    x = np.concatenate([expected[i][0] for i in fast])
+    y = np.concatenate([results[i].angular_velocity / READOUT for i in fast])
+    assert np.corrcoef(x, y)[0, 1] > 0.8
+    assert 0.7 < x @ y / (x @ x) < 1.3
+
+
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "p3p"])
+def test_every_solver_localizes_every_frame_at_least_as_well_as_a_global_shutter(
+    recording, still, solver
+):
+    calibration, clouds = recording
+    localizer = rsl.Localizer(calibration.camera(READOUT, "top_to_bottom"), solver=solver)
+    results = [localizer.localize(cloud.points, cloud.pixels) for cloud in clouds]
+    assert all(results)
+    assert np.median([r.residual_rms for r in results]) < np.median(still[1])
