@@ -192,7 +192,8 @@ class NodeConfig(LocalizerConfig):
     )
     tracking: bool = setting(
         True,
-        "Use the previous pose and twist as first guess and prior; needs readout_time",
+        "Use the previous pose and twist as first guess and prior; needs readout_time and a "
+        "rolling-shutter solver",
     )
     acceleration: Acceleration = field(default_factory=Acceleration)
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)

@@ -66,8 +66,8 @@ class Refusal:
 class FrameLocalizer:
     """Localizes correspondence messages with the latest camera and the latest settings.
 
-    With ``tracking``, and a readout time, it remembers the previous frame; new settings or a new
-    camera start it afresh.
+    With ``tracking``, a readout time and a rolling-shutter solver it remembers the previous frame;
+    new settings or a new camera start it afresh.
 
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.
@@ -169,5 +169,9 @@ def _build(
 ) -> tuple[Camera, Localizer, Tracker | None]:
     camera = calibration.camera(config.readout_time, config.scan_direction)
     localizer = Localizer(camera, config)
-    follows = config.tracking and config.readout_time > 0.0
+    follows = (
+        config.tracking
+        and config.readout_time > 0.0
+        and find_solver(config.solver).rolling_shutter
+    )
     return camera, localizer, Tracker(localizer, config.acceleration) if follows else None

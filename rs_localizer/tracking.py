@@ -21,6 +21,7 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
+from rs_localizer.solvers import find_solver
 
 # A prediction over a longer gap (s) says less than a fresh search costs.
 _LONGEST_GAP = 0.5
@@ -91,17 +92,22 @@ class Tracker:
     """Localizes the frames of one camera in their order.
 
     Args:
-        localizer: its camera must have a readout time: the velocities of one image are per
-            readout, and only the time of a readout makes them predict the next image.
+        localizer: its camera must have a readout time, because the velocities of one image are
+            per readout, and its solver must be one for rolling shutters, because a global shutter
+            knows no velocities.
         acceleration: standard deviations of the camera's accelerations.
 
     Raises:
-        ValueError: without a readout time.
+        ValueError: without a readout time, or with a global-shutter solver.
     """
 
     def __init__(self, localizer: Localizer, acceleration: Acceleration) -> None:
         if not localizer.camera.readout_time > 0.0:
             raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
+        if not find_solver(localizer.config.solver).rolling_shutter:
+            raise ValueError(
+                f"tracking needs velocities, which solver {localizer.config.solver} does not find"
+            )
         self.localizer = localizer
         self.acceleration = acceleration
         self._track: _Track | None = None

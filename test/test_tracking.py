@@ -215,6 +215,11 @@ def test_failures_in_a_row_lose_the_track_and_single_ones_do_not():
     assert tracker.localize(ns(0.033 * 8), *hand.frame(0.033 * 8, 100))
 
 
+def test_a_global_shutter_has_nothing_to_track_with():
+    with pytest.raises(ValueError, match="tracking needs velocities, which solver p3p"):
+        Tracker(rsl.Localizer(CAMERA, solver="p3p"), Acceleration())
+
+
 def test_without_a_readout_time_there_is_nothing_to_track_with():
     blind = rsl.Camera(640, 480, K)
     with pytest.raises(ValueError, match="tracking needs the readout time"):
