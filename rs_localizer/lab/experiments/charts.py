@@ -21,6 +21,7 @@ from rs_localizer.lab.experiments.methods import Method
 from rs_localizer.lab.experiments.sweeps import Curves
 
 _DPI = 110
+_LEGEND_MARGIN, _LEGEND_ROW = 0.1, 0.21  # inches
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,11 @@ def _positional(value: float) -> str:
 def legend(figure: Figure, axes: Axes, columns: int = 4) -> None:
     """One legend for all panels, below them."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+    rows = -(-len(labels) // columns)
+    # Matplotlib 3.6 knows no legend outside of the layout: the room for it is set aside here.
+    bottom = (_LEGEND_MARGIN + _LEGEND_ROW * rows) / figure.get_size_inches()[1]
+    figure.set_layout_engine("constrained", rect=(0.0, bottom, 1.0, 1.0 - bottom))
+    figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
 
 
 def error_figure(

@@ -1,4 +1,4 @@
-"""How many iterations the linear solvers need, and from how far away they find the pose."""
+"""How many iterations the linear solvers need."""
 
 from __future__ import annotations
 
@@ -11,28 +11,26 @@ from matplotlib.figure import Figure
 from rs_localizer.core.so3 import Array
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
+from rs_localizer.lab.experiments.basin import (
+    BASIN,
+    FOUND,
+    basin_figure,
+    basin_shares,
+    basin_table,
+    reach,
+)
 from rs_localizer.lab.experiments.errors import METRICS, ORIENTATION, POSITION, motion_errors
-from rs_localizer.lab.experiments.methods import Method, available, estimate
+from rs_localizer.lab.experiments.methods import Method, estimate
 from rs_localizer.lab.experiments.motion import SPEEDS, TRANSLATION, X_LABEL
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
 from rs_localizer.lab.experiments.sweeps import Curves, quartiles, sweep
-from rs_localizer.lab.experiments.trials import (
-    Motions,
-    Setting,
-    Trials,
-    draw_trials,
-    random_rotations,
-)
+from rs_localizer.lab.experiments.trials import Motions, Setting, Trials, draw_trials
 
 _ITERATIVE = (m.VC_WT, m.VCT_W, m.VCT_WT, m.VCWT)
 _ITERATIONS = (1, 2, 3, 4, 5, 6, 8, 10, 14, 20, 30, 50)
 _SHOWN = (1, 5, 50)
 _FLAT_FROM = 8
 _SETTING = Setting(angular=15.0, linear=0.15)
-_OFFSETS = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 90.0)
-_BASIN = Setting(angular=20.0, linear=0.2)
-_BASIN_METHODS = (m.R6P, replace(m.VCWT, iterations=10), replace(m.VCWT_OURS, iterations=10))
-_FOUND = 2.0  # deg of orientation error
 _POSE = 2  # the first metrics are those of the pose
 _PAPER = "paper: convergence"
 
@@ -54,21 +52,21 @@ def run(context: Context) -> Result:
         )
         for method in _ITERATIVE
     }
-    basin = _basin(context)
+    basin = basin_shares(context)
     return Result(
         "Convergence",
         "Motion as in the experiment of that name, without noise, from the true orientation, with "
         f"1, 5 and 50 iterations; iteration by iteration at {_SETTING.angular:g} degrees and "
         f"{_SETTING.linear:g} per frame, with the algebraic error: the root mean square of the "
         "twelve equations. And the share of frames that are found, to "
-        f"{_FOUND:g} degrees, from an initial orientation so far from the truth, after ten "
-        f"iterations, at {_BASIN.angular:g} degrees and {_BASIN.linear:g} per frame.",
+        f"{FOUND:g} degrees, from an initial orientation so far from the truth, after ten "
+        f"iterations, at {BASIN.angular:g} degrees and {BASIN.linear:g} per frame.",
         [
             _once_is_enough(after),
             _others_slow(after),
             _flat(history),
-            _reach(basin, 30.0, 0.15),
-            _reach(basin, 60.0, 0.02),
+            reach(basin, 30.0, 0.15),
+            reach(basin, 60.0, 0.02),
         ],
         {
             "convergence": Table(
@@ -80,19 +78,12 @@ def run(context: Context) -> Result:
                 ],
             ),
             **{f"convergence_motion_{count}": curves.table() for count, curves in after.items()},
-            "convergence_basin": Table(
-                ("initial_error_deg", "method", "found"),
-                [
-                    (offset, name, float(share))
-                    for name, shares in basin.items()
-                    for offset, share in zip(_OFFSETS, shares, strict=True)
-                ],
-            ),
+            "convergence_basin": basin_table(basin),
         },
         {
             "convergence": _history_figure(history),
             "convergence_motion": _motion_figure(after),
-            "convergence_basin": _basin_figure(basin),
+            "convergence_basin": basin_figure(basin),
         },
     )
 
@@ -121,19 +112,6 @@ def _medians(method: Method, trials: Trials) -> tuple[float, float, float]:
     errors = quartiles(motion_errors(found, trials.truth))[1]
     algebraic = np.nanmedian(algebraic_errors(found, trials, trials.truth.rotation))
     return float(errors[ORIENTATION]), float(errors[POSITION]), float(algebraic)
-
-
-def _basin(context: Context) -> dict[str, Array]:
-    trials = draw_trials(context.trials, context.seed, _BASIN)
-    methods = available(_BASIN_METHODS)
-    shares: dict[str, list[float]] = {method.name: [] for method in methods}
-    for offset in context.track(_OFFSETS, len(_OFFSETS)):
-        turn = random_rotations(len(trials), context.seed, offset)
-        for method in methods:
-            found = estimate(method, trials, turn @ trials.truth.rotation)
-            error = motion_errors(found, trials.truth)[:, ORIENTATION]
-            shares[method.name].append(float(np.mean(error < _FOUND)))
-    return {name: np.array(values) for name, values in shares.items()}
 
 
 def _once_is_enough(after: Mapping[int, Curves]) -> Claim:
@@ -195,21 +173,6 @@ def _flat(history: Mapping[str, Array]) -> Claim:
     )
 
 
-def _reach(basin: Mapping[str, Array], offset: float, most: float) -> Claim:
-    at = _OFFSETS.index(offset)
-    ours, frozen = (float(basin[x.name][at]) for x in (m.VCWT_OURS, m.VCWT))
-    start = float(basin[m.VCWT_OURS.name][0])
-    return judge(
-        f"convergence.basin_{offset:g}",
-        "this project",
-        f"relinearized, {m.VCWT.label} converges from {offset:g} degrees, frozen it does not",
-        f"at least 95 % of the frames that are found from the truth itself; frozen at most "
-        f"{most:.0%} of all",
-        f"{ours:.0%} and {frozen:.1%} of all frames ({start:.0%} from the truth itself)",
-        ours >= 0.95 * start and frozen <= most,
-    )
-
-
 def _history_figure(history: Mapping[str, Array]) -> Figure:
     drawn = charts.figure(12.0, 4.4)
     labels = (METRICS[ORIENTATION].label, METRICS[POSITION].label, "algebraic error (rms)")
@@ -241,16 +204,4 @@ def _motion_figure(after: Mapping[int, Curves]) -> Figure:
     panels[0].set_ylabel(METRICS[ORIENTATION].label)
     charts.plain_logarithmic(panels[0])
     charts.legend(drawn, panels[0])
-    return drawn
-
-
-def _basin_figure(basin: Mapping[str, Array]) -> Figure:
-    drawn = charts.figure(6.4, 4.4)
-    axes = drawn.subplots()
-    for method in available(_BASIN_METHODS):
-        shares = 100.0 * basin[method.name]
-        charts.line(axes, np.array(_OFFSETS), shares, charts.look(method), method.label)
-    axes.set_ylim(-3.0, 103.0)
-    charts.tidy(axes, "error of the initial orientation (deg)", "frames found (%)")
-    axes.legend(frameon=False)
     return drawn

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from matplotlib.figure import Figure
 
-from rs_localizer.core.so3 import Array
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
-from rs_localizer.lab.experiments.methods import Method, available
+from rs_localizer.lab.experiments.methods import available
 from rs_localizer.lab.experiments.plain_ransac import best_of_samples, observe
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    Table,
-    judge,
-    not_tested,
-)
+from rs_localizer.lab.experiments.real_claims import METHODS, OURS, Inliers, claims, notes
+from rs_localizer.lab.experiments.results import Context, Result, Table
 from rs_localizer.lab.experiments.sequences import (
     Frame,
     Sequence,
@@ -30,13 +21,8 @@ from rs_localizer.lab.experiments.sequences import (
 from rs_localizer.localizer import Localizer
 
 _SAMPLES = 1000
-_METHODS = (*m.PAPERS, m.VCWT_OURS, m.R9P_OURS)
-_OURS = "localizer"
 _MOST_FRAMES, _LEAST_FRAMES = 60, 6
 _FRAMES_PER_TRIAL = 0.03
-_PAPER = "paper: real sequences"
-
-Inliers = Mapping[str, Array]  # method -> (frames,)
 
 
 def run(context: Context) -> Result:
@@ -66,14 +52,7 @@ def run(context: Context) -> Result:
         "threshold. Two sequences are simulated along the recorded motion of a hand, with 150 "
         "points of which 30 % are outliers; the third is a recording of a plane, where P3P has "
         "nothing to lose.",
-        [
-            _equal_to_r6p(found),
-            _ahead_of_p3p(found),
-            _often_more(found),
-            _unstable(found),
-            _r9p_hardest(found),
-            _ours_most(found),
-        ],
+        claims(found),
         {
             f"real_{name}": Table(
                 ("frame", "method", "inliers"),
@@ -86,21 +65,8 @@ def run(context: Context) -> Result:
             for name, rows in found.items()
         },
         {f"real_{s.name}": _figure(s, found[s.name]) for s in sequences},
-        _notes(found["webcam"]),
+        notes(found["webcam"]),
     )
-
-
-def _notes(plane: Inliers) -> list[str]:
-    if m.R6P.name not in plane:
-        return []
-    on_plane = {x.label: float(np.mean(plane[x.name])) for x in (m.R6P, m.P3P)}
-    note = (
-        f"On the plane R6P finds {on_plane[m.R6P.label]:.1f} inliers per frame, P3P "
-        f"{on_plane[m.P3P.label]:.1f}: at rest, six coplanar points leave one direction of the "
-        "twelve unknowns free, and the polynomial system has no isolated solutions, while the "
-        "linear solvers still give one of the many."
-    )
-    return [note]
 
 
 def _inliers(sequence: Sequence, frame: Frame, seed: int) -> dict[str, int]:
@@ -110,133 +76,14 @@ def _inliers(sequence: Sequence, frame: Frame, seed: int) -> dict[str, int]:
     )
     counts = {m.P3P.name: count}
     rotation = np.nan_to_num(state[:9].reshape(3, 3))
-    for method in available(_METHODS[1:]):
+    for method in available(METHODS[1:]):
         counts[method.name] = best_of_samples(
             observations, method, rotation, _SAMPLES, sequence.threshold, seed
         )[1]
     localizer = Localizer(sequence.camera, inlier_threshold=sequence.threshold)
     result = localizer.localize(frame.points, frame.pixels)
-    counts[_OURS] = int(np.count_nonzero(result.inliers)) if result else 0
+    counts[OURS] = int(np.count_nonzero(result.inliers)) if result else 0
     return counts
-
-
-_SIMULATED = ("phone", "action_camera")
-_HARDEST = "action_camera"
-
-
-def _means(found: Mapping[str, Inliers], method: str) -> dict[str, float]:
-    return {name: float(np.mean(found[name][method])) for name in _SIMULATED}
-
-
-def _listed(found: Mapping[str, Inliers], *methods: Method) -> str:
-    return "; ".join(
-        f"{name}: "
-        + ", ".join(f"{x.label} {np.mean(rows[x.name]):.1f}" for x in methods if x.name in rows)
-        for name, rows in found.items()
-    )
-
-
-def _equal_to_r6p(found: Mapping[str, Inliers]) -> Claim:
-    said = (
-        "real.vcwt_equals_r6p",
-        _PAPER,
-        f"{m.VCWT.label} finds as many inliers as R6P",
-        "means within 10 % on the two simulated sequences",
-    )
-    if m.R6P.name not in found[_HARDEST]:
-        return not_tested(*said, "r6p is not part of this version")
-    linear, polynomial = _means(found, m.VCWT.name), _means(found, m.R6P.name)
-    equal = [abs(linear[name] - polynomial[name]) <= 0.1 * polynomial[name] for name in _SIMULATED]
-    return judge(*said, _listed(found, m.VCWT, m.R6P), all(equal))
-
-
-def _ahead_of_p3p(found: Mapping[str, Inliers]) -> Claim:
-    ours, p3p = _means(found, m.VCWT.name), _means(found, m.P3P.name)
-    return judge(
-        "real.vcwt_ahead_of_p3p",
-        _PAPER,
-        f"{m.VCWT.label} finds more inliers than P3P",
-        "higher means on the two simulated sequences",
-        _listed(found, m.VCWT, m.P3P),
-        all(ours[name] > p3p[name] for name in _SIMULATED),
-    )
-
-
-def _often_more(found: Mapping[str, Inliers]) -> Claim:
-    shares = {
-        name: float(
-            np.mean(
-                np.maximum(found[name][m.VCT_W.name], found[name][m.VCT_WT.name])
-                > found[name][m.VCWT.name]
-            )
-        )
-        for name in found
-    }
-    return judge(
-        "real.vct_often_more",
-        _PAPER,
-        f"{m.VCT_W.label} or {m.VCT_WT.label} often find more than {m.VCWT.label}",
-        "in a quarter of the frames of one of the sequences at least",
-        ", ".join(f"{name} {share:.0%} of the frames" for name, share in shares.items())
-        + f" (means, {_listed(found, m.VCWT, m.VCT_W, m.VCT_WT)})",
-        max(shares.values()) >= 0.25,
-    )
-
-
-def _unstable(found: Mapping[str, Inliers]) -> Claim:
-    def least(method: Method) -> float:
-        means = _means(found, m.VCWT.name)
-        return min(
-            float(np.percentile(found[name][method.name], 10)) / means[name] for name in _SIMULATED
-        )
-
-    ours, other = least(m.VCWT), least(m.VC_WT)
-    return judge(
-        "real.vc_wt_unstable",
-        _PAPER,
-        f"{m.VC_WT.label} is unstable",
-        "in its worst tenth of the frames of one simulated sequence it keeps less than two thirds "
-        f"of what {m.VCWT.label} keeps in its worst tenth",
-        f"{other:.2f} against {ours:.2f} of the mean of {m.VCWT.label}",
-        other < 2.0 / 3.0 * ours,
-    )
-
-
-def _r9p_hardest(found: Mapping[str, Inliers]) -> Claim:
-    means = {
-        x.label: float(np.mean(found[_HARDEST][x.name]))
-        for x in available(m.PAPERS)
-    }
-    best = max(means, key=lambda label: means[label])
-    fixed = float(np.mean(found[_HARDEST][m.R9P_OURS.name]))
-    return judge(
-        "real.r9p_hardest",
-        _PAPER,
-        "R9P is best on the hardest sequence",
-        "highest mean of the paper's solvers on the action camera",
-        ", ".join(f"{label} {mean:.1f}" for label, mean in means.items())
-        + f"; with its trace fixed {fixed:.1f}",
-        best == m.R9P.label,
-        "samples of nine points hold inliers alone in 0.7^9 = 4 % of the draws, of six in 12 %; "
-        "and noise fills the gauge (see motion.r9p_gauge)",
-    )
-
-
-def _ours_most(found: Mapping[str, Inliers]) -> Claim:
-    ratios = {
-        name: float(
-            np.mean(rows[_OURS]) / max(np.mean(rows[x.name]) for x in available(_METHODS))
-        )
-        for name, rows in found.items()
-    }
-    return judge(
-        "real.localizer_most",
-        "this project",
-        "with local optimisation the Localizer keeps more inliers than the best minimal model",
-        "mean at least as high as that of every solver, on every sequence",
-        ", ".join(f"{name} {ratio:.2f} times the best" for name, ratio in ratios.items()),
-        min(ratios.values()) >= 1.0,
-    )
 
 
 def _figure(sequence: Sequence, rows: Inliers) -> Figure:
@@ -247,7 +94,7 @@ def _figure(sequence: Sequence, rows: Inliers) -> Figure:
         style = charts.look(method)
         charts.line(axes, x, rows[method.name].astype(float), style, method.label)
     charts.line(
-        axes, x, rows[_OURS].astype(float), charts.look(m.REFINED), "ours: the Localizer"
+        axes, x, rows[OURS].astype(float), charts.look(m.REFINED), "ours: the Localizer"
     )
     axes.set_ylim(bottom=0.0)
     axes.set_title(sequence.title)

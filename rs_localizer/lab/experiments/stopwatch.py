@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rs_localizer.core.so3 import Array
 from rs_localizer.lab.experiments.results import Track
 
 
@@ -21,10 +22,11 @@ class Subject:
 
 def interleaved(
     subjects: Mapping[str, Subject], repeats: int, track: Track
-) -> dict[str, float]:
-    """Median time per piece of work of each subject, in microseconds.
+) -> dict[str, Array]:
+    """Times (repeats,) per piece of work of each subject, in microseconds.
 
-    All subjects take turns, so that a slow minute of the machine hits all of them alike.
+    All subjects take turns, so that a slow moment of the machine hits all of them alike: compare
+    them turn by turn, see :func:`ratio`.
     """
     for subject in subjects.values():
         subject.run()  # compiles, fills caches
@@ -35,4 +37,9 @@ def interleaved(
             start = time.perf_counter()
             subject.run()
             times[name].append(time.perf_counter() - start)
-    return {name: 1e6 * float(np.median(times[name])) / subjects[name].count for name in subjects}
+    return {name: 1e6 * np.array(times[name]) / subjects[name].count for name in subjects}
+
+
+def ratio(one: Array, other: Array) -> float:
+    """Median of what one subject took in units of what the other took in the same turn."""
+    return float(np.median(one / other))

@@ -1,13 +1,14 @@
-"""Times are medians per piece of work, taken in turns."""
+"""Times per piece of work, taken in turns."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
 
+import numpy as np
 import pytest
 
-from rs_localizer.lab.experiments.stopwatch import Subject, interleaved
+from rs_localizer.lab.experiments.stopwatch import Subject, interleaved, ratio
 
 
 def untracked(items: Iterable, total: int) -> Iterator:
@@ -21,7 +22,14 @@ def test_subjects_take_turns() -> None:
     assert "".join(turns) == "abc" * 4  # one to warm up
 
 
-def test_median_per_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_times_are_per_piece(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 1.0, 10.0, 12.0, 20.0, 29.0])
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    assert interleaved({"a": Subject(lambda: None, 4)}, 3, untracked) == {"a": 0.5e6}
+    times = interleaved({"a": Subject(lambda: None, 4)}, 3, untracked)
+    np.testing.assert_allclose(times["a"], [0.25e6, 0.5e6, 2.25e6])
+
+
+def test_ratios_are_taken_turn_by_turn() -> None:
+    # The machine runs at half its speed in two turns of three.
+    fast_and_slow = np.array([1.0, 2.0, 2.0])
+    assert ratio(3.0 * fast_and_slow, fast_and_slow) == 3.0
