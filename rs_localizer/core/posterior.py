@@ -7,10 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms, held_terms
 from rs_localizer.core.ransac import Observations
-from rs_localizer.core.refine import apply_step, invert_information, refine, step_between
-from rs_localizer.core.residuals import set_weights
+from rs_localizer.core.refine import (
+    apply_step,
+    invert_information,
+    refine,
+    solve_positive,
+    step_between,
+)
+from rs_localizer.core.residuals import PARAMETERS, set_weights, squared_errors
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray
 
@@ -51,6 +58,7 @@ class Posterior:
         return self.inflation * self.noise**2
 
 
+@kernel
 def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float:
     """Standard deviation of the pixel noise from the errors within a gate.
 
@@ -62,17 +70,63 @@ def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float
     The errors of true inliers are Rayleigh distributed; cutting them off at the gate lowers their
     mean square by a factor that depends on the deviation itself, hence the fixed point.
     """
-    within = squared_errors[squared_errors < gate * gate]
-    left = 2 * len(within) - freedom
+    total, left = 0.0, -freedom
+    for squared in squared_errors:
+        if squared < gate * gate:
+            total += squared
+            left += 2.0
     if left <= 0.0:
         return gate / _GATE
-    mean = float(within.sum()) / left
+    mean = total / left
     variance = mean
     for _ in range(_NOISE_ROUNDS):
         u = gate * gate / (2.0 * max(variance, 1e-12 * gate * gate))
         kept = 1.0 - u * math.exp(-u) / -math.expm1(-u)
         variance = min(mean / max(kept, 1e-3), gate * gate)
     return max(math.sqrt(variance), _LEAST_NOISE)
+
+
+@kernel
+def _rounds(
+    data: Array,
+    count: int,
+    start: Array,
+    gradient: Array,
+    prior: PriorTerms,
+    threshold: float,
+) -> tuple[Array, Array, Array, float, float, float]:
+    """Refine, measure the noise, choose the inliers, and again.
+
+    Returns:
+        state, information times the noise variance, squared errors (count,), noise, gate, and the
+        degrees of freedom that the points decide (the prior takes its part of the twelve).
+    """
+    # From the wide side: a start that fits few points well would see little noise and keep few.
+    state, gate, noise, freedom = start, _WIDEST * threshold, 0.5 * threshold, 12.0
+    errors = squared_errors(data, count, state, gradient)
+    weights = np.empty(count)
+    information = np.empty((PARAMETERS, PARAMETERS))
+    for _ in range(_ROUNDS):
+        for i in range(count):
+            weights[i] = 1.0 if errors[i] < gate * gate else 0.0
+        set_weights(data, weights)
+        state, information, _, _ = refine(
+            data, state, gradient, _NO_SCALE, 0.0, prior, noise, _ITERATIONS
+        )
+        errors = squared_errors(data, count, state, gradient)
+        freedom = 12.0
+        for i in range(PARAMETERS):
+            column = np.zeros(PARAMETERS)
+            for term in range(len(prior.informations)):
+                column += prior.informations[term, :, i]
+            taken, solved = solve_positive(information, column)
+            if solved:
+                freedom -= noise * noise * taken[i]
+        noise = noise_deviation(errors, gate, freedom)
+        gate = min(max(threshold, _GATE * noise), _WIDEST * threshold)
+    weights[:] = 1.0
+    set_weights(data, weights)
+    return state, information, errors, noise, gate, freedom
 
 
 def maximum_a_posteriori(
@@ -84,17 +138,15 @@ def maximum_a_posteriori(
         start: state (18,).
         threshold: px, least gate for inliers.
     """
-    # From the wide side: a start that fits few points well would see little noise and keep few.
-    state, gate, noise = start, _WIDEST * threshold, 0.5 * threshold
-    errors = observations.squared_errors(state)
-    for _ in range(_ROUNDS):
-        inliers = errors < gate * gate
-        state, information, _, _ = _fit(observations, state, inliers, prior, noise)
-        errors = observations.squared_errors(state)
-        inverse, smallest = invert_information(information)
-        freedom = _freedom(inverse, prior, noise)
-        noise = noise_deviation(errors, gate, freedom)
-        gate = min(max(threshold, _GATE * noise), _WIDEST * threshold)
+    state, information, errors, noise, gate, freedom = _rounds(
+        observations.packed,
+        len(observations),
+        start,
+        observations.row_time_gradient,
+        prior,
+        threshold,
+    )
+    inverse, smallest = invert_information(information)
     inliers = errors < gate * gate
     left = max(2 * np.count_nonzero(inliers) - freedom, 3.0)
     # The noise itself is estimated: errors follow a t distribution, whose variance is larger.
@@ -154,9 +206,3 @@ def _fit(
     )
     set_weights(observations.packed, np.ones(len(observations)))
     return fitted
-
-
-def _freedom(inverse: Array, prior: PriorTerms, noise: float) -> float:
-    """Degrees of freedom that the points decide; the prior takes its part of the twelve."""
-    taken = noise**2 * float(np.sum(inverse * prior.informations.sum(axis=0)))
-    return 12.0 - taken

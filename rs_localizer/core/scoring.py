@@ -11,8 +11,8 @@ from rs_localizer.core.residuals import STATE_SIZE, robust_cost
 from rs_localizer.core.so3 import Array
 
 # Local optimisation tightens Tukey's loss from the first scale to the last by these steps.
-_ANNEALING_STEPS = 4
-_ITERATIONS_PER_SCALE = 3
+_ANNEALING_STEPS = 5
+_ITERATIONS_PER_SCALE = 1
 
 
 @kernel
