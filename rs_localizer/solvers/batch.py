@@ -64,6 +64,22 @@ def scatter(work: Array, offset: int, start: int, model: Array) -> None:
             model[k, start + lane] = work[(offset + k) * LANES + lane] if finite else np.nan
 
 
+@kernel
+def unpack(
+    models: Array, first: int, rotations: Array, translations: Array, w: Array, t: Array
+) -> None:
+    """Models (k,18,h) as rows ``first ...`` of rotations (.,k,3,3) and the vectors (.,k,3)."""
+    for s in range(models.shape[0]):
+        for i in range(models.shape[2]):
+            row = first + i
+            for a in range(3):
+                for b in range(3):
+                    rotations[row, s, a, b] = models[s, 3 * a + b, i]
+                translations[row, s, a] = models[s, 9 + a, i]
+                w[row, s, a] = models[s, 12 + a, i]
+                t[row, s, a] = models[s, 15 + a, i]
+
+
 class Sample:
     """The inputs of a traced function by their names."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -11,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.so3 import Array
 from rs_localizer.solvers import joint, p3p, r6p, r6p_two_step, r6p_vcwt, r9p
-from rs_localizer.solvers.batch import MODEL_SIZE
+from rs_localizer.solvers.batch import MODEL_SIZE, unpack
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,7 @@ def solve_minimal(
     rotation: ArrayLike | None = None,
     iterations: int = 5,
     as_published: bool = False,
+    threads: int = 1,
 ) -> tuple[Array, Array, Array, Array]:
     """Solve many minimal samples at once.
 
@@ -79,6 +82,7 @@ def solve_minimal(
         iterations: of the iterative solvers.
         as_published: r6p_vcwt with v^ frozen and r9p with its gauge free, as in the paper;
             otherwise relinearised, and with ``trace(R_RS) = 0``.
+        threads: how many parts of a large batch run side by side; 0 = one per core.
 
     Returns:
         rotations (h,k,3,3), translations (h,k,3), w (h,k,3) and t (h,k,3) of model A,
@@ -86,7 +90,7 @@ def solve_minimal(
         fewer than k solutions. For ``p3p``, w and t are zero.
 
     Raises:
-        ValueError: unknown solver, wrong shapes, or fewer than one iteration.
+        ValueError: unknown solver, wrong shapes, fewer than one iteration, or threads below 0.
     """
     solver = find_solver(name)
     points = np.ascontiguousarray(points, dtype=np.float64)
@@ -104,19 +108,34 @@ def solve_minimal(
         raise ValueError(f"rotation must be (3,3) or ({h},3,3), got {initial.shape}")
     if iterations < 1:
         raise ValueError(f"iterations must be 1 or more, got {iterations}")
+    if threads < 0:
+        raise ValueError(f"threads must be 0 (all cores) or more, got {threads}")
+    samples = np.arange(h * n, dtype=np.int64).reshape(h, n)
+    solve = solver.solve_as_published if as_published else solver.solve
+    initial = initial.reshape(-1, 3, 3)
     k = solver.solutions
-    models = np.empty((k, MODEL_SIZE, h))
-    if h > 0:
-        samples = np.arange(h * n, dtype=np.int64).reshape(h, n)
-        solve = solver.solve_as_published if as_published else solver.solve
+    rotations, translations = np.empty((h, k, 3, 3)), np.empty((h, k, 3))
+    w, t = np.empty((h, k, 3)), np.empty((h, k, 3))
+
+    def solve_part(first: int, end: int) -> None:
+        models = np.empty((k, MODEL_SIZE, end - first))
         solve(
-            points.reshape(-1, 3), rays.reshape(-1, 2), tau.ravel(), samples,
-            initial.reshape(-1, 3, 3), iterations, models,
-        )  # fmt: skip
-    found = np.moveaxis(models, (2, 0), (0, 1))  # (h,k,18)
-    return (
-        np.ascontiguousarray(found[..., :9]).reshape(h, k, 3, 3),
-        np.ascontiguousarray(found[..., 9:12]),
-        np.ascontiguousarray(found[..., 12:15]),
-        np.ascontiguousarray(found[..., 15:18]),
-    )
+            points.reshape(-1, 3),
+            rays.reshape(-1, 2),
+            tau.ravel(),
+            samples[first:end],
+            initial[first:end] if len(initial) > 1 else initial,
+            iterations,
+            models,
+        )
+        unpack(models, first, rotations, translations, w, t)
+
+    bounds = range(0, h, -(-h // (threads or os.cpu_count() or 1)) or 1)
+    if len(bounds) <= 1:
+        if h > 0:
+            solve_part(0, h)
+    else:  # kernels release the interpreter's lock
+        with ThreadPoolExecutor(len(bounds)) as pool:
+            ends = [*bounds[1:], h]
+            list(pool.map(solve_part, bounds, ends))
+    return rotations, translations, w, t

@@ -234,6 +234,7 @@ def test_an_unknown_solver_is_refused():
         ({"tau": np.zeros((1, 6))}, r"tau \(h,6\)"),
         ({"rotation": np.eye(4)}, r"rotation must be \(3,3\) or \(2,3,3\), got \(4, 4\)"),
         ({"iterations": 0}, "iterations must be 1 or more, got 0"),
+        ({"threads": -1}, "threads must be 0 .* got -1"),
     ],
 )
 def test_wrong_input_is_refused_with_what_was_found(changes, said):
@@ -243,6 +244,17 @@ def test_wrong_input_is_refused_with_what_was_found(changes, said):
     }  # fmt: skip
     with pytest.raises(ValueError, match=said):
         solve_minimal("r6p_vcwt", **(given | changes))
+
+
+@pytest.mark.parametrize("name", ["p3p", "r6p_vcwt", "r9p"])
+@pytest.mark.parametrize("one_rotation", [True, False])
+def test_threads_change_nothing_but_the_time(minimal, name, one_rotation):
+    p = minimal.problem(101, SOLVERS[name].sample_size, 0.05, 0.05, 0.05, noise=1e-3, seed=14)
+    if one_rotation:
+        p.start = p.start[0]
+    for threads in (0, 2, 7, 200):
+        for one, many in zip(solve(name, p), solve(name, p, threads=threads), strict=True):
+            np.testing.assert_array_equal(one, many)
 
 
 @pytest.mark.parametrize("name", list(SOLVERS))
