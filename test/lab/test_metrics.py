@@ -10,7 +10,8 @@ from rs_localizer.lab.metrics import associate, pose_errors, summarize, twist_er
 
 RNG = np.random.default_rng(0)
 STAMPS = 1_500_000_000_000_000_000 + np.arange(10, dtype=np.int64) * 33_333_333
-TRUTH = Trajectory(STAMPS, RNG.normal(size=(10, 3)), Rotation.from_quat(RNG.normal(size=(10, 4))).as_quat())
+ROTATIONS = Rotation.from_quat(RNG.normal(size=(10, 4)))
+TRUTH = Trajectory(STAMPS, RNG.normal(size=(10, 3)), ROTATIONS.as_quat())
 
 
 def test_associate_takes_the_nearest_within_the_tolerance() -> None:
