@@ -6,6 +6,7 @@ The node declares them, and a params file or ``-p name:=value`` of a command set
 from __future__ import annotations
 
 import contextlib
+import difflib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache
@@ -50,6 +51,15 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
             yield from _walk(value, f"{prefix}{item.name}.")
         else:
             yield prefix + item.name, Setting(default=value, **item.metadata)
+
+
+def unknown(name: str) -> str | None:
+    """What to say of a name that is no setting; None for settings and what every node may have."""
+    if name in settings() or name.split(".")[0] in _FOREIGN:
+        return None
+    close = difflib.get_close_matches(name, settings(), n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(settings())}"
+    return f"{name!r} is no setting; {hint}"
 
 
 def build(values: Mapping[str, Any]) -> NodeConfig:
@@ -137,9 +147,7 @@ def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any
 
 def _checked(name: str, value: Any, where: str) -> Any:
     if name not in settings():
-        raise SettingsError(
-            f"{where}: {name!r} is no setting; there are {', '.join(settings())}"
-        )
+        raise SettingsError(f"{where}: {unknown(name) or f'{name!r} is no setting'}")
     if isinstance(value, str) and isinstance(settings()[name].default, float):
         # ROS reads 1e-3 as a number, PyYAML as text.
         with contextlib.suppress(ValueError):

@@ -90,7 +90,8 @@ other_node:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is no setting; there are solver,"),
+        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is no setting; did you mean 'seed'"),
+        ("/**:\n  ros__parameters:\n    colour: 5\n", "is no setting; there are solver, "),
         ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is no setting"),
         ("/**:\n  ros__parameters: 5\n", "ros__parameters of /.* must be a mapping"),
         ("other:\n  ros__parameters:\n    seed: 5\n", "has no ros__parameters for /rs_localizer"),

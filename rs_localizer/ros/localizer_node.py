@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -24,6 +25,7 @@ from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import TYPES, messages
 from rs_localizer.ros import parameters
 from rs_localizer.ros.conversion import make_message, message_class
+from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.stopping import StopRequest
 from rs_localizer.settings import NODE_NAME
@@ -35,7 +37,7 @@ _OUTPUT_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
 _SIGNAL_LATENCY = 0.1
 
 
-class LocalizerNode(LifecycleNode):
+class LocalizerNode(RobustLifecycleNode):
     """A managed node; only while active it takes and publishes messages.
 
     Args:
@@ -52,6 +54,8 @@ class LocalizerNode(LifecycleNode):
         self._compiling = compiling
         config = parameters.declare(self)
         FrameLocalizer(config)  # refuses what it cannot do
+        for text in parameters.unknown_names(self):
+            self._warn(f"a parameter is ignored: {text}")
         parameters.on_change(self, check=FrameLocalizer, apply=self._take_config)
         self.autostart = config.autostart
         self.refusals = Refusals(self._warn)
@@ -65,6 +69,7 @@ class LocalizerNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             frames = FrameLocalizer(parameters.read(self))
+            self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
             self._warm_up(frames)
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
@@ -97,6 +102,10 @@ class LocalizerNode(LifecycleNode):
                 (PointCloud2, "correspondences", self._take_correspondences),
             )
         ]
+        if self._frames.config.readout_time == 0.0:
+            self._warn(
+                "readout_time is 0 (unknown): no twist is published and frames are not tracked"
+            )
         self.get_logger().info(
             f"active with solver {self._frames.config.solver}, listening to "
             + " and ".join(subscription.topic_name for subscription in self._inputs)
@@ -157,8 +166,11 @@ class LocalizerNode(LifecycleNode):
         return response
 
     def _warm_up(self, frames: FrameLocalizer) -> None:
+        started = time.monotonic()
         with self._compiling():
             frames.warm_up()
+        seconds = time.monotonic() - started
+        self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
@@ -192,6 +204,14 @@ def _run(node: LocalizerNode, stop: StopRequest) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not stop.requested:
-        executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        try:
+            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        except ExternalShutdownException:
+            raise
+        except Exception as error:  # one callback's: the others go on
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            node.refusals.add(
+                "internal_error", f"{error!r} in {where.name}, {where.filename}:{where.lineno}"
+            )
     executor.remove_node(node)
     return 0

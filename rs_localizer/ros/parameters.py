@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.settings import Setting, build, settings
+from rs_localizer.settings import Setting, build, settings, unknown
 
 
 def declare(node: Node) -> NodeConfig:
@@ -28,12 +28,24 @@ def declare(node: Node) -> NodeConfig:
         try:
             node.declare_parameter(name, setting.default, _descriptor(setting))
         except InvalidParameterTypeException as error:
+            given = node._parameter_overrides[name].value
+            hint = ""
+            if isinstance(setting.default, float) and type(given) is int:
+                hint = f" (write {float(given)!r})"
             raise ValueError(
-                f"{name} must be of type {type(setting.default).__name__}: {error}"
+                f"{name} must be of type {type(setting.default).__name__}, got {given!r}{hint}"
             ) from error
         except InvalidParameterValueException as error:
             raise ValueError(str(error)) from error
     return read(node)
+
+
+def unknown_names(node: Node) -> list[str]:
+    """What to say of each parameter that the node was started with and does not have.
+
+    No reason to refuse the start: a params file for ``/**`` speaks to several nodes.
+    """
+    return [text for name in sorted(node._parameter_overrides) if (text := unknown(name))]
 
 
 def read(node: Node, changes: list[Parameter] | None = None) -> NodeConfig:

@@ -31,11 +31,11 @@ RUN = "import sys; from rs_localizer.ros.localizer_node import main; sys.exit(ma
 class NodeProcess:
     """The node, started as a user starts it."""
 
-    def __init__(self, log: Path, *arguments: str, environment: dict[str, str]) -> None:
+    def __init__(self, log: Path, *arguments: str, run: str, environment: dict[str, str]) -> None:
         self._log = log
         with log.open("w") as file:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", RUN, "--ros-args", *arguments],
+                [sys.executable, "-c", run, "--ros-args", *arguments],
                 stdout=file,
                 stderr=file,
                 env={**os.environ, "RCUTILS_LOGGING_BUFFERED_STREAM": "0", **environment},
@@ -96,9 +96,9 @@ class Peer:
 def start_node(tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
     started: list[NodeProcess] = []
 
-    def start(*arguments: str, **environment: str) -> NodeProcess:
+    def start(*arguments: str, run: str = RUN, **environment: str) -> NodeProcess:
         log = tmp_path / f"node{len(started)}.log"
-        started.append(NodeProcess(log, *arguments, environment=environment))
+        started.append(NodeProcess(log, *arguments, run=run, environment=environment))
         return started[-1]
 
     yield start

@@ -256,6 +256,45 @@ def test_life_cycle(recording: Path, start_node: Start, peer: Any) -> None:
     assert "Traceback" not in node.log
 
 
+def test_impossible_transitions_are_refused(recording: Path, start_node: Start, peer: Any) -> None:
+    node = start_node(*SHUTTER)
+    talk = Talk(peer)
+    talk.connect()
+    for transition in (
+        Transition.TRANSITION_ACTIVATE,
+        Transition.TRANSITION_CONFIGURE,
+        Transition.TRANSITION_ACTIVATE,
+        99,
+    ):
+        assert not change_state(peer, transition)
+    node.wait_for_log("transition 99 is refused: the node is active")
+    assert state(peer) == State.PRIMARY_STATE_ACTIVE
+    talk.localize(*inputs(recording)[0])
+    assert node.stop() == 0
+    assert "Traceback" not in node.log
+
+
+def test_a_failing_callback_does_not_end_the_node(
+    recording: Path, start_node: Start, peer: Any
+) -> None:
+    # A bug, for once: the first frame raises.
+    broken = (
+        "import sys; from rs_localizer.frames import FrameLocalizer as F\n"
+        "localize = F.localize\n"
+        "def fail(self, message): F.localize = localize; raise TypeError('a bug')\n"
+        "F.localize = fail\n"
+        "from rs_localizer.ros.localizer_node import main; sys.exit(main())"
+    )
+    node = start_node(*SHUTTER, run=broken)
+    talk = Talk(peer)
+    talk.connect()
+    info, cloud = inputs(recording)[0]
+    assert not talk.send(info, cloud)
+    node.wait_for_log("internal_error: TypeError('a bug') in fail")
+    talk.localize(info, cloud)
+    assert node.stop() == 0
+
+
 def test_names_can_be_remapped_and_qos_overridden(
     recording: Path, start_node: Start, peer: Any
 ) -> None:
@@ -337,7 +376,7 @@ def test_signals_while_it_compiles(start_node: Start, tmp_path: Path, number: in
     ("arguments", "text"),
     [
         (("-p", "solver:=p4p"), "solver must be one of p3p, r6p, .*; got 'p4p'"),
-        (("-p", "readout_time:=0"), "readout_time must be of type float"),
+        (("-p", "readout_time:=0"), r"readout_time must be of type float, got 0 \(write 0\.0\)"),
         (("-p", "inlier_threshold:=-1.0"), "inlier_threshold out of range"),
         (("--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
     ],
@@ -351,6 +390,27 @@ def test_started_with_bad_parameters(
     assert len(fatal) == 1
     assert re.search(text, fatal[0])
     assert "Traceback" not in node.log
+
+
+def test_what_it_says_at_start(start_node: Start, tmp_path: Path) -> None:
+    file = tmp_path / "params.yaml"
+    file.write_text("/**:\n  ros__parameters: {min_inlier: 9, use_sim_time: false}\n")
+    node = start_node("--params-file", str(file), "-p", "readout_tim:=0.1")
+    node.wait_for_log("active with solver")
+    lines = [line.partition("]: ")[2] for line in node.log.splitlines()]
+    compiling = lines.index("compiling kernels (once on this machine, up to a minute)")
+    assert re.fullmatch(r"kernels are ready after \d+\.\d s", lines[compiling + 1])
+    ignored = "a parameter is ignored: {} is no setting; did you mean {}?"
+    assert [line for line in lines if "ignored" in line] == [
+        ignored.format("'min_inlier'", "'min_inliers'"),
+        ignored.format("'readout_tim'", "'readout_time'"),
+    ]
+    silent = "readout_time is 0 (unknown): no twist is published and frames are not tracked"
+    assert lines.count(silent) == 1
+    node = start_node(*SHUTTER)
+    node.wait_for_log("active with solver")
+    assert silent not in node.log
+    assert "ignored" not in node.log
 
 
 def test_the_shipped_params_file_is_taken(start_node: Start, tmp_path: Path) -> None:

@@ -130,10 +130,30 @@ def test_values_at_start(context: Context) -> None:
     [
         ("solver:=p4p", "solver must be one of"),
         ("readout_time:=0.5", r"readout_time out of range"),
-        ("readout_time:=0", "readout_time must be of type float: .*INTEGER"),
-        ("seed:=high", "seed must be of type int: .*STRING"),
+        ("readout_time:=0", r"readout_time must be of type float, got 0 \(write 0\.0\)$"),
+        ("inlier_threshold:=-3", r"got -3 \(write -3\.0\)$"),
+        ("readout_time:=true", "readout_time must be of type float, got True$"),
+        ("seed:=high", "seed must be of type int, got 'high'$"),
     ],
 )
 def test_bad_values_at_start(context: Context, assignment: str, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         Recorder(context, "-p", assignment)
+
+
+def test_names_that_no_parameter_has(context: Context) -> None:
+    assignments = (
+        "readout_tim:=0.1",
+        "colour:=red",
+        "velocity_prior.angulr:=0.5",
+        "use_sim_time:=true",
+        "qos_overrides./camera_info.subscription.depth:=3",
+        "seed:=3",
+    )
+    recorder = Recorder(context, *(word for text in assignments for word in ("-p", text)))
+    texts = parameters.unknown_names(recorder.node)
+    recorder.node.destroy_node()
+    colour, readout_time, angular = texts
+    assert colour.startswith("'colour' is no setting; there are solver, ")
+    assert readout_time == "'readout_tim' is no setting; did you mean 'readout_time'?"
+    assert angular.endswith("did you mean 'velocity_prior.angular'?")
