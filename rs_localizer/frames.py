@@ -6,6 +6,7 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -67,16 +68,22 @@ class FrameLocalizer:
     """Localizes correspondence messages with the latest camera and the latest settings.
 
     With ``tracking``, a readout time and a rolling-shutter solver it remembers the previous frame;
-    new settings or a new camera start it afresh.
+    new settings, a new camera, another map and a time before the last one start it afresh.
 
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.
+        notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
+            (a recording that starts over) and ``map_changed``. The frame is localized all the same.
 
     Raises:
         ValueError: for settings that the localizer refuses.
     """
 
-    def __init__(self, config: NodeConfig) -> None:
+    def __init__(
+        self, config: NodeConfig, notice: Callable[[str, str], None] = lambda name, text: None
+    ) -> None:
+        self._notice = notice
+        self._last: tuple[int, str] | None = None  # stamp and map of the last cloud
         self._calibration: Calibration | None = None
         self._config = config
         self._camera, self._localizer, self._tracker = _build(_ANY_CALIBRATION, config)
@@ -95,6 +102,7 @@ class FrameLocalizer:
 
     def reset(self) -> None:
         """Forget the previous frames."""
+        self._last = None
         if self._tracker is not None:
             self._tracker.reset()
 
@@ -123,6 +131,7 @@ class FrameLocalizer:
             return Refusal("empty_cloud", str(error))
         except MessageError as error:
             return Refusal("bad_cloud", str(error))
+        self._follow(cloud.stamp_ns, cloud.frame)
         if self._calibration is None:
             return Refusal("no_camera_info", "no usable camera_info has come yet")
         given = (cloud.points, cloud.pixels, cloud.scores)
@@ -133,6 +142,26 @@ class FrameLocalizer:
         if not result:
             return Refusal(str(result.reason), result.detail)
         return self._frame(cloud, result, self._calibration.frame)
+
+    def _follow(self, stamp_ns: int, frame: str) -> None:
+        """Start afresh where this frame cannot follow the last one."""
+        if self._last is not None:
+            last_ns, last_frame = self._last
+            if stamp_ns < last_ns:
+                self.reset()
+                self._notice(
+                    "time_went_back",
+                    f"the stamp {stamp_ns * 1e-9:.3f} s lies {(last_ns - stamp_ns) * 1e-9:.3f} s "
+                    "before the last one; the previous frames are forgotten",
+                )
+            if frame != last_frame:
+                self.reset()
+                self._notice(
+                    "map_changed",
+                    f"the points are in frame {frame!r}, the last ones were in {last_frame!r}; "
+                    "the previous frames are forgotten",
+                )
+        self._last = stamp_ns, frame
 
     def _middle_row_ns(self, stamp_ns: int) -> int:
         """When the middle row of the frame with this stamp was exposed."""

@@ -47,6 +47,7 @@ class MockLocalizer:
         if config.solver == "r9p":
             raise ValueError("nine are too many")
         self.camera, self.config = camera, config
+        self.priors: list[Prior | None] = []
         MockLocalizer.made.append(self)
 
     def warm_up(self) -> None:
@@ -60,6 +61,7 @@ class MockLocalizer:
         prior: Prior | None = None,
         expected_share: float = 0.5,
     ) -> Estimate | Failure:
+        self.priors.append(prior)
         if len(points) < 4:
             return Failure(Reason.TOO_FEW_POINTS, f"{len(points)} points")
         return Estimate(
@@ -260,6 +262,38 @@ def test_new_settings_count_from_the_next_frame_on(
         frames.config = NodeConfig(solver="r9p")
     assert frames.config.inlier_threshold == 5.0
     assert localized(frames.localize(cloud)).twist is not None
+
+
+def test_a_jump_of_time_and_another_map_start_afresh(
+    mock: type[MockLocalizer], cloud: SimpleNamespace, make_camera_info: Make
+) -> None:
+    notices: list[tuple[str, str]] = []
+    frames = FrameLocalizer(
+        NodeConfig(readout_time=READOUT_TIME), lambda *words: notices.append(words)
+    )
+    frames.take_camera_info(make_camera_info())
+
+    def tracked(second: int, hundredths: int, frame: str = "map") -> bool:
+        """Whether the previous frame helped."""
+        cloud.header.stamp.sec, cloud.header.stamp.nanosec = second, hundredths * 10_000_000
+        cloud.header.frame_id = frame
+        localized(frames.localize(cloud))
+        return mock.made[-1].priors[-1] is not None
+
+    assert [tracked(5, 0), tracked(5, 3), tracked(5, 6)] == [False, True, True]
+    assert notices == []
+    # A recording that starts over.
+    assert [tracked(1, 0), tracked(1, 3)] == [False, True]
+    text = "the stamp 1.000 s lies 4.060 s before the last one; the previous frames are forgotten"
+    assert notices == [("time_went_back", text)]
+    # Another map at the next instant.
+    assert [tracked(1, 6, "cellar"), tracked(1, 9, "cellar")] == [False, True]
+    forgotten = "the previous frames are forgotten"
+    text = f"the points are in frame 'cellar', the last ones were in 'map'; {forgotten}"
+    assert notices[1:] == [("map_changed", text)]
+    frames.reset()  # who asks for it is not told
+    assert not tracked(1, 0, "map")
+    assert len(notices) == 2
 
 
 def simulated(direction: str, **settings: Any) -> list[tuple[Any, Any]]:

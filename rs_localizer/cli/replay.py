@@ -7,6 +7,7 @@ import importlib
 import shutil
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -68,12 +69,15 @@ def run(args: argparse.Namespace) -> None:
         with open_bag(args.bag) as bag:
             _play(bag, find_topics(bag, args.correspondences, args.camera_info), args.rate or 1.0)
         return
-    localizer = _localizer(args.params, args.assignments)
+    notices: Counter[str] = Counter()
+    localizer = _localizer(
+        args.params, args.assignments, lambda name, text: notices.update((name,))
+    )
     with open_bag(args.bag) as bag:
         topics = find_topics(bag, args.correspondences, args.camera_info)
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         _prepare(out, args.overwrite)
-        _replay(bag, topics, localizer, out, args.storage)
+        _replay(bag, topics, localizer, notices, out, args.storage)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
@@ -91,10 +95,12 @@ def _check_usage(args: argparse.Namespace) -> None:
         raise UsageError(f"--rate must be positive, got {args.rate}")
 
 
-def _localizer(params: Path | None, assignments: list[str]) -> FrameLocalizer:
+def _localizer(
+    params: Path | None, assignments: list[str], notice: Callable[[str, str], None]
+) -> FrameLocalizer:
     values = {} if params is None else load_params_file(params)
     try:
-        localizer = FrameLocalizer(build(values))
+        localizer = FrameLocalizer(build(values), notice)
     except ValueError as error:
         raise ValueError(f"{params}: {error}") from error
     try:
@@ -115,7 +121,12 @@ def _prepare(out: Path, overwrite: bool) -> None:
 
 
 def _replay(
-    bag: BagReader, topics: Topics, localizer: FrameLocalizer, out: Path, storage: str
+    bag: BagReader,
+    topics: Topics,
+    localizer: FrameLocalizer,
+    notices: Counter[str],
+    out: Path,
+    storage: str,
 ) -> None:
     localizer.warm_up()
     frames: list[Frame] = []
@@ -137,7 +148,7 @@ def _replay(
             bar.update(1 if result or result.reason != "bad_camera_info" else 0)
     seconds = time.perf_counter() - start
     repeated = _write_texts(out, frames)
-    _print_summary(total, frames, refused, repeated, seconds)
+    _print_summary(total, frames, refused, notices, repeated, seconds)
     print(f"written to {out}: {POSES}, {TWISTS}, {RESULT}")
     if not frames:
         raise ValueError(f"no frame of {bag.path} was localized")
@@ -173,10 +184,16 @@ def _quaternion(frame: Frame) -> so3.Array:
 
 
 def _print_summary(
-    total: int, frames: list[Frame], refused: Counter[str], repeated: int, seconds: float
+    total: int,
+    frames: list[Frame],
+    refused: Counter[str],
+    notices: Counter[str],
+    repeated: int,
+    seconds: float,
 ) -> None:
     rows = [("frames", total), ("localized", len(frames))]
     rows += [(f"  refused: {reason}", count) for reason, count in refused.most_common()]
+    rows += [(f"started afresh: {name}", count) for name, count in notices.most_common()]
     dropped = sum(frame.dropped for frame in frames)
     rows += [("rows dropped (not finite)", dropped)] if dropped else []
     rows += [("stamps repeated, not in the text files", repeated)] if repeated else []

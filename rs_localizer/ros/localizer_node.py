@@ -68,7 +68,7 @@ class LocalizerNode(RobustLifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            frames = FrameLocalizer(parameters.read(self))
+            frames = FrameLocalizer(parameters.read(self), self.refusals.notice)
             self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
             self._warm_up(frames)
         except Exception:  # rclpy would hide it

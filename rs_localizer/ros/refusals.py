@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
-import math
+import re
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 
-_PERIOD = 5.0  # s between two log lines of one reason
+_PERIOD = 5.0  # s between two log lines that say the same
+# Different texts of one reason that are logged in a period. More come from a sender who writes
+# something new into every message, and share one line.
+_MOST_KINDS = 8
+_OTHERS = ""
+
+
+@dataclass(slots=True)
+class _Logged:
+    """The last line of a kind, and how many like it have not been logged since."""
+
+    when: float
+    silent: int = 0
 
 
 class Refusals:
-    """Counts refusals and passes on one text per reason and period.
+    """Counts refusals and passes on one text per kind and period.
+
+    Of one kind are those of the same reason whose details differ in their numbers only.
 
     Args:
         log: takes a line of text.
@@ -24,15 +39,37 @@ class Refusals:
         self.counts: Counter[str] = Counter()
         self._log = log
         self._clock = clock
-        self._logged: dict[str, tuple[float, int]] = {}  # reason: when, and the count then
+        self._logged: dict[str, dict[str, _Logged]] = {}  # by reason and kind
 
     def add(self, reason: str, detail: str) -> None:
         """Count one more; ``detail`` is one sentence."""
         self.counts[reason] += 1
-        now, count = self._clock(), self.counts[reason]
-        when, before = self._logged.get(reason, (-math.inf, count - 1))
-        if now - when < _PERIOD:
+        self.notice(reason, detail)
+
+    def notice(self, reason: str, detail: str) -> None:
+        """Log likewise what is no refusal."""
+        now = self._clock()
+        kinds = self._logged.setdefault(reason, {})
+        kind = re.sub(r"\d+", "0", detail)
+        if kind not in kinds:
+            kind = _room_for(kind, kinds, now)
+        last = kinds.get(kind)
+        if last is not None and now - last.when < _PERIOD:
+            last.silent += 1
             return
-        self._logged[reason] = now, count
-        more = count - before - 1
-        self._log(f"{reason}: {detail}" + (f" ({more} more since the last report)" if more else ""))
+        more = "" if last is None else _more(last.silent)
+        kinds[kind] = _Logged(now)
+        self._log(f"{reason}: {detail}{more}")
+
+
+def _room_for(kind: str, kinds: dict[str, _Logged], now: float) -> str:
+    """The name under which a new kind is kept, so that there are never many."""
+    if len(kinds) < _MOST_KINDS:
+        return kind
+    for old in [k for k, logged in kinds.items() if now - logged.when >= _PERIOD and k != _OTHERS]:
+        del kinds[old]
+    return kind if len(kinds) < _MOST_KINDS else _OTHERS
+
+
+def _more(silent: int) -> str:
+    return f" ({silent} more since the last report)" if silent else ""

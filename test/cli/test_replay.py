@@ -222,6 +222,27 @@ def test_repeated_stamps_come_once(
     assert rows["stamps repeated, not in the text files"] == str(FRAMES - len(poses))
 
 
+def test_a_recording_that_starts_over_is_counted(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[int] = []
+
+    def loop(topic: str, message: Any) -> str:
+        if topic == "/correspondences":
+            seen.append(1)
+            if len(seen) > FRAMES // 2:
+                message.header.stamp.sec -= 100
+                message.header.frame_id = "cellar"
+        return topic
+
+    bag = rewrite(recording, tmp_path / "loop", loop)
+    assert main(["replay", str(bag), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
+    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines()[:4])
+    assert rows["localized"] == str(FRAMES)
+    assert rows["started afresh: time_went_back"] == "1"
+    assert rows["started afresh: map_changed"] == "1"
+
+
 def test_without_readout_time_there_are_no_twists(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
