@@ -62,8 +62,8 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "localizer = rs_localizer.ros.localizer_node:main",
-            "rs_localizer = rs_localizer.cli.main:main",
+            "localizer = rs_localizer.ros.main:main",
+            "rs_localizer = rs_localizer.__main__:run",
         ],
     },
 )

@@ -1,12 +1,16 @@
 """Rolling-shutter absolute pose: the camera's pose and velocities from 2D-3D correspondences."""
 
-from rs_localizer.config import LocalizerConfig, VelocityPrior
-from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection
-from rs_localizer.core.prior import Prior
-from rs_localizer.core.shutter import Motion
-from rs_localizer.core.types import Estimate, Failure, Reason
-from rs_localizer.localizer import Localizer
-from rs_localizer.solvers import solve_minimal
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rs_localizer.config import LocalizerConfig, VelocityPrior
+    from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection
+    from rs_localizer.core.prior import Prior
+    from rs_localizer.core.shutter import Motion
+    from rs_localizer.core.types import Estimate, Failure, Reason
+    from rs_localizer.localizer import Localizer
+    from rs_localizer.solvers import solve_minimal
 
 __version__ = "0.1.0"
 
@@ -25,3 +29,27 @@ __all__ = [
     "VelocityPrior",
     "solve_minimal",
 ]
+
+if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all others
+    # Numba and OpenCV take a second to import. Who imports this package only to start a program
+    # does not wait for them, and the program can take Ctrl-C in hand before they come (PEP 562).
+    _HOMES = {
+        "config": ("LocalizerConfig", "VelocityPrior"),
+        "core.camera": ("Camera", "DistortionModel", "Roi", "ScanDirection"),
+        "core.prior": ("Prior",),
+        "core.shutter": ("Motion",),
+        "core.types": ("Estimate", "Failure", "Reason"),
+        "localizer": ("Localizer",),
+        "solvers": ("solve_minimal",),
+    }
+
+    def __getattr__(name):
+        for module, names in _HOMES.items():
+            if name in names:
+                value = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+                globals()[name] = value
+                return value
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    def __dir__():
+        return sorted({*globals(), *__all__})

@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import rs_localizer
@@ -57,13 +58,25 @@ COMMANDS = {
 }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code. ``argv`` defaults to the process's arguments."""
+def main(
+    argv: Sequence[str] | None = None,
+    importing: Callable[[str], AbstractContextManager[object]] = nullcontext,
+) -> int:
+    """Run one command.
+
+    Args:
+        argv: defaults to the process's arguments.
+        importing: entered, with the name of the command, while its module is imported.
+
+    Returns:
+        the exit code.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         name = _parser().parse_args(words[:1]).command
         command = COMMANDS[name]
-        module = importlib.import_module(command.module)
+        with importing(f"rs_localizer {name}"):
+            module = importlib.import_module(command.module)
         parser = argparse.ArgumentParser(
             prog=f"rs_localizer {name}",
             description=_sentence(command.summary),

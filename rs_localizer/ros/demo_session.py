@@ -22,11 +22,11 @@ from rs_localizer.config import PoseTime
 from rs_localizer.lab.comparison import Answer, Recording
 from rs_localizer.ros.conversion import copy_message
 from rs_localizer.ros.demo_listener import Listener
-from rs_localizer.ros.stopping import StopSignals
 from rs_localizer.settings import NODE_NAME
+from rs_localizer.stopping import StopSignals
 
 # The installed executable may not be on the path; this starts the same node.
-_NODE = "import sys; from rs_localizer.ros.localizer_node import main; sys.exit(main())"
+_NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # The first start on a machine compiles all kernels.
 _START_TIMEOUT = 300.0

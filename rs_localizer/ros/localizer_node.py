@@ -27,8 +27,8 @@ from rs_localizer.ros import parameters
 from rs_localizer.ros.conversion import make_message, message_class
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.stopping import StopRequest
 from rs_localizer.settings import NODE_NAME
+from rs_localizer.stopping import StopRequest
 
 # Sensor data: the newest counts, and a late one is worth less than none.
 _INPUT_QOS = {"depth": 1, "reliability": ReliabilityPolicy.BEST_EFFORT}
@@ -176,24 +176,23 @@ class LocalizerNode(RobustLifecycleNode):
         self.get_logger().warning(text)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until Ctrl-C or SIGTERM; the exit code."""
-    with StopRequest() as stop:
-        try:
-            # rclpy's own handlers end the context from a thread while the node still uses it.
-            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-            node = LocalizerNode(compiling=stop.at_once)
-        except (ValueError, RuntimeError) as error:
-            rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
-            rclpy.try_shutdown()
-            return 1
-        try:
-            return _run(node, stop)
-        except ExternalShutdownException:
-            return 0
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
+def run(stop: StopRequest, args: list[str] | None = None) -> int:
+    """Run the node until ``stop`` is requested; the exit code."""
+    try:
+        # rclpy's own handlers end the context from a thread while the node still uses it.
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = LocalizerNode(compiling=stop.at_once)
+    except (ValueError, RuntimeError) as error:
+        rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
+        rclpy.try_shutdown()
+        return 1
+    try:
+        return _run(node, stop)
+    except ExternalShutdownException:
+        return 0
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
 
 
 def _run(node: LocalizerNode, stop: StopRequest) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -13,7 +14,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from rs_localizer.ros.conversion import copy_message, message_class
-from rs_localizer.ros.stopping import StopSignals, shut_down
+from rs_localizer.stopping import StopSignals
 
 _CLOCK_PERIOD = 0.01  # s of real time between two messages on /clock
 _DISCOVERY_TIMEOUT = 5.0  # s to wait for somebody who listens
@@ -36,7 +37,9 @@ def play(
         try:
             _play(messages, types, rate)
         finally:
-            shut_down()
+            # After a signal rclpy does the same in a thread, and whoever comes second fails.
+            with contextlib.suppress(RuntimeError):
+                rclpy.try_shutdown()
 
 
 def _play(messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], rate: float) -> None:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
+import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -112,3 +116,45 @@ def test_a_fault_in_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
     with pytest.raises(TypeError, match="a bug"):
         main(["replay"])
+
+
+# A module that tells that it is being imported, and takes its time.
+SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("slow", ["numba", "cv2", "rosbags"])
+def test_signals_while_a_command_is_imported(tmp_path: Path, number: int, slow: str) -> None:
+    (tmp_path / f"{slow}.py").write_text(SLOW)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", "replay", "bag"],
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (tmp_path / f"{slow}.seen").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=30)
+    assert (process.returncode, output) == (1, "")
+    assert errors == "rs_localizer replay: interrupted\n"
+
+
+def test_sigterm_ends_a_running_command_in_one_line(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", "simulate", "bag", "--duration", "3000"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(rs_localizer.__file__).parents[1])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (tmp_path / "bag").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (1, "rs_localizer simulate: interrupted\n")

@@ -25,7 +25,7 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randint(1, 100))
 
 TIMEOUT = 60.0  # s, of a machine that is busy
-RUN = "import sys; from rs_localizer.ros.localizer_node import main; sys.exit(main())"
+RUN = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 
 
 class NodeProcess:
