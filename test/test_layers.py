@@ -12,11 +12,12 @@ PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 # What each part may import besides itself; a part without a row: everything but `ros` and `cli`.
 MAY_IMPORT = {
     "core": set(),
+    "arguments": set(),
     "config": {"core"},
     "solvers": {"core"},
     "localizer": {"core", "config", "solvers"},
     "io": {"core"},
-    "lab": {"core", "config", "solvers", "localizer", "io", "settings"},
+    "lab": {"core", "config", "solvers", "localizer", "io", "settings", "arguments"},
 }
 ABOVE = {"ros", "cli"}
 

@@ -16,15 +16,15 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.config import NodeConfig
-from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.arguments import number
+from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
 from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.calibration import read_calibration
 from rs_localizer.lab.boards import Board, find_corners
-from rs_localizer.lab.recording import write_frame, write_jpeg
+from rs_localizer.lab.recording import write_frame, write_jpeg, write_parameters
 from rs_localizer.lab.video import read_video
-from rs_localizer.settings import NODE_NAME
+from rs_localizer.settings import settings
 
 # A time of 0 means "none" to ROS.
 _START_NS = 1_000_000_000
@@ -95,14 +95,6 @@ def static_residual(camera: Camera, points: Array, pixels: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((camera.project(local) - pixels) ** 2, axis=1))))
 
 
-def _write_parameters(path: Path, readout_time: float) -> None:
-    config = NodeConfig(readout_time=readout_time)
-    path.write_text(
-        f"{NODE_NAME}:\n  ros__parameters:\n    readout_time: {config.readout_time!r}\n",
-        encoding="utf-8",
-    )
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m rs_localizer.lab.board_video",
@@ -119,11 +111,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--board", required=True, metavar="6x4", help="inner corners, along a row x rows"
     )
-    parser.add_argument("--square", type=float, required=True, metavar="M", help="side in metres")
-    parser.add_argument("--rate", type=float, required=True, metavar="HZ", help="images per second")
+    positive = number(0.0, above=True)
+    parser.add_argument(
+        "--square", type=positive, required=True, metavar="M", help="side in metres"
+    )
+    parser.add_argument(
+        "--rate", type=positive, required=True, metavar="HZ", help="images per second"
+    )
     parser.add_argument(
         "--readout-time",
-        type=float,
+        type=number(0.0, settings()["readout_time"].maximum or 0.0),
         metavar="S",
         help="seconds from the first row to the last, if known: written to parameters.yaml beside "
         "the data, for replay --params",
@@ -136,16 +133,20 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError:
         parser.error(f"--board must be of the form 6x4, got {args.board!r}")
     try:
+        board = Board(columns, rows, args.square)
+    except ValueError as error:
+        parser.error(f"--board: {error}")
+    try:
         recorded = record_board(
             args.video,
             read_calibration(args.calibration),
-            Board(columns, rows, args.square),
+            board,
             args.out,
             rate=args.rate,
             with_images=not args.no_images,
         )
         if args.readout_time is not None:
-            _write_parameters(args.out / "parameters.yaml", args.readout_time)
+            write_parameters(args.out, args.readout_time, ScanDirection.TOP_TO_BOTTOM.value)
     except (ValueError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 1

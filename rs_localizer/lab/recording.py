@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.so3 import Array
@@ -15,6 +17,7 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import make_header
 from rs_localizer.lab.simulation import SimulatedFrame
 from rs_localizer.lab.true_motion import TrueState
+from rs_localizer.settings import NODE_NAME
 
 CAMERA_FRAME = "camera_optical_frame"
 MAP_FRAME = "map"
@@ -23,9 +26,22 @@ CORRESPONDENCES_TOPIC = "/correspondences"
 IMAGE_TOPIC = "/image/compressed"
 TRUE_POSE_TOPIC = "/truth/pose"
 TRUE_TWIST_TOPIC = "/truth/twist"
+# A params file in the directory of a recording.
+PARAMETERS = "parameters.yaml"
 
 # Single precision is what RViz shows and most trackers give: 3e-5 px at the rim of an image.
 _ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "u", "v")] + [("id", "<u4")])
+
+
+def write_parameters(directory: Path, readout_time: float, scan_direction: str) -> None:
+    """The shutter of a recording as a params file beside its data, for ``replay --params``."""
+    config = NodeConfig(readout_time=readout_time, scan_direction=scan_direction)
+    (directory / PARAMETERS).write_text(
+        f"{NODE_NAME}:\n  ros__parameters:\n"
+        f"    readout_time: {config.readout_time!r}\n"
+        f"    scan_direction: {config.scan_direction}\n",
+        encoding="utf-8",
+    )
 
 
 def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections import Counter
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.settings import load_params_file
 
 CLEAN = ("--noise", "0", "--outliers", "0", "--points", "60")
 TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "1", "0.5", "0")
@@ -130,13 +133,27 @@ def test_same_seed_same_bag(tmp_path: Path) -> None:
     [
         (["--trajectory", "absent.txt"], 1, "absent.txt does not exist"),
         (["--trajectory", "tum_vi_room5", "--linear-velocity", "1", "0", "0"], 2, "not both"),
-        (["--outliers", "1.5"], 1, "outliers must lie between 0 and 1, got 1.5"),
-        (["--distortion", "0.1"], 1, "plumb_bob takes 0 or 4 or 5 coefficients, got 1"),
-        (["--focal", "0"], 1, "not calibrated"),
+        (["--outliers", "1.5"], 2, "--outliers: must lie between 0 and 1, got 1.5"),
+        (["--distortion", "0.1"], 2, "--distortion: plumb_bob takes 0 or 4 or 5 coefficients"),
+        (["--distortion", "0.1", "nan"], 2, "--distortion: must be a number, got 'nan'"),
+        (["--focal", "0"], 2, "--focal: must be more than 0, got 0"),
+        (["--width", "0"], 2, "--width: must be 2 or more, got 0"),
+        (["--height", "-5"], 2, "--height: must be 2 or more, got -5"),
+        (["--noise", "-1"], 2, "--noise: must be 0 or more, got -1"),
+        (["--noise", "inf"], 2, "--noise: must be a number, got 'inf'"),
+        (["--points", "0"], 2, "--points: must be 1 or more, got 0"),
+        (["--seed", "-1"], 2, "--seed: must be 0 or more, got -1"),
+        (["--start", "-1"], 2, "--start: must be 0 or more, got -1"),
+        (["--duration", "nan"], 2, "--duration: must be a number, got 'nan'"),
+        (["--duration", "0"], 2, "--duration: must be more than 0, got 0"),
+        (["--knot-spacing", "-1"], 2, "--knot-spacing: must be 0 or more, got -1"),
+        (["--readout-time", "0.3"], 2, "--readout-time: must lie between 0 and 0.2, got 0.3"),
+        (["--linear-velocity", "1", "x", "0"], 2, "--linear-velocity: must be a number, got 'x'"),
+        (["--focal", "1e7"], 1, "none of the 300 frames sees any point"),
         (["--duration", "0.001"], 1, "no frame lies within"),
-        (["--rate", "0"], 1, "rate must be more than 0"),
+        (["--rate", "0"], 2, "--rate: must be more than 0, got 0"),
         (["--scan-direction", "up"], 2, "invalid choice: 'up'"),
-        (["--points", "many"], 2, "invalid int value"),
+        (["--points", "many"], 2, "--points: must be a whole number, got 'many'"),
     ],
 )
 def test_faults(
@@ -149,9 +166,53 @@ def test_faults(
     assert simulate(tmp_path / "bag", *words) == code
     assert expected in capsys.readouterr().err
     assert not (tmp_path / "bag").exists()
+    assert not (tmp_path / "bag").exists()
 
 
 def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert simulate(tmp_path / "bag", "--duration", "0.1") == 0
     assert simulate(tmp_path / "bag", "--duration", "0.1") == 1
     assert "exists already" in capsys.readouterr().err
+
+
+def test_the_next_command_has_the_shutter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("--readout-time", "0.025", "--scan-direction", "bottom_to_top", "--duration", "0.2")
+    assert simulate(Path("my bag"), *words) == 0
+    *_, line = capsys.readouterr().out.splitlines()
+    label, program, *command = shlex.split(line)
+    assert (label, program) == ("next:", "rs_localizer")
+    assert load_params_file(tmp_path / "my bag" / "parameters.yaml") == {
+        "readout_time": 0.025,
+        "scan_direction": "bottom_to_top",
+    }
+    assert main(command) == 0
+    assert main(["evaluate", "my bag_poses", "my bag"]) == 0
+
+
+def test_fewer_points_than_asked_for_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Two seconds at a narrow view of a room: some frames see a point, others none.
+    words = ("--focal", "30000", "--points", "5", "--duration", "2")
+    assert simulate(tmp_path / "bag", *words) == 0
+    line = capsys.readouterr().out.splitlines()[0]
+    found = re.search(
+        r"(\d) points each \(of 5 asked for; (\d+) frames see fewer, (\d+) of them none\)$", line
+    )
+    assert found, line
+    with open_bag(tmp_path / "bag") as bag:
+        widths = [message.width for _, _, message in bag.messages(["/correspondences"])]
+    assert int(found[2]) == sum(width < 5 for width in widths) > int(found[3]) > 0
+    assert int(found[3]) == widths.count(0)
+    assert simulate(tmp_path / "full", "--duration", "0.1") == 0
+    assert "asked for" not in capsys.readouterr().out
+
+
+def test_help_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--help"]) == 0
+    text = capsys.readouterr().out
+    for default in ("640", "480", "500.0", "plumb_bob", "0.03", "top_to_bottom", "30.0", "150"):
+        assert f"(default: {default})" in text

@@ -148,8 +148,24 @@ def test_faults_end_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "camera.yaml").write_text(CALIBRATION.replace("240", "480"))
     assert run(tmp_path, *out) == 1
     assert "images of 320x240, the calibration is for 320x480" in capsys.readouterr().err
-    assert run(tmp_path, *out, "--square", "0") == 1
-    assert run(tmp_path, *out, "--rate", "0") == 1
-    assert run(tmp_path, *out, "--readout-time", "7", "--board", "2x4") == 1
-    with pytest.raises(SystemExit, match="2"):
-        run(tmp_path, *out, "--board", "six")
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--square", "0"), "--square: must be more than 0, got 0"),
+        (("--square", "-1"), "--square: must be more than 0, got -1"),
+        (("--rate", "0"), "--rate: must be more than 0, got 0"),
+        (("--readout-time", "7"), "--readout-time: must lie between 0 and 0.2, got 7"),
+        (("--board", "1x1"), "--board: a board needs 3x3 inner corners, got 1x1"),
+        (("--board", "six"), "--board must be of the form 6x4, got 'six'"),
+    ],
+)
+def test_wrong_usage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], text: str
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        run(tmp_path, "--out", str(tmp_path / "bag"), *words)
+    assert end.value.code == 2
+    assert text in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
