@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
+from numbers import Integral, Real
 from typing import Any
 
 from rs_localizer.core.camera import ScanDirection
@@ -64,9 +65,9 @@ def _check(config: Any, prefix: str = "") -> None:
         if isinstance(default, bool):
             valid = isinstance(value, bool)
         elif isinstance(default, int):
-            valid = isinstance(value, int) and not isinstance(value, bool)
+            valid = isinstance(value, Integral) and not isinstance(value, bool)
         elif isinstance(default, float):
-            valid = isinstance(value, (int, float)) and not isinstance(value, bool)
+            valid = isinstance(value, Real) and not isinstance(value, bool)
         else:
             valid = isinstance(value, str)
         if not valid:
@@ -77,6 +78,10 @@ def _check(config: Any, prefix: str = "") -> None:
         low, high = item.metadata["minimum"], item.metadata["maximum"]
         if low is not None and not (low <= value <= high):
             raise ValueError(f"{name} must lie between {low} and {high}, got {value!r}")
+
+
+# Of a velocity prior; anything less would hold the camera still with infinite force.
+_LEAST_DEVIATION = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +103,13 @@ class VelocityPrior:
 
     def __post_init__(self) -> None:
         _check(self, "velocity_prior.")
+        for name in ("angular", "linear"):
+            deviation = getattr(self, name)
+            if 0.0 < deviation < _LEAST_DEVIATION:
+                raise ValueError(
+                    f"velocity_prior.{name} must be 0 (no prior) or at least {_LEAST_DEVIATION:g}, "
+                    f"got {deviation!r}"
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,13 +117,13 @@ class Acceleration:
     """How fast the camera changes its velocities, for the prediction of the next frame."""
 
     angular: float = setting(
-        10.0,
+        6.0,
         "Standard deviation of the camera's angular acceleration, in rad/s^2",
         minimum=0.001,
         maximum=10000.0,
     )
     linear: float = setting(
-        5.0,
+        3.0,
         "Standard deviation of the camera's linear acceleration, in m/s^2",
         minimum=0.001,
         maximum=10000.0,

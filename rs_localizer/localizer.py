@@ -50,7 +50,12 @@ _LEAST_EIGENVALUE = 1e-11
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5
 # Errors as large as the gate lets them be are those of points strewn over it.
-_MOST_NOISE = 1.0  # inlier thresholds
+_MOST_NOISE = 0.75  # inlier thresholds
+# An image that moves along with the rows is one moment of the scene, drawn out: any motion that
+# does so fits anything. See :meth:`Observations.row_paces`.
+_LEAST_PACE = 0.25
+# Points farther away than this (m) are faults, and their squares would be infinite.
+_FARTHEST_POINT = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,15 +134,21 @@ class Localizer:
             ValueError: wrong shapes, or values that are not finite.
         """
         points, pixels, scores = _checked(points, pixels, scores)
+        if not 0.0 <= expected_share <= 1.0:
+            raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         rays = self.camera.rays(pixels)
-        usable = np.flatnonzero(np.isfinite(rays).all(axis=1))
+        seen = np.isfinite(rays[:, 0])
+        centre = np.median(points[seen], axis=0) if np.any(seen) else np.zeros(3)
+        with np.errstate(over="ignore"):
+            near = np.abs(points - centre).max(axis=1, initial=0.0) < _FARTHEST_POINT
+        usable = np.flatnonzero(seen & near)
         if len(usable) < self.config.min_inliers:
             return Failure(
                 Reason.TOO_FEW_POINTS,
                 f"{len(usable)} usable points of {len(points)}, "
                 f"{self.config.min_inliers} are needed",
             )
-        frame = self._frame(points, pixels, rays, usable, scores, prior)
+        frame = self._frame(points, pixels, rays, usable, centre, scores, prior)
         if prior is not None and prior.motion is not None:
             near = self._track(frame, prior, expected_share)
             if near:
@@ -156,10 +167,10 @@ class Localizer:
         pixels: Array,
         rays: Array,
         usable: IntArray,
+        centre: Array,
         scores: Array | None,
         prior: Prior | None,
     ) -> _Frame:
-        centre = points[usable].mean(axis=0)
         deviations = self.config.velocity_prior
         terms = (
             velocity_terms(deviations.angular, deviations.linear)
@@ -186,7 +197,6 @@ class Localizer:
     def _track(self, frame: _Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
         assert prior.motion is not None
-        assert prior.covariance is not None
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, frame.centre)
         terms = with_prior(frame.terms, prior.motion_only(), frame.centre)
@@ -194,7 +204,7 @@ class Localizer:
         start = Candidate(predicted, best.cost)
         posterior = self._final(frame, best, terms)
         innovation = step_between(predicted, posterior.state)
-        if innovation @ np.linalg.solve(prior.covariance, innovation) > _MOST_INNOVATION:
+        if innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION:
             posterior = self._final(frame, best, frame.terms)  # a jump: the points know better
         result = self._accept(frame, start, best, posterior)
         if result and np.count_nonzero(result.inliers) < (
@@ -293,7 +303,14 @@ class Localizer:
             return Failure(
                 Reason.RESIDUAL,
                 f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
-                f"inlier_threshold of {threshold:g} px: no motion fits them",
+                f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
+                "too small for the noise",
+            )
+        pace = float(np.median(frame.observations.row_paces(state)[posterior.inliers]))
+        if pace < _LEAST_PACE:
+            return Failure(
+                Reason.IMPLAUSIBLE,
+                f"the image would move along with the rows, {1.0 - pace:.0%} as fast as they",
             )
         turn = float(np.linalg.norm(state[12:15]))
         if turn > _MOST_TURN:
@@ -417,6 +434,8 @@ def _checked(
 ) -> tuple[Array, Array, Array | None]:
     points = np.ascontiguousarray(points, dtype=np.float64)
     pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+    if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
+        points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
     n = len(points)
     if points.shape != (n, 3) or pixels.shape != (n, 2):
         raise ValueError(

@@ -7,8 +7,10 @@ the raw row of the full sensor: distortion moves light between rows, not rows in
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+from numbers import Integral, Real
 from typing import Any
 
 import cv2
@@ -43,6 +45,8 @@ _COEFFICIENTS = {
 }
 # OpenCV's own default of five iterations leaves errors of pixels at the rim of wide lenses.
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+# Pixels; a lens is neither a needle's eye nor a telescope of the next galaxy.
+_LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e9
 # A pixel that does not come back to itself has no bearing: it lies beyond the model's range.
 _ROUND_TRIP_TOLERANCE = 1e-3
 # Step of the numerical derivative of the distortion, in normalized image coordinates.
@@ -123,12 +127,22 @@ class Camera:
                 f"scan_direction must be one of {', '.join(ScanDirection)}; "
                 f"got {self.scan_direction!r}"
             ) from None
-        if self.width < 2 or self.height < 2:
-            raise ValueError(f"the image must be at least 2x2, got {self.width}x{self.height}")
-        if not 0.0 <= self.readout_time < np.inf:
-            raise ValueError(f"readout_time must be 0 or more seconds, got {self.readout_time}")
-        if min(self.binning) < 1:
-            raise ValueError(f"binning must be 1 or more, got {self.binning}")
+        if not all(isinstance(size, Integral) and size > 1 for size in (self.width, self.height)):
+            raise ValueError(f"the image must be at least 2x2, got {self.width!r}x{self.height!r}")
+        if not isinstance(self.readout_time, Real) or not 0.0 <= self.readout_time < math.inf:
+            raise ValueError(f"readout_time must be 0 or more seconds, got {self.readout_time!r}")
+        if not all(isinstance(step, Integral) and step > 0 for step in self.binning):
+            raise ValueError(f"binning must be two numbers of 1 or more, got {self.binning}")
+        if not (_LEAST_FOCAL < K[0, 0] < _MOST_FOCAL and _LEAST_FOCAL < K[1, 1] < _MOST_FOCAL):
+            raise ValueError(f"focal lengths of {K[0, 0]:g}, {K[1, 1]:g} pixels are impossible")
+        roi = self.roi
+        if roi is not None and (
+            min(roi.width, roi.height) < 1
+            or min(roi.x_offset, roi.y_offset) < 0
+            or roi.x_offset + roi.width > self.width
+            or roi.y_offset + roi.height > self.height
+        ):
+            raise ValueError(f"{roi} does not lie on a sensor of {self.width}x{self.height}")
         for array in (K, D):
             array.flags.writeable = False
         set_field(self, "K", K)

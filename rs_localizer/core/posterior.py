@@ -26,7 +26,8 @@ from rs_localizer.core.types import BoolArray
 _GATE = 3.5
 _WIDEST = 2.0
 _ROUNDS = 3
-_ITERATIONS = 10
+_ITERATIONS = 50
+_TOLERANCE = 1e-6  # noise variances
 # Positions of image points are never better than this, in pixels; it also keeps noise-free data
 # from claiming an infinite information.
 _LEAST_NOISE = 1e-4
@@ -111,7 +112,7 @@ def _rounds(
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
         set_weights(data, weights)
         state, information, _, _ = refine(
-            data, state, gradient, _NO_SCALE, 0.0, prior, noise, _ITERATIONS
+            data, state, gradient, _NO_SCALE, 0.0, prior, noise, _ITERATIONS, _TOLERANCE
         )
         errors = squared_errors(data, count, state, gradient)
         freedom = 12.0
@@ -203,6 +204,7 @@ def _fit(
         prior,
         noise,
         _ITERATIONS,
+        _TOLERANCE,
     )
     set_weights(observations.packed, np.ones(len(observations)))
     return fitted

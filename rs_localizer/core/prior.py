@@ -15,6 +15,9 @@ from rs_localizer.core.so3 import Array, log
 
 # A precision that holds a velocity at its mean whatever the points say.
 _HOLDING = 1e18
+_LEAST_DEVIATION = 1e-9
+# Numbers whose squares are finite.
+_MOST = 1e100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +48,9 @@ class Prior:
     def __post_init__(self) -> None:
         if (self.motion is None) != (self.covariance is None):
             raise ValueError("a prior motion and its covariance go together")
-        if self.covariance is not None and np.shape(self.covariance) != (12, 12):
-            raise ValueError(f"covariance must be (12,12), got {np.shape(self.covariance)}")
+        if self.motion is not None and self.covariance is not None:
+            _check_motion(self.motion)
+            _check_covariance(np.asarray(self.covariance, float))
         for name in ("angular_velocity", "gravity", "gravity_in_map"):
             vector = getattr(self, name)
             if vector is None:
@@ -54,11 +58,14 @@ class Prior:
             array = np.array(vector, dtype=np.float64)
             if array.shape != (3,) or not np.all(np.isfinite(array)):
                 raise ValueError(f"{name} must be three finite numbers, got {vector!r}")
-            if name != "angular_velocity" and not np.linalg.norm(array) > 0.0:
+            if name != "angular_velocity" and not np.abs(array).max() > 0.0:
                 raise ValueError(f"{name} has no direction: {vector!r}")
             deviation = getattr(self, f"{name}_deviation", 1.0)
-            if not deviation > 0.0:
-                raise ValueError(f"{name}_deviation must be positive, got {deviation}")
+            if not _LEAST_DEVIATION <= deviation < math.inf:
+                raise ValueError(
+                    f"{name}_deviation must be at least {_LEAST_DEVIATION:g} and finite, "
+                    f"got {deviation}"
+                )
 
     def without_motion(self) -> Prior:
         """The same but for the motion."""
@@ -79,6 +86,30 @@ class PriorTerms(NamedTuple):
 
 _NO_GRAVITY = np.zeros(7)
 _STILL = np.concatenate([np.eye(3).ravel(), np.zeros(9)])
+
+
+def _check_motion(motion: Motion) -> None:
+    for name in ("rotation", "translation", "angular_velocity", "linear_velocity"):
+        if not np.all(np.abs(getattr(motion, name)) < _MOST):
+            raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
+    rotation = np.asarray(motion.rotation)
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > 1e-6 or np.linalg.det(rotation) < 0.0:
+        raise ValueError(f"the prior motion's rotation is none: {rotation.tolist()}")
+
+
+def _check_covariance(covariance: Array) -> None:
+    if covariance.shape != (12, 12):
+        raise ValueError(f"covariance must be (12,12), got {covariance.shape}")
+    known = ~np.isinf(np.diag(covariance))
+    block = covariance[np.ix_(known, known)]
+    if not np.all(np.isfinite(block)):
+        raise ValueError("covariance must be finite where its diagonal is")
+    scale = np.sqrt(np.abs(np.diag(block)))
+    if not np.all(np.abs(block - block.T) <= 1e-6 * np.outer(scale, scale)):
+        raise ValueError("covariance must be symmetric")
+    if not np.all(scale > 0.0) or np.linalg.eigvalsh(block / np.outer(scale, scale))[0] < 1e-12:
+        raise ValueError("covariance must be positive definite")
 
 
 def velocity_terms(angular: float, linear: float) -> PriorTerms:
@@ -128,6 +159,7 @@ def state_in(motion: Motion, centre: Array) -> Array:
 
 def _unit(vector: ArrayLike) -> Array:
     array = np.asarray(vector, float)
+    array = array / np.abs(array).max()  # squares of very long vectors overflow
     unit: Array = array / np.linalg.norm(array)
     return unit
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.prior import PriorTerms
-from rs_localizer.core.residuals import pack, squared_errors
+from rs_localizer.core.residuals import pack, row_paces, squared_errors
 from rs_localizer.core.sampling import IntArray, Pool, Random, draw
 from rs_localizer.core.scoring import best_models, optimize
 from rs_localizer.core.so3 import Array
@@ -49,6 +49,11 @@ class Observations:
         """Squared reprojection errors (n,) in raw pixels."""
         errors: Array = squared_errors(self.packed, len(self), state, self.row_time_gradient)
         return errors
+
+    def row_paces(self, state: Array) -> Array:
+        """How much faster than the image points the rows move (n,): 1 at rest, 0 in step."""
+        paces: Array = row_paces(self.packed, len(self), state, self.row_time_gradient)
+        return paces
 
 
 @dataclass(frozen=True, slots=True, eq=False)

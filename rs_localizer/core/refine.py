@@ -13,8 +13,6 @@ from rs_localizer.core.prior import PriorTerms, add_prior
 from rs_localizer.core.residuals import PARAMETERS, STATE_SIZE, normal_equations
 from rs_localizer.core.so3 import Array, exp, log
 
-# A step that gains less than this part of the noise variance changes nothing.
-_CONVERGED = 1e-6
 _MOST_DAMPING = 1e8
 
 
@@ -116,6 +114,7 @@ def refine(
     prior: PriorTerms,
     noise: float,
     iterations: int,
+    tolerance: float,
 ) -> tuple[Array, Array, float, bool]:
     """Minimize the robust cost of all points plus the prior.
 
@@ -127,6 +126,7 @@ def refine(
         prior: see :mod:`rs_localizer.core.prior`.
         noise: standard deviation of the pixels, against which the prior is weighed.
         iterations: most steps.
+        tolerance: a step that gains less than this, in noise variances, is the last one.
 
     Returns:
         state (18,), information (12,12) times the noise variance, cost, and whether a step
@@ -157,15 +157,15 @@ def refine(
                 state, cost = trial, trial_cost
                 information, next_information = next_information, information
                 slope, next_slope = next_slope, slope
-                damping = 0.0 if damping < 1e-5 else 0.1 * damping
-                if gain < _CONVERGED * noise * noise:
+                damping = 0.0 if damping < 1e-8 else 0.2 * damping
+                if gain < tolerance * noise * noise:
                     converged = True
                     break
                 continue
-            if gain < _CONVERGED * noise * noise:
+            if gain < tolerance * noise * noise:
                 converged = True
                 break
-        damping = max(10.0 * damping, 1e-4)
+        damping = max(5.0 * damping, 1e-6)
         if damping > _MOST_DAMPING:
             break
     return state, information, cost, converged

@@ -8,7 +8,9 @@ The error of a point is measured where the model puts it on the image, although 
 evaluated at the *measured* row: noise of the row is noise of the time. With ``m`` the velocity of
 the image point in pixels per unit of row time, ``g`` the gradient of the row time by the pixel and
 ``e`` the error at the measured row time, the point that satisfies its own row time lies at
-``(I - m g^T)^-1 e`` to first order, and there the noise is that of the pixels.
+``(I - m g^T)^-1 e`` to first order, and there the noise is that of the pixels. From a row time
+``d`` later than the measured one the error is ``(I - m g^T)^-1 (e - m d)``: a second look at the
+row that the first one found leaves out terms of third order only.
 """
 
 from __future__ import annotations
@@ -32,8 +34,11 @@ _SUMS = PARAMETERS * (PARAMETERS + 1) // 2 + PARAMETERS + 1  # information, grad
 
 # Terms of the power series; exact to double precision up to a turn of 90 degrees per half readout.
 _SERIES_TERMS = 10
-# Where the rows nearly keep pace with the image point, its row time is all but undetermined.
-_LEAST_PACE = 0.05
+# Where the image point nearly keeps pace with the rows, no row or any row sees it: such a motion
+# explains whatever was measured, and explains nothing.
+_LEAST_PACE = 0.1
+# The second look is taken no farther away than this, in row time.
+_FARTHEST_LOOK = 0.1
 
 
 def _series(x: Any, first_factorial: int) -> Any:
@@ -56,23 +61,35 @@ def _outer_turn(theta: Vector, s: Any, c: Any) -> list[Vector]:
 
 
 class _View:
-    """One point under one motion: everything that errors and derivatives share."""
+    """One point under one motion: everything that errors and derivatives share.
 
-    def __init__(self, values: Sequence[Lanes]) -> None:
-        self.point, ray, self.tau = values[0:3], values[3:5], values[5]
-        by_ray = [values[6:8], values[8:10]]
+    ``looks``: the first look is at the measured row, a second one where the first saw the point.
+    The measured row has the point's own noise in it, and derivatives taken there are correlated
+    with the errors: harmless for a search, but where the points hardly determine the motion (a
+    plane) it pulls the estimate by many times its deviation.
+    """
+
+    def __init__(self, values: Sequence[Lanes], looks: int) -> None:
+        self.point, self._ray, self._measured_tau = values[0:3], values[3:5], values[5]
+        self._raw_by_ray = [values[6:8], values[8:10]]
         self.weight = values[10]
         state = values[_POINT : _POINT + STATE_SIZE]
-        rotation = [state[0:3], state[3:6], state[6:9]]
-        translation, omega, velocity = state[9:12], state[12:15], state[15:18]
-        gradient = values[_POINT + STATE_SIZE : _POINT + STATE_SIZE + 2]
+        self._omega, self._velocity = state[12:15], state[15:18]
+        self._gradient = values[_POINT + STATE_SIZE : _POINT + STATE_SIZE + 2]
         self.scale, self.softness = values[_POINT + STATE_SIZE + 2 : _POINT + STATE_SIZE + 4]
+        moved = multiply([state[0:3], state[3:6], state[6:9]], self.point)
+        self.at_middle = [a + b for a, b in zip(moved, state[9:12], strict=True)]
+        self._look(self._measured_tau)
+        for _ in range(1, looks):
+            shift = dot(self._gradient, self.error)
+            shift = select(shift < _FARTHEST_LOOK, shift, _FARTHEST_LOOK)
+            shift = select(shift > -_FARTHEST_LOOK, shift, -_FARTHEST_LOOK)
+            self._look(self._measured_tau + shift)
 
-        tau = self.tau
-        moved = multiply(rotation, self.point)
-        self.at_middle = [a + b for a, b in zip(moved, translation, strict=True)]
-        self.shifted = [a - tau * v for a, v in zip(self.at_middle, velocity, strict=True)]
-        theta = [-(tau * w) for w in omega]
+    def _look(self, tau: Any) -> None:
+        self.tau = tau
+        self.shifted = [a - tau * v for a, v in zip(self.at_middle, self._velocity, strict=True)]
+        theta = [-(tau * w) for w in self._omega]
         self.angle_squared = dot(theta, theta)
         self.theta = theta
         self.c = _series(self.angle_squared, 2)
@@ -84,25 +101,28 @@ class _View:
         u, v = x * self.inverse_depth, y * self.inverse_depth
         self.image = [u, v]
 
-        drift = multiply(self.turn, velocity)
-        rate = [-(a + b) for a, b in zip(cross(omega, [x, y, z]), drift, strict=True)]
+        drift = multiply(self.turn, self._velocity)
+        rate = [-(a + b) for a, b in zip(cross(self._omega, [x, y, z]), drift, strict=True)]
         ray_rate = [
             (rate[0] - u * rate[2]) * self.inverse_depth,
             (rate[1] - v * rate[2]) * self.inverse_depth,
         ]
-        image_rate = multiply(by_ray, ray_rate)
-        pace = 1.0 - dot(gradient, image_rate)
-        pace = select(pace > _LEAST_PACE, pace, _LEAST_PACE)
-        lead = [a / pace for a in image_rate]
-        correction = [[lead[i] * gradient[j] for j in range(2)] for i in range(2)]
+        image_rate = multiply(self._raw_by_ray, ray_rate)
+        self.pace = 1.0 - dot(self._gradient, image_rate)
+        seen = in_front & (self.pace > _LEAST_PACE)
+        divisor = select(self.pace > _LEAST_PACE, self.pace, _LEAST_PACE)
+        lead = [a / divisor for a in image_rate]
+        correction = [[lead[i] * self._gradient[j] for j in range(2)] for i in range(2)]
         correction[0][0] = correction[0][0] + 1.0
         correction[1][1] = correction[1][1] + 1.0
         self.by_ray = [
-            [dot(correction[i], [by_ray[0][j], by_ray[1][j]]) for j in range(2)] for i in range(2)
+            [dot(correction[i], [self._raw_by_ray[0][j], self._raw_by_ray[1][j]]) for j in range(2)]
+            for i in range(2)
         ]
-        self.error = multiply(self.by_ray, [u - ray[0], v - ray[1]])
-        squared = dot(self.error, self.error)
-        self.squared = select(in_front, squared, math.inf)
+        at_this_row = multiply(self.by_ray, [u - self._ray[0], v - self._ray[1]])
+        offset = self._measured_tau - tau
+        self.error = [a + b * offset for a, b in zip(at_this_row, lead, strict=True)]
+        self.squared = select(seen, dot(self.error, self.error), math.inf)
 
     def robust(self) -> tuple[Any, Any]:
         """Weight and cost of the squared error: truncated (softness 0) or Tukey's (1)."""
@@ -141,15 +161,19 @@ class _View:
 
 
 def _squared_error(values: list[Lanes]) -> Vector:
-    return [_View(values).squared]
+    return [_View(values, looks=2).squared]
+
+
+def _pace(values: list[Lanes]) -> Vector:
+    return [_View(values, looks=1).pace]
 
 
 def _cost(values: list[Lanes]) -> Vector:
-    return [_View(values).robust()[1]]
+    return [_View(values, looks=1).robust()[1]]
 
 
 def _accumulate(values: list[Lanes]) -> Vector:
-    view = _View(values[: _POINT + _UNIFORM])
+    view = _View(values[: _POINT + _UNIFORM], looks=2)
     sums = values[_POINT + _UNIFORM :]
     weight, cost = view.robust()
     first, second = view.jacobian()
@@ -167,6 +191,7 @@ def _accumulate(values: list[Lanes]) -> Vector:
 
 
 _squared_error_lanes = traced(_squared_error, _POINT, _UNIFORM)
+_pace_lanes = traced(_pace, _POINT, _UNIFORM)
 _cost_lanes = traced(_cost, _POINT, _UNIFORM)
 _accumulate_lanes = traced(_accumulate, _POINT, _UNIFORM + _SUMS)
 
@@ -227,6 +252,20 @@ def squared_errors(data: Array, count: int, state: Array, gradient: Array) -> Ar
         for lane in range(min(LANES, count - block * LANES)):
             errors[block * LANES + lane] = block_errors[lane]
     return errors
+
+
+@kernel
+def row_paces(data: Array, count: int, state: Array, gradient: Array) -> Array:
+    """How much faster than the image points the rows move (count,): 1 at rest, 0 in step."""
+    uniform = np.empty(_UNIFORM * LANES)
+    spread_state(state, gradient, 1.0, 0.0, uniform)
+    block_paces = np.empty(LANES)
+    paces = np.empty(count)
+    for block in range(len(data)):
+        _pace_lanes(data[block], uniform, block_paces)
+        for lane in range(min(LANES, count - block * LANES)):
+            paces[block * LANES + lane] = block_paces[lane]
+    return paces
 
 
 @kernel

@@ -12,7 +12,9 @@ from rs_localizer.core.so3 import Array
 
 # Local optimisation tightens Tukey's loss from the first scale to the last by these steps.
 _ANNEALING_STEPS = 5
-_ITERATIONS_PER_SCALE = 1
+_ITERATIONS_PER_SCALE = 3
+# Gain, in noise variances, below which the next scale is worth more than another step.
+_TOLERANCE = 1.0
 
 
 @kernel
@@ -84,7 +86,7 @@ def optimize(
         scale = first_scale
         for _ in range(_ANNEALING_STEPS):
             state, _, _, _ = refine(
-                data, state, gradient, scale, 1.0, prior, noise, _ITERATIONS_PER_SCALE
+                data, state, gradient, scale, 1.0, prior, noise, _ITERATIONS_PER_SCALE, _TOLERANCE
             )
             scale *= ratio
         cost = robust_cost(data, state, gradient, last_scale, 0.0, best_cost)

@@ -137,7 +137,13 @@ def test_inside_is_the_area_of_the_pixels():
         ({"scan_direction": "sideways"}, "one of top_to_bottom, .*; got 'sideways'"),
         ({"width": 0}, "at least 2x2, got 0x480"),
         ({"readout_time": -0.1}, "readout_time must be 0 or more seconds, got -0.1"),
-        ({"binning": (0, 1)}, "binning must be 1 or more"),
+        ({"width": 640.5}, "got 640.5x480"),
+        ({"readout_time": "fast"}, "readout_time must be 0 or more seconds, got 'fast'"),
+        ({"K": np.diag([1e300, 1e300, 1.0])}, "focal lengths of 1e\\+300, .* are impossible"),
+        ({"roi": Roi(0, 0, 700, 480)}, "does not lie on a sensor of 640x480"),
+        ({"roi": Roi(0, -5, 0, 0)}, "does not lie on a sensor"),
+        ({"binning": (1.5, 2)}, "binning must be two numbers"),
+        ({"binning": (0, 1)}, "binning must be two numbers of 1 or more"),
     ],
 )
 def test_an_impossible_camera_is_refused_with_what_was_found(changes, said):

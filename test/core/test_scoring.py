@@ -47,9 +47,7 @@ def test_places_without_a_model_stay_infinite(scene):
     nothing = np.full((1, 18, 3), np.nan)
     states, costs = best_models(nothing, data, camera.row_time_gradient, 8.0, 2)
     assert np.isinf(costs).all()
-    _, cost = optimize(
-        states, costs, data, camera.row_time_gradient, 16.0, 2.0, FREE, 1.0
-    )
+    _, cost = optimize(states, costs, data, camera.row_time_gradient, 16.0, 2.0, FREE, 1.0)
     assert np.isinf(cost)
 
 
@@ -62,9 +60,7 @@ def test_optimisation_reaches_all_inliers_from_a_poor_state(scene):
     start = scene.state_of(motion)
     start[9:] += 0.02 * rng.normal(size=9)
     before = robust_cost(data, start, gradient, 2.0, 0.0, np.inf)
-    state, cost = optimize(
-        start[None], np.zeros(1), data, gradient, 32.0, 2.0, FREE, 1.0
-    )
+    state, cost = optimize(start[None], np.zeros(1), data, gradient, 32.0, 2.0, FREE, 1.0)
     truth = robust_cost(data, scene.state_of(motion), gradient, 2.0, 0.0, np.inf)
     assert cost == robust_cost(data, state, gradient, 2.0, 0.0, np.inf)
     assert cost <= truth < before

@@ -66,7 +66,7 @@ def refine_frames(
         errors = squared_errors(data, points.shape[1], state, gradient)
         gate = 4.0 * threshold * threshold
         set_weights(data, np.where(errors < gate, 1.0, 0.0))
-        state, _, _, _ = refine(data, state, gradient, 1e6, 0.0, prior, noise, 10)
+        state, _, _, _ = refine(data, state, gradient, 1e6, 0.0, prior, noise, 10, 1e-6)
         states[i] = state
     return states
 

@@ -1,0 +1,109 @@
+"""Planes, which a single rolling-shutter image hardly determines: the estimate must be the minimum
+of the exact problem, where each point is seen by its own row, and no collapsed motion may pass."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+from rs_localizer.core.refine import apply_step
+from rs_localizer.core.shutter import project_rolling
+
+CAMERA = rsl.Camera(1000, 1000, np.array([[1207, 0, 499.5], [0, 1207, 499.5], [0, 0, 1.0]]))
+
+
+def plane_frame(seed, tilt, turn, travel, size, count=50):
+    """A plane 2 to 3 m away, tilted (deg) about a random axis, seen by a moving camera."""
+    rng = np.random.default_rng(seed)
+
+    def direction(length):
+        vector = rng.normal(size=3)
+        return length * vector / np.linalg.norm(vector)
+
+    angle = rng.uniform(0, 2 * np.pi)
+    tilted = Rotation.from_rotvec(np.radians(tilt) * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    flat = np.column_stack([rng.uniform(-size, size, (6 * count, 2)), np.zeros(6 * count)])
+    in_camera = tilted.apply(flat) + np.array([0.0, 0.0, rng.uniform(2.0, 3.0)])
+    rotation, translation = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
+    points = (in_camera - translation) @ rotation
+    motion = rsl.Motion(rotation, translation, direction(np.radians(turn)), direction(travel))
+    pixels, _ = project_rolling(CAMERA, motion.at_rows, points)
+    pixels = pixels + rng.normal(size=pixels.shape)
+    seen = np.flatnonzero(CAMERA.inside(pixels))[:count]
+    return points[seen], pixels[seen], motion
+
+
+def turn_between(estimate, motion):
+    return np.degrees(Rotation.from_matrix(estimate.rotation @ motion.rotation.T).magnitude())
+
+
+def exact_minimum(points, pixels, estimate):
+    """Exact posterior cost at the estimate and at the minimum that SciPy finds from there."""
+    state = np.concatenate(
+        [
+            estimate.rotation.ravel(), estimate.translation,
+            estimate.angular_velocity, estimate.linear_velocity,
+        ]
+    )  # fmt: skip
+    prior = rsl.VelocityPrior()
+
+    def residuals(step):
+        s = apply_step(state, step)
+        motion = rsl.Motion(s[:9].reshape(3, 3), s[9:12], s[12:15], s[15:])
+        predicted, _ = project_rolling(CAMERA, motion.at_rows, points)
+        velocities = np.concatenate(
+            [motion.angular_velocity / prior.angular, motion.linear_velocity / prior.linear]
+        )
+        return np.concatenate([(predicted - pixels).ravel(), velocities])
+
+    fit = least_squares(residuals, np.zeros(12), x_scale="jac", method="lm", max_nfev=4000)
+    return np.sum(residuals(np.zeros(12)) ** 2), 2.0 * fit.cost
+
+
+@pytest.mark.parametrize(("tilt", "turn", "travel"), [(30, 1.5, 0.015), (0, 6.0, 0.06), (45, 3, 0)])
+def test_the_estimate_is_the_minimum_of_the_exact_problem(tilt, turn, travel):
+    # All points are inliers here; rest would be mixed in, so only clear motions are compared.
+    localizer = rsl.Localizer(CAMERA, inlier_threshold=4.0)
+    compared = 0
+    for seed in range(12):
+        points, pixels, _ = plane_frame(seed, tilt, turn, travel, 1.0)
+        estimate = localizer.localize(points, pixels)
+        if not estimate or not estimate.inliers.all():
+            continue
+        weighed = np.concatenate([estimate.angular_velocity, estimate.linear_velocity])
+        if weighed @ np.linalg.solve(estimate.covariance[6:, 6:], weighed) < 70.0:
+            continue
+        found, lowest = exact_minimum(points, pixels, estimate)
+        assert found - lowest < 0.5, seed
+        compared += 1
+    assert compared >= 3
+
+
+@pytest.mark.parametrize(
+    ("tilt", "turn", "travel", "limit"),
+    [(0, 0.0, 0.0, 0.35), (0, 6.0, 0.06, 1.2), (30, 1.5, 0.015, 1.1)],
+)
+def test_planes_are_localized_as_well_as_the_prior_allows(tilt, turn, travel, limit):
+    localizer = rsl.Localizer(CAMERA)
+    errors = []
+    for seed in range(40):
+        points, pixels, motion = plane_frame(seed, tilt, turn, travel, 1.0)
+        estimate = localizer.localize(points, pixels)
+        errors.append(turn_between(estimate, motion) if estimate else 180.0)
+    assert np.median(errors) < limit
+
+
+def test_no_motion_that_keeps_pace_with_the_rows_is_published():
+    """Before a small plane a camera that turns along with its rows would fit anything."""
+    localizer = rsl.Localizer(CAMERA)
+    published = 0
+    for seed in range(40):
+        points, pixels, motion = plane_frame(seed, 0, 1.0, 0.01, 0.2)
+        estimate = localizer.localize(points, pixels)
+        if estimate:
+            published += 1
+            assert turn_between(estimate, motion) < 45.0
+            seen, _ = project_rolling(CAMERA, estimate.at_rows, points)
+            assert np.abs(seen - pixels)[estimate.inliers].max() < 10.0
+    assert published > 10
