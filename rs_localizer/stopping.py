@@ -71,8 +71,7 @@ class _Signals(abc.ABC):
 class StopSignals(_Signals):
     """The first signal raises KeyboardInterrupt wherever the main thread is; more change nothing.
 
-    Enter it before ``rclpy.init``: rclpy's own handlers, which wake a waiting executor, call
-    those that they found.
+    Enter it before ``rclpy.init``: rclpy's own handlers call those that they found.
     """
 
     def _stop(self) -> None:

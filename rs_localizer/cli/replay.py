@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import shlex
 import shutil
 import time
 from collections import Counter
@@ -14,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
+from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, open_bag
@@ -77,6 +79,7 @@ def run(args: argparse.Namespace) -> None:
         topics = find_topics(bag, args.correspondences, args.camera_info)
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         _prepare(out, args.overwrite)
+        _hint(args.bag, args.params)
         _replay(bag, topics, localizer, notices, out, args.storage)
 
 
@@ -98,11 +101,14 @@ def _check_usage(args: argparse.Namespace) -> None:
 def _localizer(
     params: Path | None, assignments: list[str], notice: Callable[[str, str], None]
 ) -> FrameLocalizer:
-    values = {} if params is None else load_params_file(params)
+    try:
+        values = {} if params is None else load_params_file(params)
+    except ValueError as error:
+        raise UsageError(f"--params: {error}") from error
     try:
         localizer = FrameLocalizer(build(values), notice)
     except ValueError as error:
-        raise ValueError(f"{params}: {error}") from error
+        raise UsageError(f"--params: {params}: {error}") from error
     try:
         localizer.config = build(values | dict(map(parse_assignment, assignments)))
     except ValueError as error:
@@ -113,11 +119,24 @@ def _localizer(
 def _prepare(out: Path, overwrite: bool) -> None:
     if out.exists() and not overwrite:
         raise ValueError(f"{out} exists; choose another --out, or --overwrite")
+    if out.exists() and not _is_ours(out):
+        raise ValueError(f"{out} is no result of replay; --overwrite leaves it as it is")
     out.mkdir(parents=True, exist_ok=True)
     for name in (POSES, TWISTS):
         (out / name).unlink(missing_ok=True)
     if (out / RESULT / "metadata.yaml").exists():  # nothing but a recording is removed
         shutil.rmtree(out / RESULT)
+
+
+def _is_ours(out: Path) -> bool:
+    """Whether a directory holds an earlier result, or nothing."""
+    return out.is_dir() and ((out / RESULT / "metadata.yaml").is_file() or not any(out.iterdir()))
+
+
+def _hint(bag: Path, params: Path | None) -> None:
+    file = (bag if bag.is_dir() else bag.parent) / "parameters.yaml"
+    if params is None and file.is_file():
+        print(f"the recording has settings of its own: --params {shlex.quote(str(file))}")
 
 
 def _replay(
@@ -149,7 +168,10 @@ def _replay(
     seconds = time.perf_counter() - start
     repeated = _write_texts(out, frames)
     _print_summary(total, frames, refused, notices, repeated, seconds)
-    print(f"written to {out}: {POSES}, {TWISTS}, {RESULT}")
+    moving = any(frame.twist for frame in frames)
+    if frames and not moving:
+        print(f"no twists: {_why_no_twists(localizer.config)}")
+    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}")
     if not frames:
         raise ValueError(f"no frame of {bag.path} was localized")
 
@@ -168,14 +190,13 @@ def _write_texts(out: Path, frames: list[Frame]) -> int:
         ),
     )
     moving = [(f.stamp_ns, f.twist) for f in once if f.twist is not None]
-    write_twists(
-        out / TWISTS,
-        Twists(
+    if moving:
+        twists = Twists(
             stamps_ns=np.array([stamp for stamp, _ in moving], dtype=np.int64),
-            angular=np.array([twist.angular for _, twist in moving]).reshape(-1, 3),
-            linear=np.array([twist.linear for _, twist in moving]).reshape(-1, 3),
-        ),
-    )
+            angular=np.array([twist.angular for _, twist in moving]),
+            linear=np.array([twist.linear for _, twist in moving]),
+        )
+        write_twists(out / TWISTS, twists)
     return len(frames) - len(once)
 
 
@@ -200,8 +221,12 @@ def _print_summary(
     for name, count in rows:
         print(f"{name:40} {count:8}")
     print(f"{'frames per second':40} {total / seconds:8.0f}")
-    if frames and not any(frame.twist for frame in frames):
-        print("no twists: the readout time is not given, or the solver estimates none")
+
+
+def _why_no_twists(config: NodeConfig) -> str:
+    if config.readout_time == 0.0:
+        return "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
+    return f"solver {config.solver} estimates no velocities"
 
 
 def _play(bag: BagReader, topics: Topics, rate: float) -> None:
@@ -213,10 +238,15 @@ def _play(bag: BagReader, topics: Topics, rate: float) -> None:
             "(README.md)"
         ) from error
     names = (topics.camera_info, topics.correspondences)
-    play(
-        tqdm(
-            bag.messages(names), total=bag.count(names), unit="message", desc="play", disable=None
-        ),
+    total = bag.count(names)
+    played = play(
+        tqdm(bag.messages(names), total=total, unit="message", desc="play", disable=None),
         {name: bag.topics[name] for name in names},
         rate,
     )
+    frames = bag.count([topics.correspondences])
+    print(f"{frames} frames published in {played.seconds:.1f} s")
+    for topic, count in played.poses.items():
+        print(f"{count} poses heard on {topic}")
+    if not played.poses:
+        print(f"no node {NODE_NAME} was there to publish poses")

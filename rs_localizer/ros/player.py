@@ -2,54 +2,79 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import rclpy
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from rs_localizer.ros.conversion import copy_message, message_class
+from rs_localizer.settings import NODE_NAME
 from rs_localizer.stopping import StopSignals
 
 _CLOCK_PERIOD = 0.01  # s of real time between two messages on /clock
 _DISCOVERY_TIMEOUT = 5.0  # s to wait for somebody who listens
+_REST_TIME = 0.5  # s to wait for the last answers
 # Reliable publishers are heard by reliable and by best-effort subscribers.
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
+class PlayerError(ValueError):
+    """Nobody listens."""
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What came of it."""
+
+    seconds: float  # from the first message to the last
+    poses: dict[str, int]  # how many were heard, by the topic of each localizer node
+
+
 def play(
     messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], rate: float = 1.0
-) -> None:
+) -> Played:
     """Publish messages at the pace of their recording.
 
     Args:
         messages: topic, time of recording in ns, message of rosbags; in the order of time.
         types: type name of each topic.
         rate: times real time.
+
+    Raises:
+        PlayerError: when nobody listens to any of the topics.
     """
     with StopSignals():
-        rclpy.init()
+        # rclpy's own handlers end the context from a thread while the player still uses it.
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         try:
-            _play(messages, types, rate)
+            return _play(messages, types, rate)
         finally:
-            # After a signal rclpy does the same in a thread, and whoever comes second fails.
-            with contextlib.suppress(RuntimeError):
-                rclpy.try_shutdown()
+            rclpy.try_shutdown()
 
 
-def _play(messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], rate: float) -> None:
+def _play(
+    messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], rate: float
+) -> Played:
     node = rclpy.create_node("rs_localizer_player")
     clock = node.create_publisher(Clock, "/clock", _QOS)
     publishers = {
         topic: node.create_publisher(message_class(name), topic, _QOS)
         for topic, name in types.items()
     }
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
     _wait_for_listeners(node, publishers)
+    heard = _hear_poses(node)
     started: tuple[float, int] | None = None
     for topic, recorded_ns, message in messages:
         if started is None:
@@ -57,11 +82,34 @@ def _play(messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], ra
         due = started[0] + (recorded_ns - started[1]) * 1e-9 / rate
         while (left := due - time.monotonic()) > 0.0:
             _tick(clock, recorded_ns - round(left * rate * 1e9))
-            time.sleep(min(left, _CLOCK_PERIOD))
+            _listen(executor, min(left, _CLOCK_PERIOD))
         _tick(clock, recorded_ns)
         publishers[topic].publish(copy_message(message, types[topic]))
     for publisher in publishers.values():
         publisher.wait_for_all_acked(Duration(seconds=1.0))
+    seconds = 0.0 if started is None else time.monotonic() - started[0]
+    _listen(executor, _REST_TIME)
+    return Played(seconds, dict(heard))
+
+
+def _hear_poses(node: Any) -> Counter[str]:
+    """Count the poses of all localizer nodes that are there, by topic, from now on."""
+    heard: Counter[str] = Counter()
+
+    def subscribe(topic: str) -> None:
+        heard[topic] = 0
+        node.create_subscription(PoseStamped, topic, lambda _: heard.update((topic,)), _QOS)
+
+    for topic, types in node.get_topic_names_and_types():
+        if topic.endswith(f"/{NODE_NAME}/pose") and types == ["geometry_msgs/msg/PoseStamped"]:
+            subscribe(topic)
+    return heard
+
+
+def _listen(executor: SingleThreadedExecutor, seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while (left := deadline - time.monotonic()) > 0.0:
+        executor.spin_once(timeout_sec=left)
 
 
 def _wait_for_listeners(node: Any, publishers: Mapping[str, Any]) -> None:
@@ -69,6 +117,11 @@ def _wait_for_listeners(node: Any, publishers: Mapping[str, Any]) -> None:
     deadline = time.monotonic() + _DISCOVERY_TIMEOUT
     while deaf := [t for t, p in publishers.items() if p.get_subscription_count() == 0]:
         if time.monotonic() > deadline:
+            if len(deaf) == len(publishers):
+                raise PlayerError(
+                    f"nobody listens to {' and '.join(deaf)}: start the node, or check its "
+                    "topics and ROS_DOMAIN_ID"
+                )
             node.get_logger().warning(f"nobody listens to {', '.join(deaf)}")
             return
         time.sleep(0.05)

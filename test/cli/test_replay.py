@@ -248,13 +248,53 @@ def test_without_readout_time_there_are_no_twists(
 ) -> None:
     out = tmp_path / "out"
     assert main(["replay", str(recording), "--out", str(out)]) == 0
-    assert "no twists: the readout time is not given" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "no twists: readout_time is 0 (unknown); give it with -p readout_time:=SECONDS" in text
+    assert text.endswith(f"written to {out}: poses.txt, result\n")
     assert len(read_tum(out / "poses.txt")) == FRAMES
-    assert (out / "twists.txt").read_text() == "# t wx wy wz vx vy vz\n"
+    assert sorted(file.name for file in out.iterdir()) == ["poses.txt", "result"]
     with open_bag(out / "result") as bag:
         assert sorted(bag.topics) == [
             f"/rs_localizer/{name}" for name in ("inliers", "pose", "pose_with_covariance")
         ]
+
+
+def test_a_solver_without_velocities_is_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["replay", str(recording), "--out", str(tmp_path / "out"), *SHUTTER]
+    assert main([*arguments, "-p", "solver:=p3p"]) == 0
+    assert "no twists: solver p3p estimates no velocities\n" in capsys.readouterr().out
+
+
+def test_settings_beside_the_recording_are_pointed_out(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = rewrite(recording, tmp_path / "bag", lambda topic, message: topic)
+    arguments = ["replay", str(bag), "--out", str(tmp_path / "out"), "--overwrite"]
+    assert main(arguments) == 0
+    assert "--params" not in capsys.readouterr().out
+    file = bag / "parameters.yaml"
+    file.write_text(f"/**:\n  ros__parameters: {{readout_time: {READOUT_TIME}}}\n")
+    assert main(arguments) == 0
+    hint = f"the recording has settings of its own: --params {file}\n"
+    assert capsys.readouterr().out.startswith(hint)
+    assert main([*arguments, "--params", str(file)]) == 0
+    assert hint not in capsys.readouterr().out
+
+
+def test_only_results_are_overwritten(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    foreign = tmp_path / "dataset"
+    foreign.mkdir()
+    (foreign / "poses.txt").write_text("the only copy")
+    arguments = ["replay", str(recording), *SHUTTER, "--overwrite", "--out"]
+    assert main([*arguments, str(foreign)]) == 1
+    assert f"{foreign} is no result of replay" in capsys.readouterr().err
+    assert [file.read_text() for file in foreign.iterdir()] == ["the only copy"]
+    (tmp_path / "empty").mkdir()
+    assert main([*arguments, str(tmp_path / "empty")]) == 0
 
 
 def test_an_earlier_result_is_not_overwritten_unasked(
@@ -324,7 +364,7 @@ def test_topics_are_found_or_chosen(
         (["-p", "solver:=p4p"], 2, "solver must be one of p3p,"),
         (["-p", "sead:=1"], 2, "'sead' is no setting"),
         (["-p", "seed"], 2, "expected name:=value, got 'seed'"),
-        (["--params", "nowhere.yaml"], 1, "nowhere.yaml cannot be read"),
+        (["--params", "nowhere.yaml"], 2, "--params: nowhere.yaml cannot be read"),
         (["--rate", "2"], 2, "--rate goes with --ros"),
         (["--ros", "--rate", "-1"], 2, "--rate must be positive, got -1.0"),
         (["--ros", "-p", "seed:=1"], 2, "are for offline replay"),
@@ -354,7 +394,7 @@ def test_a_params_file_with_a_wrong_value_is_named(
 ) -> None:
     file = tmp_path / "bad.yaml"
     file.write_text("/**:\n  ros__parameters: {readout_time: 3.0}\n")
-    assert main(["replay", str(recording), "--params", str(file)]) == 1
+    assert main(["replay", str(recording), "--params", str(file)]) == 2
     assert "bad.yaml: readout_time must lie between 0.0 and 0.2" in capsys.readouterr().err
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +67,11 @@ def test_everything_arrives_in_scaled_time(recording: Path, peer: Any) -> None:
     )
     player = play(recording, "--rate", "0.5")
     assert peer.spin_until(lambda: player.poll() is not None)
-    assert player.communicate() == ("", "")
-    assert player.returncode == 0
+    output, errors = player.communicate()
+    assert re.fullmatch(
+        rf"{FRAMES} frames published in 1\.[45] s\nno node rs_localizer was there .*\n", output
+    )
+    assert (player.returncode, errors) == (0, "")
     peer.spin_until(lambda: len(clouds) == FRAMES, 1.0)
 
     with open_bag(recording) as bag:
@@ -82,6 +87,34 @@ def test_everything_arrives_in_scaled_time(recording: Path, peer: Any) -> None:
     assert stamps[-1] == START_NS + (FRAMES - 1) * PERIOD_NS
     assert len(stamps) > 5 * FRAMES
     assert (stamps[-1] - stamps[0]) * 1e-9 / (times[-1] - times[0]) == pytest.approx(0.5, abs=0.1)
+
+
+def test_poses_of_a_node_are_counted(tmp_path: Path, start_node: Callable[..., Any]) -> None:
+    simulate = [sys.executable, "-m", "rs_localizer", "simulate", str(tmp_path / "flight")]
+    subprocess.run([*simulate, "--duration", "1", "--rate", "10"], check=True)
+    node = start_node("-p", "readout_time:=0.03", "-r", "__ns:=/cam")
+    node.wait_for_log("active with solver")
+    player = play(tmp_path / "flight", *(
+        "--rate", "0.5", "--correspondences", "/correspondences"
+    ))  # fmt: skip
+    output, errors = player.communicate(timeout=60)
+    # It listens to /cam/correspondences: nobody hears the recording.
+    assert (player.returncode, output) == (1, "")
+    assert errors.startswith(
+        "rs_localizer replay: nobody listens to /camera_info and /correspondences: start the node"
+    )
+    assert errors.count("\n") == 1
+    remapped = [f"{topic}:=/{topic}" for topic in ("camera_info", "correspondences")]
+    node = start_node("-p", "readout_time:=0.03", "-r", remapped[0], "-r", remapped[1])
+    node.wait_for_log("active with solver")
+    output, errors = play(tmp_path / "flight", "--rate", "0.5").communicate(timeout=60)
+    assert errors == ""
+    lines = output.splitlines()
+    assert re.fullmatch(r"10 frames published in 1\.[89] s", lines[0])
+    counts = {line.split()[-1]: int(line.split()[0]) for line in lines[1:]}
+    # Subscribed to as it starts: the very first may be missed.
+    assert 8 <= counts["/rs_localizer/pose"] <= 10
+    assert counts["/cam/rs_localizer/pose"] == 0
 
 
 def test_ctrl_c_ends_it_in_one_line(recording: Path, peer: Any) -> None:
