@@ -23,6 +23,7 @@ from rs_localizer.stopping import StopSignals
 
 _CLOCK_PERIOD = 0.01  # s of real time between two messages on /clock
 _DISCOVERY_TIMEOUT = 5.0  # s to wait for somebody who listens
+_SETTLING_TIME = 0.3  # s to be heard by those whom we hear, and the other way round
 _REST_TIME = 0.5  # s to wait for the last answers
 # Reliable publishers are heard by reliable and by best-effort subscribers.
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -74,9 +75,12 @@ def _play(
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     _wait_for_listeners(node, publishers)
-    heard = _hear_poses(node)
+    poses = _Poses(node)
+    poses.look_round()
+    _listen(executor, _SETTLING_TIME)
     started: tuple[float, int] | None = None
     for topic, recorded_ns, message in messages:
+        poses.look_round()
         if started is None:
             started = time.monotonic(), recorded_ns
         due = started[0] + (recorded_ns - started[1]) * 1e-9 / rate
@@ -89,21 +93,28 @@ def _play(
         publisher.wait_for_all_acked(Duration(seconds=1.0))
     seconds = 0.0 if started is None else time.monotonic() - started[0]
     _listen(executor, _REST_TIME)
-    return Played(seconds, dict(heard))
+    return Played(seconds, dict(poses.counts))
 
 
-def _hear_poses(node: Any) -> Counter[str]:
-    """Count the poses of all localizer nodes that are there, by topic, from now on."""
-    heard: Counter[str] = Counter()
+class _Poses:
+    """Counts the poses of all localizer nodes, by topic."""
 
-    def subscribe(topic: str) -> None:
-        heard[topic] = 0
-        node.create_subscription(PoseStamped, topic, lambda _: heard.update((topic,)), _QOS)
+    def __init__(self, node: Any) -> None:
+        self.counts: Counter[str] = Counter()
+        self._node = node
 
-    for topic, types in node.get_topic_names_and_types():
-        if topic.endswith(f"/{NODE_NAME}/pose") and types == ["geometry_msgs/msg/PoseStamped"]:
-            subscribe(topic)
-    return heard
+    def look_round(self) -> None:
+        """Hear nodes that are new in the graph, too: they are discovered one after the other."""
+        for topic, types in self._node.get_topic_names_and_types():
+            if topic.endswith(f"/{NODE_NAME}/pose") and types == ["geometry_msgs/msg/PoseStamped"]:
+                self._hear(topic)
+
+    def _hear(self, topic: str) -> None:
+        if topic not in self.counts:
+            self.counts[topic] = 0
+            self._node.create_subscription(
+                PoseStamped, topic, lambda _: self.counts.update((topic,)), _QOS
+            )
 
 
 def _listen(executor: SingleThreadedExecutor, seconds: float) -> None:

@@ -94,9 +94,7 @@ def test_poses_of_a_node_are_counted(tmp_path: Path, start_node: Callable[..., A
     subprocess.run([*simulate, "--duration", "1", "--rate", "10"], check=True)
     node = start_node("-p", "readout_time:=0.03", "-r", "__ns:=/cam")
     node.wait_for_log("active with solver")
-    player = play(tmp_path / "flight", *(
-        "--rate", "0.5", "--correspondences", "/correspondences"
-    ))  # fmt: skip
+    player = play(tmp_path / "flight")
     output, errors = player.communicate(timeout=60)
     # It listens to /cam/correspondences: nobody hears the recording.
     assert (player.returncode, output) == (1, "")
@@ -112,9 +110,9 @@ def test_poses_of_a_node_are_counted(tmp_path: Path, start_node: Callable[..., A
     lines = output.splitlines()
     assert re.fullmatch(r"10 frames published in 1\.[89] s", lines[0])
     counts = {line.split()[-1]: int(line.split()[0]) for line in lines[1:]}
-    # Subscribed to as it starts: the very first may be missed.
+    # Best effort, and the very first may be missed.
     assert 8 <= counts["/rs_localizer/pose"] <= 10
-    assert counts["/cam/rs_localizer/pose"] == 0
+    assert counts.get("/cam/rs_localizer/pose", 0) == 0
 
 
 def test_ctrl_c_ends_it_in_one_line(recording: Path, peer: Any) -> None:
