@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rs_localizer.arguments import number
+from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.trajectories import Trajectory, read_twists
 from rs_localizer.lab.metrics import (
@@ -17,6 +19,7 @@ from rs_localizer.lab.metrics import (
     summarize,
     twist_errors,
 )
+from rs_localizer.lab.recording import CORRESPONDENCES_TOPIC
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     topics.add_argument("--truth-twist-topic", metavar="TOPIC", help="of TRUTH")
     parser.add_argument(
         "--tolerance",
-        type=float,
+        type=number(0.0),
         default=1e-3,
         metavar="S",
         help="largest difference of times that are compared (default: %(default)s)",
@@ -56,7 +59,8 @@ def run(args: argparse.Namespace) -> None:
     twists = None
     if estimate.twists is not None and truth.twists is not None:
         twists = twist_errors(estimate.twists, truth.twists, tolerance_ns)
-    print(f"{len(poses.stamps_ns)} of {len(estimate.poses)} poses compared\n")
+    print(f"{len(poses.stamps_ns)} of {len(estimate.poses)} poses compared")
+    print(f"{_coverage(args.truth, estimate.poses, truth.poses, tolerance_ns)}\n")
     _print_table(poses, twists)
     if args.ate:
         _print_ate(estimate.poses, truth.poses, tolerance_ns)
@@ -71,6 +75,22 @@ def run(args: argparse.Namespace) -> None:
         for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
             plots.save(figure, args.plot / name)
             print(f"{args.plot / name}")
+
+
+def _coverage(
+    path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns: int
+) -> str:
+    """How much of what the truth knows has been localized."""
+    rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
+    try:
+        with open_bag(path) as bag:
+            clouds = {CORRESPONDENCES_TOPIC} & set(bag.topics)
+            frames = bag.count(clouds) if clouds else 0
+    except BagError:  # a text file, or a directory of them
+        frames = 0
+    if frames > 0:  # their truth may stand there for several instants of each
+        return f"{len(rows)} of {frames} frames have a pose"
+    return f"{len(set(true_rows.tolist()))} of {len(truth)} true poses have an estimate"
 
 
 def _read(

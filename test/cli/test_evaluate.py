@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
+from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 
 STAMPS = 1_500_000_000_000_000_000 + np.arange(40, dtype=np.int64) * 33_333_333
@@ -63,6 +64,32 @@ def test_table(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "linear velocity (m/s)": 0.5,
     }.items():
         np.testing.assert_allclose(found[name], [40, error, error, error, error], atol=1e-4)
+
+
+def test_frames_without_a_pose_are_told(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = TRUTH.part(np.arange(40) % 4 != 0)
+    write_tum(tmp_path / "few.txt", few)
+    assert evaluate(files, estimate="few.txt") == 0
+    text = capsys.readouterr().out
+    assert text.startswith("30 of 30 poses compared\n30 of 40 true poses have an estimate\n")
+    # A recording knows its frames; each has two true poses.
+    bag = tmp_path / "bag"
+    assert main(["simulate", str(bag), "--duration", "0.5"]) == 0
+    truth = read_motions(bag, "/truth/pose", "/truth/twist").poses
+    write_tum(tmp_path / "found.txt", truth.part(np.arange(0, len(truth), 2)[3:]))
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "found.txt"), str(bag)]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == "12 of 15 frames have a pose"
+
+
+@pytest.mark.parametrize("tolerance", ["-0.1", "nan", "soon"])
+def test_a_wrong_tolerance_is_wrong_usage(
+    files: Path, tolerance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate(files, "--tolerance", tolerance) == 2
+    assert "--tolerance: must be " in capsys.readouterr().err
 
 
 def test_files_alone_have_no_twists(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
