@@ -34,7 +34,7 @@ from rs_localizer.lab.true_motion import RecordedMotion
 from rs_localizer.settings import build, load_params_file
 
 _GLOBAL, _ROLLING = "global_shutter", "rolling_shutter"
-_NAMES = {_ROLLING: "rolling shutter", _GLOBAL: "global shutter"}
+_NAMES = {_ROLLING: "rolling shutter", _GLOBAL: "P3P (one pose per image)"}
 # The part of the hand's motion that is flown (s): it begins slowly and ends in quick turns.
 _FLIGHT_START, _FLIGHT_DURATION = 8.0, 18.0
 _FLIGHT_CAMERA = Camera(

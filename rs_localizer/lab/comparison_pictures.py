@@ -22,8 +22,7 @@ from rs_localizer.lab.comparison import (
     true_rates,
 )
 
-# So that arrows of a tenth of a pixel are seen.
-_MAGNIFICATION = 150.0
+_RESIDUAL_TITLE = "The frame where they differ most"
 
 
 def trajectory_picture(recording: Recording, results: Mapping[str, Result]) -> Figure:
@@ -77,7 +76,7 @@ def residual_picture(
             best = (
                 difference,
                 plots.residuals(
-                    np.asarray(image, np.uint8), seen.pixels, predicted, _MAGNIFICATION
+                    np.asarray(image, np.uint8), seen.pixels, predicted, _RESIDUAL_TITLE
                 ),
             )
     return None if best is None else best[1]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Mapping
+from itertools import zip_longest
 
 import numpy as np
 
@@ -19,7 +21,11 @@ Cell = Callable[[Recording, Result], str]
 
 def table(title: str, recording: Recording, results: Mapping[str, Result]) -> str:
     """The results of several methods, by name, side by side; 80 columns hold two of them."""
-    lines = [f"{title:{_LABEL}}" + "".join(f"{name:>{_CELL}}" for name in results)]
+    names = [textwrap.wrap(name, _CELL - 2) for name in results]
+    lines = [
+        f"{left:{_LABEL}}" + "".join(f"{part:>{_CELL}}" for part in parts)
+        for left, *parts in zip_longest([title], *names, fillvalue="")
+    ]
     for label, cell in _ROWS:
         cells = [cell(recording, result) for result in results.values()]
         if any(text != _NONE for text in cells):

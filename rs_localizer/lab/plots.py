@@ -40,7 +40,7 @@ _LONGEST_GAP = 4.0
 _WINDOW = 15
 # Zero has no logarithm.
 _LEAST = 1e-9
-# What is shown of an image around the points (px).
+# What is shown of an image around the points, and the longest arrow (px).
 _RIM = 80.0
 
 
@@ -145,15 +145,20 @@ def _draw_series(
     values: Array,
     start: int,
     unit: str,
+    counted: Array | None = None,
 ) -> None:
-    """Single values as pale marks, their running median as a line."""
+    """Single values as pale marks, their running median as a line.
+
+    The legend has the median of all values, or of those that are ``counted``.
+    """
     t = _seconds(stamps_ns, start)
     axes.plot(
         t, values, linestyle="none", marker=style.marker, markersize=3.0, markeredgewidth=0.6,
         color=style.color, alpha=0.35, zorder=style.layer,
     )  # fmt: skip
     x, y = _broken(stamps_ns, t, _running_median(values))
-    label = f"{name}: median {np.median(values):.3g} {unit}".rstrip() if len(values) else name
+    counted = values if counted is None else counted
+    label = f"{name}: median {np.median(counted):.3g} {unit}".rstrip() if len(counted) else name
     axes.plot(x, y, style.line, color=style.color, linewidth=2.0, zorder=style.layer, label=label)
 
 
@@ -172,7 +177,7 @@ def inliers(
     angular_rate: Array,
     most_label: str,
 ) -> Figure:
-    """Inliers of each frame, and how fast the camera turned.
+    """Inliers of each frame, and how fast the camera turned; medians of the localized frames.
 
     Args:
         stamps_ns: (n,) of all frames.
@@ -186,7 +191,9 @@ def inliers(
     t = _seconds(stamps_ns, int(stamps_ns[0]))
     upper.fill_between(t, most, step="mid", color="#ececec", zorder=0, label=most_label)
     for (name, style), values in zip(_methods(counts), counts.values(), strict=True):
-        _draw_series(upper, name, style, stamps_ns, values, int(stamps_ns[0]), "")
+        # As in the table: what a refused frame would have had, nobody knows.
+        localized = values[values > 0.0]
+        _draw_series(upper, name, style, stamps_ns, values, int(stamps_ns[0]), "", localized)
     upper.set_ylim(bottom=0.0)
     upper.set_ylabel("inliers (0: frame refused)")
     _legend(upper, 3)
@@ -199,18 +206,22 @@ def inliers(
     return figure
 
 
-def residuals(
-    image: Image, pixels: Array, predicted: Mapping[str, Array], magnification: float
-) -> Figure:
+def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title: str) -> Figure:
     """Residuals as arrows on the image they belong to, one picture per method.
+
+    All arrows are enlarged alike, as far as all stay inside.
 
     Args:
         image: (height, width) grey.
         pixels: (n,2) where the corners were seen.
         predicted: (n,2) where each method's pose puts them.
-        magnification: length of an arrow in image pixels per pixel of residual.
+        title: what image it is.
     """
-    figure = _figure("From where the pose puts the points to where they are seen", 4.9)
+    figure = _figure(
+        f"{title}: from where the pose puts the points to where they are seen", 4.9
+    )
+    longest = max(float(np.linalg.norm(pixels - seen, axis=1).max()) for seen in predicted.values())
+    magnification = _round_down(_RIM / longest) if longest > 0.0 else 1.0
     for axes, (name, style), seen in zip(
         figure.subplots(1, len(predicted)), _methods(predicted), predicted.values(), strict=True
     ):
@@ -226,9 +237,15 @@ def residuals(
         axes.set_xticks([])
         axes.set_yticks([])
         low, high = pixels.min(axis=0) - _RIM, pixels.max(axis=0) + _RIM
-        axes.set_xlim(max(low[0], -0.5), min(high[0], image.shape[1] - 0.5))
-        axes.set_ylim(min(high[1], image.shape[0] - 0.5), max(low[1], -0.5))
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(high[1], low[1])
     return figure
+
+
+def _round_down(value: float) -> float:
+    """The next lower one of ... 0.5, 1, 2, 5, 10 ..."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(digit for digit in (1.0, 2.0, 5.0) if digit * power <= value))
 
 
 def _plain_numbers(axes: Axes) -> None:

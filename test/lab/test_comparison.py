@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.quiver import Quiver
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.so3 import Array
+from rs_localizer.lab import plots
 from rs_localizer.lab.comparison import (
     Answer,
     Recording,
@@ -150,3 +152,43 @@ def test_predicted_pixels_move_with_the_rows() -> None:
     static = Answer(0, 0.0, 0, np.zeros(3), start.as_quat(), None, None, np.zeros(0))
     expected = project(camera, points, start, np.zeros(3))
     np.testing.assert_allclose(predicted_pixels(camera, static, points), expected, atol=1e-9)
+
+
+def test_long_names_stand_in_two_lines(recording: Recording) -> None:
+    found = compare(answers(recording, moving=True, shift=0.0), recording.truth)
+    lines = table("Title", recording, {"one": found, "P3P (one pose per image)": found})
+    first, second, third, *_ = lines.splitlines()
+    assert first.split() == ["Title", "one", "P3P", "(one", "pose"]
+    assert second.split() == ["per", "image)"]
+    assert third.split() == ["frames", "30", "30"]
+    assert max(map(len, lines.splitlines())) <= 80
+
+
+def test_picture_and_table_have_the_same_median_of_inliers(recording: Recording) -> None:
+    half = dict(list(answers(recording, moving=True, shift=0.0).items())[:10])
+    results = {"one": compare(half, recording.truth)}
+    median = np.median(results["one"].inlier_counts)
+    assert median > 0.0
+    figure = inlier_picture(recording, results, np.full(30, 105.0))
+    labels = figure.axes[0].get_legend_handles_labels()[1]
+    assert f"one: median {median:.3g}" in labels
+
+
+@pytest.mark.parametrize(("residual", "enlarged"), [(0.11, "500"), (3.0, "20"), (700.0, "0.1")])
+def test_arrows_stay_inside(residual: float, enlarged: str) -> None:
+    """All the points lie at the border of the image, and the arrows point outwards."""
+    pixels = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
+    outwards = (pixels - pixels.mean(axis=0)) / np.linalg.norm(pixels[2] / 2)
+    predicted = {"bad": pixels - residual * outwards, "good": pixels - 0.01 * outwards}
+    figure = plots.residuals(np.zeros((480, 640), np.uint8), pixels, predicted, "A frame")
+    assert figure.get_suptitle().startswith("A frame: ")
+    for axes in figure.axes:
+        assert axes.get_xlabel() == f"arrows {enlarged} times enlarged"
+        (arrows,) = (c for c in axes.collections if isinstance(c, Quiver))
+        tips = arrows.XY + np.stack([arrows.U, arrows.V], axis=1) / arrows.scale
+        left, right = axes.get_xlim()
+        bottom, top = axes.get_ylim()
+        assert left <= tips[:, 0].min() < tips[:, 0].max() <= right
+        assert top <= tips[:, 1].min() < tips[:, 1].max() <= bottom
+    longest = np.hypot(arrows.U, arrows.V).max() / arrows.scale
+    assert longest < 80.0
