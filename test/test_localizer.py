@@ -129,6 +129,13 @@ def test_p3p_is_a_global_shutter_and_knows_no_motion():
     assert rsl.Localizer(cam).localize(points, pixels).inliers.sum() > 0.95 * inliers.sum()
 
 
+def test_an_estimate_prints_in_a_line():
+    cam = camera()
+    text = repr(rsl.Localizer(cam).localize(*frame(cam, Path(2), 60, 0.5, 0.3)[:2]))
+    assert len(text) < 200
+    assert "of 60 inliers" in text
+
+
 def test_same_seed_same_bits_and_no_memory_of_earlier_frames():
     cam = camera()
     data = [frame(cam, Path(seed), 60, 0.5, 0.3, seed)[:2] for seed in (1, 2)]

@@ -105,13 +105,15 @@ def search(
     Blocks take the initial rotations in turn and draw equally from all pools. The search stops
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
     *optimised* motion, is below ``1 - confidence``: minimal models see too few of the inliers to
-    count them (a six-point model sees a tenth).
+    count them (a six-point model sees a tenth). Only models that beat all minimal ones before are
+    optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003).
     """
     usable = [pool for pool in pools if len(pool.points) >= hypotheses.sample_size]
     best = start
     inliers = _inliers(observations, best, hypotheses.final_scale)
     drawn = np.zeros(len(usable), dtype=np.int64)
     row_range = float(np.ptp(observations.tau))
+    no_fit, best_gain = len(observations) * hypotheses.score_scale**2, 0.0
     while usable and drawn.sum() < max_samples:
         block = int(min(hypotheses.block, max_samples - drawn.sum()))
         samples = np.empty((block, hypotheses.sample_size), dtype=np.int64)
@@ -129,8 +131,9 @@ def search(
         )  # fmt: skip
         states, costs = best_models(
             models, observations.packed, observations.row_time_gradient,
-            hypotheses.score_scale, _KEEP,
+            hypotheses.score_scale, _KEEP, no_fit - best_gain,
         )  # fmt: skip
+        best_gain = max(best_gain, no_fit - float(costs[0]))
         state, cost = optimize(
             states, costs, observations.packed, observations.row_time_gradient,
             2.0 * hypotheses.score_scale, hypotheses.final_scale, hypotheses.prior,

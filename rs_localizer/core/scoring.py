@@ -10,8 +10,8 @@ from rs_localizer.core.refine import refine
 from rs_localizer.core.residuals import STATE_SIZE, robust_cost
 from rs_localizer.core.so3 import Array
 
-# Local optimisation tightens Tukey's loss from the first scale to the last by these steps.
-_ANNEALING_STEPS = 5
+# Local optimisation tightens Tukey's loss from the first scale to the last in this many steps.
+_MOST_ANNEALING_STEPS = 5
 _ITERATIONS_PER_SCALE = 3
 # Gain, in noise variances, below which the next scale is worth more than another step.
 _TOLERANCE = 1.0
@@ -33,12 +33,12 @@ def state_of_model(model: Array) -> Array:
 
 @kernel
 def best_models(
-    models: Array, data: Array, gradient: Array, scale: float, keep: int
+    models: Array, data: Array, gradient: Array, scale: float, keep: int, bar: float
 ) -> tuple[Array, Array]:
     """States (keep,18) and costs (keep,) of the models (k,18,h) with the least truncated error.
 
-    A model is left as soon as its cost exceeds that of the worst kept one. Places that no model
-    takes have infinite cost.
+    A model is left as soon as its cost exceeds that of the worst kept one, or ``bar``. Places that
+    no model takes have infinite cost.
     """
     states = np.zeros((keep, STATE_SIZE))
     costs = np.full(keep, np.inf)
@@ -48,8 +48,9 @@ def best_models(
             if np.isnan(models[s, 0, h]):
                 continue
             state = state_of_model(models[s, :, h])
-            cost = robust_cost(data, state, gradient, scale, 0.0, costs[keep - 1])
-            if cost < costs[keep - 1]:
+            limit = min(costs[keep - 1], bar)
+            cost = robust_cost(data, state, gradient, scale, 0.0, limit)
+            if cost < limit:
                 place = keep - 1
                 while place > 0 and cost < costs[place - 1]:
                     costs[place] = costs[place - 1]
@@ -78,13 +79,15 @@ def optimize(
     """
     best = np.zeros(STATE_SIZE)
     best_cost = np.inf
-    ratio = (last_scale / first_scale) ** (1.0 / (_ANNEALING_STEPS - 1))
+    # About a halving from step to step.
+    steps = min(max(int(np.log2(first_scale / last_scale) + 0.5) + 1, 2), _MOST_ANNEALING_STEPS)
+    ratio = (last_scale / first_scale) ** (1.0 / (steps - 1))
     for i in range(len(states)):
         if not np.isfinite(costs[i]):
             continue
         state = states[i]
         scale = first_scale
-        for _ in range(_ANNEALING_STEPS):
+        for _ in range(steps):
             state, _, _, _ = refine(
                 data, state, gradient, scale, 1.0, prior, noise, _ITERATIONS_PER_SCALE, _TOLERANCE
             )

@@ -27,7 +27,7 @@ class Reason(StrEnum):
     IMPLAUSIBLE = "implausible"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Estimate(Motion):
     """An accepted pose and velocity; true in a condition.
 
@@ -55,6 +55,15 @@ class Estimate(Motion):
 
     def __bool__(self) -> Literal[True]:
         return True
+
+    def __repr__(self) -> str:
+        turn = np.degrees(np.linalg.norm(self.angular_velocity))
+        return (
+            f"Estimate(position={np.round(self.position, 4).tolist()}, "
+            f"{np.count_nonzero(self.inliers)} of {len(self.inliers)} inliers at "
+            f"{self.residual_rms:.3g} px rms, {turn:.3g} deg and "
+            f"{np.linalg.norm(self.linear_velocity):.3g} m per readout)"
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ def test_the_best_models_are_those_of_a_full_sort(scene):
     camera, motion, points, _, measured = scene.frame(noise=1.0, count=50)
     data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
     models, flat = models_near(motion, 40, np.random.default_rng(1))
-    states, costs = best_models(models, data, gradient, 8.0, 4)
+    states, costs = best_models(models, data, gradient, 8.0, 4, np.inf)
     alive = [state_of_model(column) for column in flat.T if np.isfinite(column).all()]
     expected = sorted(robust_cost(data, s, gradient, 8.0, 0.0, np.inf) for s in alive)[:4]
     np.testing.assert_allclose(costs, expected, rtol=1e-12)
@@ -41,11 +41,20 @@ def test_the_best_models_are_those_of_a_full_sort(scene):
         assert robust_cost(data, state, gradient, 8.0, 0.0, np.inf) == cost
 
 
+def test_models_above_the_bar_are_left_out(scene):
+    camera, motion, points, _, measured = scene.frame(noise=1.0, count=50)
+    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    models, _ = models_near(motion, 40, np.random.default_rng(1))
+    _, costs = best_models(models, data, gradient, 8.0, 4, np.inf)
+    _, fewer = best_models(models, data, gradient, 8.0, 4, 0.5 * (costs[1] + costs[2]))
+    np.testing.assert_array_equal(fewer, [*costs[:2], np.inf, np.inf])
+
+
 def test_places_without_a_model_stay_infinite(scene):
     camera, _, points, _, measured = scene.frame()
     data = scene.pack(camera, points, measured)
     nothing = np.full((1, 18, 3), np.nan)
-    states, costs = best_models(nothing, data, camera.row_time_gradient, 8.0, 2)
+    states, costs = best_models(nothing, data, camera.row_time_gradient, 8.0, 2, np.inf)
     assert np.isinf(costs).all()
     _, cost = optimize(states, costs, data, camera.row_time_gradient, 16.0, 2.0, FREE, 1.0)
     assert np.isinf(cost)
