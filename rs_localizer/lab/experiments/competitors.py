@@ -49,6 +49,16 @@ def p3p_subjects(trials: Trials) -> dict[str, Subject]:
     return subjects
 
 
+def poselib_camera(view: Camera) -> dict[str, object]:
+    """A camera without distortion as PoseLib takes it."""
+    return {
+        "model": "PINHOLE",
+        "width": view.width,
+        "height": view.height,
+        "params": [view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]],
+    }
+
+
 def robust_subjects(view: Camera, points: Array, pixels: Array, label: str) -> dict[str, Subject]:
     """Global-shutter RANSAC of a frame."""
     subjects = {
@@ -61,12 +71,7 @@ def robust_subjects(view: Camera, points: Array, pixels: Array, label: str) -> d
     }
     module = poselib()
     if module is not None:
-        model = {
-            "model": "PINHOLE",
-            "width": view.width,
-            "height": view.height,
-            "params": [view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]],
-        }
+        model = poselib_camera(view)
         options = {"max_reproj_error": 2.0, "max_iterations": 1000}
         subjects[f"PoseLib estimate_absolute_pose, {label}"] = Subject(
             lambda: module.estimate_absolute_pose(pixels, points, model, options, {}), 1

@@ -22,6 +22,7 @@ OUTLIERS = 0.5
 _STILL_FRAME = Setting(noise=0.5, points=200)
 _BLOCK = 64
 _HYPOTHESES = 1000
+ALL_SAMPLES = f"robust loop, {_HYPOTHESES} samples, moving"
 
 
 def frame_subjects(seed: int) -> dict[str, Subject]:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rs_localizer.lab.experiments import (
+    bound,
     convergence,
     linearisation,
     motion,
     noise,
     p3p_initialisation,
+    planes,
     real,
+    robustness,
     timings,
     translation,
 )
@@ -23,6 +26,9 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "convergence": convergence.run,
     "linearisation": linearisation.run,
     "p3p-initialisation": p3p_initialisation.run,
+    "bound": bound.run,
+    "planes": planes.run,
+    "robustness": robustness.run,
     "timings": timings.run,
     "real": real.run,
 }

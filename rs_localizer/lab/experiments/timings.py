@@ -10,7 +10,13 @@ import numpy as np
 from rs_localizer.core.ransac import MODEL_SIZE
 from rs_localizer.core.so3 import Array
 from rs_localizer.lab.experiments.competitors import p3p_subjects
-from rs_localizer.lab.experiments.frame_timings import FRAME, OUTLIERS, frame_subjects
+from rs_localizer.lab.experiments.frame_timings import (
+    ALL_SAMPLES,
+    FRAME,
+    OUTLIERS,
+    frame_subjects,
+)
+from rs_localizer.lab.experiments.median_frame import examine_frames, frame_claims, frame_note
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
 from rs_localizer.lab.experiments.startup import Startup, cold_and_warm
 from rs_localizer.lab.experiments.stopwatch import Subject, interleaved, ratio
@@ -48,6 +54,7 @@ _BUDGETS = (
     Budget("r6p", 1, 14.0, 9.0, 1700.0),
     Budget("joint", 1),
 )
+_ALL_SAMPLES_AT_MOST = 5.0  # ms
 _COMPILE_AT_MOST, _FIRST_POSE_AT_MOST = 40.0, 1.5  # s
 
 
@@ -64,6 +71,9 @@ def run(context: Context) -> Result:
     rows = [_row(budget, minimal) for budget in budgets]
     claims = [_cost(budget, minimal) for budget in budgets if np.isfinite(budget.at_most)]
     claims.append(_faster_than_paper(rows))
+    claims.append(_all_samples(frame[ALL_SAMPLES]))
+    found = examine_frames(context)
+    claims += frame_claims(found)
     claims += _startup_claims(startup)
     return Result(
         "Timings",
@@ -78,8 +88,9 @@ def run(context: Context) -> Result:
         {
             "timings": Table(_COLUMNS, rows),
             "timings_frame": Table(("subject", "us"), list(medians.items())),
+            "timings_median_frame": found.table(),
         },
-        notes=[_text(rows, minimal, frame, startup)],
+        notes=[_text(rows, minimal, frame, startup), frame_note(found)],
     )
 
 
@@ -172,6 +183,20 @@ def _faster_than_paper(rows: list[tuple[str | float | int, ...]]) -> Claim:
         "per iteration",
         ", ".join(f"{name} {gain:.0f} times" for name, gain in gains.items()),
         min(gains.values()) > 1.0,
+    )
+
+
+def _all_samples(times: Array) -> Claim:
+    milliseconds = float(np.median(times)) / 1000.0
+    return judge(
+        "timings.all_samples",
+        "this project",
+        f"all 1000 hypotheses on {FRAME.points} points, {OUTLIERS:.0%} of them outliers, are cheap",
+        "drawn, solved, scored and the best optimised, without stopping early, in at most "
+        f"{_ALL_SAMPLES_AT_MOST:g} ms",
+        f"{milliseconds:.1f} ms",
+        milliseconds <= _ALL_SAMPLES_AT_MOST,
+        "the machine had other work, or is of another kind",
     )
 
 

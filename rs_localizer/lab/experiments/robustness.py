@@ -1,0 +1,304 @@
+"""What the Localizer bears: wrong matches of several kinds, few and many points, any camera."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import chi2
+
+from rs_localizer.core import so3
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.so3 import Array
+from rs_localizer.core.types import BoolArray
+from rs_localizer.lab.experiments import charts
+from rs_localizer.lab.experiments.charts import Look
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.views import GROSS, Outcome, View, outcome, uniform_pixels
+from rs_localizer.localizer import Localizer
+
+_SIZE = 1000
+_NOISE = 1.0  # px
+_DEPTH = (1.0, 4.0)  # m
+_FOUND, _MOST_MS = 0.99, 15.0
+# A second object has turned and moved by so much against the scene (deg, m).
+_OBJECT = (20.0, 0.5)
+_PERIOD = 0.3  # m from one window of a facade to the next
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Frames of one kind."""
+
+    name: str
+    label: str
+    points: int = 200
+    uniform: float = 0.0  # share of pixels anywhere in the image
+    second: float = 0.0  # share of points on an object that moves by itself
+    shifted: float = 0.0  # share of points matched one period aside
+    field_of_view: float = 45.0  # deg
+    offset: float = 0.0  # m, of the map's origin
+    scores: str = ""  # "right", "random" or "reversed"
+    motion: float = 1.0  # of 10 deg and 0.1 m per readout
+    at_least: float = 0.99  # share localized correctly; NaN: no claim
+    frames: float = 0.2  # per trial
+
+
+HARD = Case("uniform_70", "70 % uniform outliers", uniform=0.7, frames=0.5)
+_CASES = (
+    HARD,
+    Case("uniform_50", "50 % uniform outliers", uniform=0.5),
+    Case("object", "30 % on a second moving object", second=0.3),
+    Case("object_uniform", "30 % on an object, 20 % uniform", second=0.3, uniform=0.2),
+    Case("texture", "30 % shifted by a period", shifted=0.3),
+    Case("points_12", "12 points", points=12, at_least=math.nan),
+    Case("points_20", "20 points", points=20),
+    Case("points_50", "50 points, 30 % uniform", points=50, uniform=0.3),
+    Case("points_1000", "1000 points, 50 % uniform", points=1000, uniform=0.5),
+    Case("points_5000", "5000 points, 50 % uniform", points=5000, uniform=0.5, frames=0.05),
+    Case("narrow", "field of view 10 deg, 30 % uniform, 2 deg", field_of_view=10.0, uniform=0.3,
+         motion=0.2),
+    Case("narrow_fast", "field of view 10 deg, 30 % uniform, 10 deg", field_of_view=10.0,
+         uniform=0.3, at_least=math.nan),
+    Case("wide", "field of view 120 deg, 30 % uniform", field_of_view=120.0, uniform=0.3),
+    Case("offset", "origin 5e6 m away, 30 % uniform", offset=5e6, uniform=0.3),
+    Case("scores_right", "right scores, 50 % uniform", scores="right", uniform=0.5),
+    Case("scores_random", "random scores, 50 % uniform", scores="random", uniform=0.5),
+    Case("scores_reversed", "reversed scores, 50 % uniform", scores="reversed", uniform=0.5),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """All frames of one case."""
+
+    case: Case
+    outcomes: Sequence[Outcome]
+    seconds: Array
+
+    @property
+    def correct(self) -> float:
+        return float(np.mean([x.correct for x in self.outcomes]))
+
+    @property
+    def no_pose(self) -> float:
+        return float(np.mean([not x.localized for x in self.outcomes]))
+
+    @property
+    def wrong(self) -> float:
+        """Share of frames that were published and are wrong."""
+        return float(np.mean([x.gross for x in self.outcomes]))
+
+    @property
+    def median(self) -> float:
+        """Of the errors in units of the median of an estimate at the bound."""
+        errors = np.median([x.bound for x in self.outcomes])
+        return float(np.sqrt(errors / chi2.ppf(0.5, 12)))
+
+    @property
+    def milliseconds(self) -> float:
+        return 1e3 * float(np.median(self.seconds))
+
+
+def run(context: Context) -> Result:
+    """The experiment."""
+    found = []
+    for index, case in enumerate(_CASES):
+        count = max(1, round(case.frames * context.trials))
+        found.append(_examine(case, count, [context.seed, 4, index], context))
+    listed = {one.case.name: one for one in found}
+    return Result(
+        "Robustness",
+        "The Localizer at its defaults on 200 points at 10 degrees and 0.1 m per readout, "
+        f"{_NOISE:g} px noise on {_SIZE} rows, 45 degrees, points {_DEPTH[0]:g} to {_DEPTH[1]:g} m "
+        f"away, and what each line says. Correct is within {GROSS:g} sigma of the Cramér-Rao bound "
+        "of the true inliers; of two groups of points that move differently, the bigger one is the "
+        "truth. Errors are medians in units of that of an estimate at the bound.",
+        [
+            _hard(listed[HARD.name]),
+            _hard_time(listed[HARD.name]),
+            *(_localized(one) for one in found if one.case.at_least > 0.0 and one.case is not HARD),
+            _none_wrong(found),
+        ],
+        {"robustness": Table(_COLUMNS, [_row(one) for one in found])},
+        {"robustness": _figure(found)},
+        [_WHY_TWELVE, _WHY_NARROW],
+    )
+
+
+_COLUMNS = (
+    "case", "points", "frames", "correct", "wrong", "no_pose", "median_error_by_bound", "median_ms"
+)  # fmt: skip
+_WHY_TWELVE = (
+    "Of 12 points all have to be inliers for the default min_inliers of 12, and with 1 px noise "
+    "an inlier in seven lies beyond the inlier threshold of 2 px until the noise is known: there "
+    "is no claim on how many such frames get a pose, only that none gets a wrong one."
+)
+
+_WHY_NARROW = (
+    "A camera that sees 10 degrees and turns by 10 degrees per readout moves the image as fast as "
+    "the rows run: points are seen by several rows or by none, and some frames have no pose. With "
+    "a fifth of that motion, which is what 10 degrees are to a field of view of 45, there is a "
+    "claim."
+)
+
+
+def _examine(case: Case, count: int, seed: Sequence[int], context: Context) -> Found:
+    rng = np.random.default_rng(seed)
+    view_camera = _camera(case.field_of_view)
+    localizer = Localizer(view_camera)
+    outcomes, seconds = [], []
+    for _ in context.track(range(count), count):
+        view = _view(case, view_camera, rng)
+        scores = _scores(case, view.inliers, rng)
+        start = time.perf_counter()
+        result = localizer.localize(view.points, view.pixels, scores)
+        seconds.append(time.perf_counter() - start)
+        outcomes.append(outcome(view, result))
+    return Found(case, outcomes, np.array(seconds))
+
+
+def _camera(field_of_view: float) -> Camera:
+    focal = 0.5 * _SIZE / math.tan(0.5 * math.radians(field_of_view))
+    centre = 0.5 * (_SIZE - 1)
+    K = np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
+    return Camera(width=_SIZE, height=_SIZE, K=K)
+
+
+def _view(case: Case, view: Camera, rng: np.random.Generator) -> View:
+    """A frame: pixels are drawn first, and their points lie on the rays of their rows."""
+    n = case.points
+    pixels = uniform_pixels(view, n, rng)
+    place = case.offset * _direction(rng)
+    motion = _motion(so3.exp(math.pi * rng.uniform(-1.0, 1.0, 3)), place + rng.normal(size=3), case,
+                     rng)  # fmt: skip
+    points = _seen_at(motion, view, pixels, rng.uniform(*_DEPTH, n))
+    group = np.zeros(n, dtype=np.int64)  # 0: the scene
+    order, first = rng.permutation(n), 0
+    for kind, share in enumerate((case.uniform, case.second, case.shifted), 1):
+        group[order[first : first + round(share * n)]] = kind
+        first += round(share * n)
+    measured = pixels + _NOISE * rng.normal(size=(n, 2))
+    measured[group == 1] = uniform_pixels(view, int(np.count_nonzero(group == 1)), rng)
+    # The camera as the object sees it: elsewhere, and moving in another way.
+    other = group == 2
+    turn, way = _OBJECT
+    beside = _motion(
+        so3.exp(math.radians(turn) * _direction(rng)) @ motion.rotation,
+        -motion.rotation.T @ motion.translation + way * _direction(rng),
+        case,
+        rng,
+    )
+    points[other] = _seen_at(beside, view, pixels[other], rng.uniform(*_DEPTH, n)[other])
+    points[group == 3] += _PERIOD * motion.rotation[0]  # along the rows of the image
+    return View(view, points, measured, pixels, group == 0, motion, _NOISE)
+
+
+def _motion(rotation: Array, position: Array, case: Case, rng: np.random.Generator) -> Motion:
+    turn, travel = math.radians(10.0) * case.motion, 0.1 * case.motion
+    return Motion(rotation, -rotation @ position, turn * _direction(rng), travel * _direction(rng))
+
+
+def _seen_at(motion: Motion, view: Camera, pixels: Array, depth: Array) -> Array:
+    """Points (n,3) in the map that are seen at pixels (n,2), each at the time of its row."""
+    rotations, translations = motion.at_rows(view.row_time(pixels))
+    local = depth[:, None] * np.column_stack([view.rays(pixels), np.ones(len(pixels))])
+    points: Array = np.einsum("nji,nj->ni", rotations, local - translations)
+    return points
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    vector = rng.normal(size=3)
+    unit: Array = vector / np.linalg.norm(vector)
+    return unit
+
+
+def _scores(case: Case, inliers: BoolArray, rng: np.random.Generator) -> Array | None:
+    if not case.scores:
+        return None
+    noise = rng.normal(size=len(inliers))
+    gain = {"right": 2.0, "random": 0.0, "reversed": -2.0}[case.scores]
+    scores: Array = noise + gain * inliers
+    return scores
+
+
+def _hard(found: Found) -> Claim:
+    return judge(
+        "robustness.uniform_70",
+        "this project",
+        "70 % uniform outliers are borne",
+        f"at least {_FOUND:.0%} of the frames localized correctly",
+        f"{found.correct:.1%}, median error {found.median:.2f} of the bound",
+        found.correct >= _FOUND,
+    )
+
+
+def _hard_time(found: Found) -> Claim:
+    return judge(
+        "robustness.uniform_70_time",
+        "this project",
+        "70 % uniform outliers do not take long",
+        f"median at most {_MOST_MS:g} ms",
+        f"{found.milliseconds:.1f} ms",
+        found.milliseconds <= _MOST_MS,
+        "the machine had other work, or is of another kind",
+    )
+
+
+def _localized(found: Found) -> Claim:
+    case = found.case
+    return judge(
+        f"robustness.{case.name}",
+        "this project",
+        f"localized correctly: {case.label}",
+        f"at least {case.at_least:.0%} of the frames",
+        f"{found.correct:.1%}, median error {found.median:.2f} of the bound",
+        found.correct >= case.at_least,
+    )
+
+
+def _none_wrong(found: Sequence[Found]) -> Claim:
+    wrong = {one.case.name: one.wrong for one in found if one.wrong > 0.0}
+    worst = max(wrong.values(), default=0.0)
+    listed = ", ".join(f"{name} {share:.1%}" for name, share in wrong.items())
+    return judge(
+        "robustness.none_wrong",
+        "this project",
+        "where there is no good pose, none is published",
+        "at most 1 % of the frames of each kind have a wrong one",
+        listed or "none at all",
+        worst <= 0.01,
+    )
+
+
+def _row(found: Found) -> tuple[str | float | int, ...]:
+    return (
+        found.case.name, found.case.points, len(found.outcomes), found.correct, found.wrong,
+        found.no_pose, found.median, found.milliseconds,
+    )  # fmt: skip
+
+
+def _worst(found: Sequence[Found]) -> float:
+    return max((one.median for one in found if np.isfinite(one.median)), default=1.0)
+
+
+def _figure(found: Sequence[Found]) -> Figure:
+    drawn = charts.figure(9.6, 5.4)
+    axes, errors = drawn.subplots(1, 2, sharey=True)
+    y = np.arange(len(found), dtype=np.float64)
+    for panel, values, label in (
+        (axes, [100.0 * one.correct for one in found], "localized correctly (%)"),
+        (errors, [one.median for one in found], "median error / that at the bound"),
+    ):
+        charts.line(panel, np.array(values), y, Look("#0b3c8c", "o", ""), "")
+        charts.tidy(panel, label, "")
+    axes.set_xlim(0.0, 103.0)
+    errors.set_xlim(0.0, max(1.5, 1.1 * _worst(found)))
+    axes.set_yticks(y, [one.case.label for one in found])
+    axes.invert_yaxis()
+    return drawn
