@@ -55,7 +55,7 @@ def best_of_samples(
         method.iterations, models,
     )  # fmt: skip
     states, costs = best_models(
-        models, observations.packed, observations.row_time_gradient, threshold, 1
+        models, observations.packed, observations.row_time_gradient, threshold, 1, math.inf
     )
     if not math.isfinite(costs[0]):
         return np.full(MODEL_SIZE, np.nan), 0
