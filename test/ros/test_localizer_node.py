@@ -223,6 +223,8 @@ def test_parameters_of_a_running_node(recording: Path, start_node: Start, peer: 
     assert len(talk.received["odometry"]) > before
     changes = [
         Parameter("solver", value="p3p").to_parameter_msg(),
+        # A single pose fits this motion badly.
+        Parameter("inlier_threshold", value=10.0).to_parameter_msg(),
         Parameter("pose_time", value="mid_frame").to_parameter_msg(),
     ]
     request = SetParametersAtomically.Request(parameters=changes)
