@@ -25,7 +25,7 @@ from rs_localizer.core.sampling import IntArray, Pool, Random, generator
 from rs_localizer.core.scoring import optimize
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.core.types import BoolArray, Estimate, Failure, Reason
 from rs_localizer.solvers import Solver, find_solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -45,12 +45,15 @@ _STILL_TRACKED = 0.7
 _GLOBAL_SHUTTER_BLOCK = 48
 _BLOCK = 64
 _GLOBAL_SHUTTER_MOST_SAMPLES = 384
+# Enough to find three inliers among points of which two fifths are.
+_SECOND_LOOK_SAMPLES = 96
 # Of the information matrix scaled to a unit diagonal.
 _LEAST_EIGENVALUE = 1e-11
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5
 # Errors as large as the gate lets them be are those of points strewn over it.
-_MOST_NOISE = 0.75  # inlier thresholds
+# A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
+_MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
 # does so fits anything. See :meth:`Observations.row_paces`.
 _LEAST_PACE = 0.25
@@ -153,10 +156,11 @@ class Localizer:
             near = self._track(frame, prior, expected_share)
             if near:
                 return replace(near, tracked=True)
-        start = self._global_shutter(frame)
+        start = self._global_shutter(frame, np.arange(len(usable)), self.config.max_iterations)
         if not start.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
         best = self._motion(frame, start)
+        start, best = self._largest_group(frame, start, best)
         return self._accept(frame, start, best, self._final(frame, best, frame.terms))
 
     # -- steps ------------------------------------------------------------------------------
@@ -217,11 +221,38 @@ class Localizer:
             )
         return result
 
-    def _global_shutter(self, frame: _Frame) -> Candidate:
-        """A pose that fits all rows roughly, by P3P and a wide threshold."""
+    def _largest_group(
+        self, frame: _Frame, start: Candidate, best: Candidate
+    ) -> tuple[Candidate, Candidate]:
+        """The start and the motion of another group of points, if it is the larger one.
+
+        The search stays near its global-shutter start. Where that lies on a second moving object,
+        the points that it leaves out may hold more inliers than it found.
+        """
+        if not best.found:
+            return start, best
+        others = np.flatnonzero(~self._near(frame, start))
+        inliers = frame.observations.squared_errors(best.state) < self.config.inlier_threshold**2
+        if not self._solver.rolling_shutter or len(others) <= np.count_nonzero(inliers):
+            return start, best
+        second = self._global_shutter(frame, others, _SECOND_LOOK_SAMPLES)
+        if not second.found or (
+            np.count_nonzero(self._near(frame, second)[others]) <= np.count_nonzero(inliers)
+        ):
+            return start, best
+        rival = self._motion(frame, second)
+        return (second, rival) if rival.cost < best.cost else (start, best)
+
+    def _near(self, frame: _Frame, start: Candidate) -> BoolArray:
+        """Which points may belong to a motion whose global-shutter pose this is."""
+        errors = frame.observations.squared_errors(start.state)
+        near: BoolArray = errors < (_POOL_SCALE * self._focal_length) ** 2
+        return near
+
+    def _global_shutter(self, frame: _Frame, among: IntArray, most: int) -> Candidate:
+        """A pose that fits all rows roughly, by P3P on some points and a wide threshold."""
         threshold = self.config.inlier_threshold
         wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
-        most = self.config.max_iterations
         if self._solver.rolling_shutter:
             score_scale, final_scale = wide, wide
             most = min(_GLOBAL_SHUTTER_MOST_SAMPLES, most)
@@ -234,7 +265,7 @@ class Localizer:
             frame.observations,
             hypotheses,
             [np.eye(3)],
-            _pools(frame),
+            _pools(frame, among),
             NOTHING,
             self.config.confidence,
             most,
@@ -246,8 +277,7 @@ class Localizer:
         if not self._solver.rolling_shutter:
             return start
         threshold = self.config.inlier_threshold
-        errors = frame.observations.squared_errors(start.state)
-        near = np.flatnonzero(errors < (_POOL_SCALE * self._focal_length) ** 2)
+        near = np.flatnonzero(self._near(frame, start))
         # The global-shutter pose is a hypothesis, too: at rest it is the best one.
         first = self._optimize(frame, start.state, _POOL_SCALE * self._focal_length, frame.terms)
         hypotheses = self._hypotheses(
@@ -257,7 +287,7 @@ class Localizer:
             frame.observations,
             hypotheses,
             [start.state[:9].reshape(3, 3)],
-            [Pool(near), *_pools(frame)],
+            [Pool(near), *_pools(frame, np.arange(len(frame.observations)))],
             first,
             self.config.confidence,
             self.config.max_iterations,
@@ -299,7 +329,9 @@ class Localizer:
                 f"information {posterior.smallest_eigenvalue:.1e}",
             )
         threshold = self.config.inlier_threshold
-        if posterior.noise > _MOST_NOISE * threshold:
+        rolling = self._solver.rolling_shutter
+        most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
+        if posterior.noise > most * threshold:
             return Failure(
                 Reason.RESIDUAL,
                 f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
@@ -417,12 +449,12 @@ class Localizer:
         return int(np.count_nonzero(frame.observations.squared_errors(pose.state) < threshold**2))
 
 
-def _pools(frame: _Frame) -> list[Pool]:
-    everything = Pool(np.arange(len(frame.observations)))
+def _pools(frame: _Frame, among: IntArray) -> list[Pool]:
+    everything = Pool(among)
     # Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
     if frame.ranking is None:
         return [everything]
-    return [Pool(frame.ranking, ranked=True), everything]
+    return [Pool(frame.ranking[np.isin(frame.ranking, among)], ranked=True), everything]
 
 
 def _median_depth(points: Array, state: Array) -> float:

@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "solvers": {"core"},
     "localizer": {"core", "config", "solvers"},
     "io": {"core"},
-    "lab": {"core", "config", "solvers", "localizer", "io", "settings", "arguments"},
+    "lab": {"core", "config", "solvers", "localizer", "tracking", "io", "settings", "arguments"},
 }
 ABOVE = {"ros", "cli"}
 

@@ -311,3 +311,22 @@ def test_warming_up_compiles_all_that_a_frame_needs():
     points, pixels, inliers = frame(cam, Path(0), 40, 0.5, 0.2)
     assert localizer.localize(points, pixels, inliers.astype(float))
     assert [len(kernel.signatures) for kernel in kernels] == before
+
+
+def test_the_larger_of_two_moving_groups_wins():
+    """Half of the points are the scene, three tenths another object, the rest is strewn."""
+    cam = camera()
+    localizer = rsl.Localizer(cam)
+    wrong = 0
+    for seed in range(40):
+        scene, thing = Path(seed), Path(seed + 1000)
+        points, pixels, _ = frame(cam, scene, 100, 0.5, seed=seed)
+        others, seen, _ = frame(cam, thing, 60, 0.5, seed=seed)
+        rng = np.random.default_rng(seed)
+        strewn = rng.uniform([0, 0], [639, 479], (40, 2))
+        result = localizer.localize(
+            np.concatenate([points, others, rng.uniform(-2, 2, (40, 3))]),
+            np.concatenate([pixels, seen, strewn]),
+        )
+        wrong += not (result and result.inliers[:100].mean() > 0.95)
+    assert wrong <= 1

@@ -149,9 +149,10 @@ def maximum_a_posteriori(
     )
     inverse, smallest = invert_information(information)
     inliers = errors < gate * gate
-    left = max(2 * np.count_nonzero(inliers) - freedom, 3.0)
-    # The noise itself is estimated: errors follow a t distribution, whose variance is larger.
-    inflation = left / (left - 2.0)
+    left = max(2 * np.count_nonzero(inliers) - freedom, 6.0)
+    # The noise itself is estimated, so that squared distances follow an F distribution; this makes
+    # its 95 % quantile that of the chi-squared one, to half a percent from 40 degrees of freedom.
+    inflation = left / (left - 5.0)
     covariance = inflation * noise**2 * inverse
     return Posterior(state, covariance, noise, inflation, smallest, inliers, errors)
 

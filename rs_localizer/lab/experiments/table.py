@@ -15,6 +15,7 @@ from rs_localizer.lab.experiments import (
     real,
     robustness,
     timings,
+    tracking,
     translation,
 )
 from rs_localizer.lab.experiments.results import Context, Result
@@ -28,6 +29,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "p3p-initialisation": p3p_initialisation.run,
     "bound": bound.run,
     "planes": planes.run,
+    "tracking": tracking.run,
     "robustness": robustness.run,
     "timings": timings.run,
     "real": real.run,

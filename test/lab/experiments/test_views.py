@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from rs_localizer.core.refine import apply_step
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.core.types import Estimate, Failure, Reason
-from rs_localizer.lab.experiments import bound, robustness
+from rs_localizer.lab.experiments import bound, robustness, tracking
 from rs_localizer.lab.experiments.results import Verdict
 from rs_localizer.lab.experiments.robustness import Case
 from rs_localizer.lab.experiments.trials import Setting, draw_trials
@@ -178,3 +178,15 @@ def test_the_second_object_is_rigid_too() -> None:
     assert other
     assert other.inliers.mean() > 0.9
     assert np.linalg.norm(one.off(other)[3:6]) > 0.3
+
+
+def test_ratios_of_tracking_are_by_quartile() -> None:
+    errors = np.column_stack([np.arange(9.0), np.arange(9.0)])
+    one = tracking.Run(np.arange(9.0), errors * [0.5, 2.0], errors, np.arange(9) > 4)
+    np.testing.assert_allclose(one.ratios(0.5), [0.5, 2.0])
+    assert one.share == 0.5
+    assert tracking._never_worse(tracking._CASES[2], one).verdict is Verdict.NOT_HELD
+    assert tracking._improves(tracking._CASES[0], one).verdict is Verdict.NOT_HELD
+    better = dataclasses.replace(one, tracked=0.5 * errors)
+    assert tracking._never_worse(tracking._CASES[2], better).verdict is Verdict.HELD
+    assert tracking._improves(tracking._CASES[0], better).verdict is Verdict.HELD
