@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.posterior import Posterior, maximum_a_posteriori, weigh_against_rest
+from rs_localizer.core.posterior import WIDEST_GATE, Posterior, maximum_a_posteriori, weigh_against_rest
 from rs_localizer.core.prior import (
     Prior,
     PriorTerms,
@@ -232,7 +232,9 @@ class Localizer:
         if not best.found:
             return start, best
         others = np.flatnonzero(~self._near(frame, start))
-        inliers = frame.observations.squared_errors(best.state) < self.config.inlier_threshold**2
+        # At the widest gate of the final estimate, so that noise hides none of them.
+        gate = WIDEST_GATE * self.config.inlier_threshold
+        inliers = frame.observations.squared_errors(best.state) < gate**2
         if not self._solver.rolling_shutter or len(others) <= np.count_nonzero(inliers):
             return start, best
         second = self._global_shutter(frame, others, _SECOND_LOOK_SAMPLES)

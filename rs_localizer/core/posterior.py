@@ -24,7 +24,7 @@ from rs_localizer.core.types import BoolArray
 # Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
 # distributed errors); the threshold is widened for them at most twofold.
 _GATE = 3.5
-_WIDEST = 2.0
+WIDEST_GATE = 2.0
 _ROUNDS = 3
 _ITERATIONS = 50
 _TOLERANCE = 1e-6  # noise variances
@@ -103,7 +103,7 @@ def _rounds(
         degrees of freedom that the points decide (the prior takes its part of the twelve).
     """
     # From the wide side: a start that fits few points well would see little noise and keep few.
-    state, gate, noise, freedom = start, _WIDEST * threshold, 0.5 * threshold, 12.0
+    state, gate, noise, freedom = start, WIDEST_GATE * threshold, 0.5 * threshold, 12.0
     errors = squared_errors(data, count, state, gradient)
     weights = np.empty(count)
     information = np.empty((PARAMETERS, PARAMETERS))
@@ -124,7 +124,7 @@ def _rounds(
             if solved:
                 freedom -= noise * noise * taken[i]
         noise = noise_deviation(errors, gate, freedom)
-        gate = min(max(threshold, _GATE * noise), _WIDEST * threshold)
+        gate = min(max(threshold, _GATE * noise), WIDEST_GATE * threshold)
     weights[:] = 1.0
     set_weights(data, weights)
     return state, information, errors, noise, gate, freedom
