@@ -10,7 +10,12 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.posterior import WIDEST_GATE, Posterior, maximum_a_posteriori, weigh_against_rest
+from rs_localizer.core.posterior import (
+    WIDEST_GATE,
+    Posterior,
+    maximum_a_posteriori,
+    weigh_against_rest,
+)
 from rs_localizer.core.prior import (
     Prior,
     PriorTerms,
