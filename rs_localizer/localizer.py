@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.acceptance import determines_motion, refusal
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.inputs import checked
 from rs_localizer.core.posterior import (
     WIDEST_GATE,
     Posterior,
@@ -52,16 +54,6 @@ _BLOCK = 64
 _GLOBAL_SHUTTER_MOST_SAMPLES = 384
 # Enough to find three inliers among points of which two fifths are.
 _SECOND_LOOK_SAMPLES = 96
-# Of the information matrix scaled to a unit diagonal.
-_LEAST_EIGENVALUE = 1e-11
-# Beyond this the camera turns by more than the motion model is meant for, rad per readout.
-_MOST_TURN = 1.5
-# Errors as large as the gate lets them be are those of points strewn over it.
-# A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
-_MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
-# An image that moves along with the rows is one moment of the scene, drawn out: any motion that
-# does so fits anything. See :meth:`Observations.row_paces`.
-_LEAST_PACE = 0.25
 # Points farther away than this (m) are faults, and their squares would be infinite.
 _FARTHEST_POINT = 1e9
 
@@ -141,7 +133,7 @@ class Localizer:
         Raises:
             ValueError: wrong shapes, or values that are not finite.
         """
-        points, pixels, scores = _checked(points, pixels, scores)
+        points, pixels, scores = checked(points, pixels, scores)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         rays = self.camera.rays(pixels)
@@ -307,7 +299,7 @@ class Localizer:
         posterior = maximum_a_posteriori(frame.observations, best.state, terms, threshold)
         # Unless more is known of this very frame than the velocity prior of the configuration.
         uninformed = len(terms.informations) == 1 and self._solver.rolling_shutter
-        if uninformed and posterior.smallest_eigenvalue > _LEAST_EIGENVALUE:
+        if uninformed and determines_motion(posterior):
             return weigh_against_rest(frame.observations, posterior)
         return posterior
 
@@ -315,57 +307,16 @@ class Localizer:
         self, frame: _Frame, start: Candidate, best: Candidate, posterior: Posterior
     ) -> Estimate | Failure:
         """Accept the motion or say what is wrong with it."""
-        state = posterior.state
-        found, needed = int(np.count_nonzero(posterior.inliers)), self.config.min_inliers
-        if found < needed:
-            behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
-            if 2 * behind > len(frame.usable):
-                return Failure(
-                    Reason.BEHIND_CAMERA,
-                    f"{behind} of {len(frame.usable)} points lie behind the camera",
-                )
-            return Failure(
-                Reason.TOO_FEW_INLIERS,
-                f"{found} inliers of {len(frame.usable)} points after {best.samples} samples, "
-                f"{needed} are needed",
-            )
-        if not posterior.smallest_eigenvalue > _LEAST_EIGENVALUE:
-            return Failure(
-                Reason.DEGENERATE,
-                f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
-                f"information {posterior.smallest_eigenvalue:.1e}",
-            )
-        threshold = self.config.inlier_threshold
-        rolling = self._solver.rolling_shutter
-        most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
-        if posterior.noise > most * threshold:
-            return Failure(
-                Reason.RESIDUAL,
-                f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
-                f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
-                "too small for the noise",
-            )
-        pace = float(np.median(frame.observations.row_paces(state)[posterior.inliers]))
-        if pace < _LEAST_PACE:
-            return Failure(
-                Reason.IMPLAUSIBLE,
-                f"the image would move along with the rows, {1.0 - pace:.0%} as fast as they",
-            )
-        turn = float(np.linalg.norm(state[12:15]))
-        if turn > _MOST_TURN:
-            return Failure(
-                Reason.IMPLAUSIBLE,
-                f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
-            )
-        depth = _median_depth(frame.observations.points[posterior.inliers], state)
-        travel = float(np.linalg.norm(state[15:18]))
-        if travel > depth:
-            return Failure(
-                Reason.IMPLAUSIBLE,
-                f"the camera would move by {travel:.3g} m per readout in front of points "
-                f"{depth:.3g} m away",
-            )
-        return self._estimate(frame, start, best, posterior)
+        failure = refusal(
+            frame.observations,
+            posterior,
+            best.samples,
+            min_inliers=self.config.min_inliers,
+            threshold=self.config.inlier_threshold,
+            rolling=self._solver.rolling_shutter,
+        )
+        # Not `or`: a Failure is false.
+        return self._estimate(frame, start, best, posterior) if failure is None else failure
 
     def _estimate(
         self, frame: _Frame, start: Candidate, best: Candidate, posterior: Posterior
@@ -462,31 +413,3 @@ def _pools(frame: _Frame, among: IntArray) -> list[Pool]:
     if frame.ranking is None:
         return [everything]
     return [Pool(frame.ranking[np.isin(frame.ranking, among)], ranked=True), everything]
-
-
-def _median_depth(points: Array, state: Array) -> float:
-    return float(np.median(points @ state[6:9] + state[11]))
-
-
-def _checked(
-    points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None
-) -> tuple[Array, Array, Array | None]:
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    pixels = np.ascontiguousarray(pixels, dtype=np.float64)
-    if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
-        points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
-    n = len(points)
-    if points.shape != (n, 3) or pixels.shape != (n, 2):
-        raise ValueError(
-            f"points must be (n,3) and pixels (n,2), got {points.shape} and {pixels.shape}"
-        )
-    checks = [("points", points), ("pixels", pixels)]
-    if scores is not None:
-        scores = np.ascontiguousarray(scores, dtype=np.float64)
-        if scores.shape != (n,):
-            raise ValueError(f"scores must be ({n},), got {scores.shape}")
-        checks.append(("scores", scores))
-    for name, array in checks:
-        if not np.all(np.isfinite(array)):
-            raise ValueError(f"{name} must be finite, found NaN or infinity")
-    return points, pixels, scores

@@ -1,0 +1,99 @@
+"""Whether an estimate may be published: nothing rather than a wrong pose."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rs_localizer.core.posterior import Posterior
+from rs_localizer.core.ransac import Observations
+from rs_localizer.core.so3 import Array
+from rs_localizer.core.types import Failure, Reason
+
+# Of the information matrix scaled to a unit diagonal.
+_LEAST_EIGENVALUE = 1e-11
+# Beyond this the camera turns by more than the motion model is meant for, rad per readout.
+_MOST_TURN = 1.5
+# Errors as large as the gate lets them be are those of points strewn over it.
+# A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
+_MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
+# An image that moves along with the rows is one moment of the scene, drawn out: any motion that
+# does so fits anything. See :meth:`Observations.row_paces`.
+_LEAST_PACE = 0.25
+
+
+def determines_motion(posterior: Posterior) -> bool:
+    """Whether points and prior together determine all twelve parameters."""
+    return posterior.smallest_eigenvalue > _LEAST_EIGENVALUE
+
+
+def refusal(
+    observations: Observations,
+    posterior: Posterior,
+    samples: int,
+    *,
+    min_inliers: int,
+    threshold: float,
+    rolling: bool,
+) -> Failure | None:
+    """What is wrong with an estimate, or None.
+
+    Args:
+        samples: minimal samples drawn, for the message.
+        min_inliers, threshold: of the configuration.
+        rolling: whether velocities were estimated.
+    """
+    state = posterior.state
+    found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
+    if found < needed:
+        behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
+        if 2 * behind > len(observations):
+            return Failure(
+                Reason.BEHIND_CAMERA,
+                f"{behind} of {len(observations)} points lie behind the camera",
+            )
+        return Failure(
+            Reason.TOO_FEW_INLIERS,
+            f"{found} inliers of {len(observations)} points after {samples} samples, "
+            f"{needed} are needed",
+        )
+    if not determines_motion(posterior):
+        return Failure(
+            Reason.DEGENERATE,
+            f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
+            f"information {posterior.smallest_eigenvalue:.1e}",
+        )
+    most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
+    if posterior.noise > most * threshold:
+        return Failure(
+            Reason.RESIDUAL,
+            f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
+            f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
+            "too small for the noise",
+        )
+    pace = float(np.median(observations.row_paces(state)[posterior.inliers]))
+    if pace < _LEAST_PACE:
+        return Failure(
+            Reason.IMPLAUSIBLE,
+            f"the image would move along with the rows, {1.0 - pace:.0%} as fast as they",
+        )
+    turn = float(np.linalg.norm(state[12:15]))
+    if turn > _MOST_TURN:
+        return Failure(
+            Reason.IMPLAUSIBLE,
+            f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
+        )
+    depth = _median_depth(observations.points[posterior.inliers], state)
+    travel = float(np.linalg.norm(state[15:18]))
+    if travel > depth:
+        return Failure(
+            Reason.IMPLAUSIBLE,
+            f"the camera would move by {travel:.3g} m per readout in front of points "
+            f"{depth:.3g} m away",
+        )
+    return None
+
+
+def _median_depth(points: Array, state: Array) -> float:
+    return float(np.median(points @ state[6:9] + state[11]))

@@ -1,0 +1,37 @@
+"""The arrays of one frame, checked."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_localizer.core.so3 import Array
+
+
+def checked(
+    points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None
+) -> tuple[Array, Array, Array | None]:
+    """Points (n,3), pixels (n,2) and scores (n,) as contiguous float64 arrays.
+
+    Raises:
+        ValueError: wrong shapes, or values that are not finite.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+    if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
+        points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
+    n = len(points)
+    if points.shape != (n, 3) or pixels.shape != (n, 2):
+        raise ValueError(
+            f"points must be (n,3) and pixels (n,2), got {points.shape} and {pixels.shape}"
+        )
+    checks = [("points", points), ("pixels", pixels)]
+    if scores is not None:
+        scores = np.ascontiguousarray(scores, dtype=np.float64)
+        if scores.shape != (n,):
+            raise ValueError(f"scores must be ({n},), got {scores.shape}")
+        checks.append(("scores", scores))
+    for name, array in checks:
+        if not np.all(np.isfinite(array)):
+            raise ValueError(f"{name} must be finite, found NaN or infinity")
+    return points, pixels, scores
