@@ -140,8 +140,8 @@ class Localizer:
         seen = np.isfinite(rays[:, 0])
         centre = np.median(points[seen], axis=0) if np.any(seen) else np.zeros(3)
         with np.errstate(over="ignore"):
-            near = np.abs(points - centre).max(axis=1, initial=0.0) < _FARTHEST_POINT
-        usable = np.flatnonzero(seen & near)
+            within = np.abs(points - centre).max(axis=1, initial=0.0) < _FARTHEST_POINT
+        usable = np.flatnonzero(seen & within)
         if len(usable) < self.config.min_inliers:
             return Failure(
                 Reason.TOO_FEW_POINTS,
@@ -150,9 +150,9 @@ class Localizer:
             )
         frame = self._frame(points, pixels, rays, usable, centre, scores, prior)
         if prior is not None and prior.motion is not None:
-            near = self._track(frame, prior, expected_share)
-            if near:
-                return replace(near, tracked=True)
+            tracked = self._track(frame, prior, expected_share)
+            if tracked:
+                return replace(tracked, tracked=True)
         start = self._global_shutter(frame, np.arange(len(usable)), self.config.max_iterations)
         if not start.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")

@@ -12,7 +12,8 @@ one moment, in SI units, and orders its covariance as REP-103 does. First-order 
     v(tau)        = exp(-tau (omega + d_omega)) (v + d_v)
                   = E v + E d_v + tau [E v]x J(-tau omega) d_omega,   E = exp(-tau omega)
 
-where J is the left Jacobian of SO(3): ``exp(a + d) = exp(J(a) d) exp(a)``.
+where J is the left Jacobian of SO(3): ``exp(a + d) = exp(J(a) d) exp(a)``; it is the right one of
+``-a``.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def pose_at(estimate: Estimate, tau: float) -> Pose:
     jacobian[_LINEAR, _V] = tau * map_from_middle
     jacobian[_ANGULAR, _PHI] = map_from_middle
     jacobian[_ANGULAR, _OMEGA] = (
-        tau * map_from_middle @ _left_jacobian(tau * estimate.angular_velocity)
+        tau * map_from_middle @ so3.right_jacobian(-tau * estimate.angular_velocity)
     )
     return Pose(
         position=-rotation.T @ translation,
@@ -54,7 +55,7 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     linear = estimate.linear_velocity_at(tau)
     jacobian = np.zeros((6, 12))
     jacobian[_LINEAR, _OMEGA] = (
-        tau * so3.hat(linear) @ _left_jacobian(-tau * estimate.angular_velocity)
+        tau * so3.hat(linear) @ so3.right_jacobian(tau * estimate.angular_velocity)
     )
     jacobian[_LINEAR, _V] = turn
     jacobian[_ANGULAR, _OMEGA] = np.eye(3)
@@ -64,14 +65,6 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
         angular=estimate.angular_velocity / readout_time,
         covariance=_propagate(jacobian / readout_time, estimate.covariance),
     )
-
-
-def _left_jacobian(vector: Array) -> Array:
-    """Left Jacobian (3,3) of the exponential at a rotation vector (3,)."""
-    _, second, third = so3.coefficients(float(vector @ vector))
-    cross = so3.hat(vector)
-    jacobian: Array = np.eye(3) + second * cross + third * cross @ cross
-    return jacobian
 
 
 def _propagate(jacobian: Array, covariance: Array) -> Array:
