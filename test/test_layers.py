@@ -17,7 +17,11 @@ MAY_IMPORT = {
     "solvers": {"core"},
     "localizer": {"core", "config", "solvers"},
     "io": {"core"},
-    "lab": {"core", "config", "solvers", "localizer", "tracking", "io", "settings", "arguments"},
+    "markers": {"core", "io"},
+    "lab": {
+        *("core", "config", "solvers", "localizer", "tracking"),
+        *("io", "markers", "settings", "arguments"),
+    },
 }
 ABOVE = {"ros", "cli"}
 

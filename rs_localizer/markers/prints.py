@@ -1,0 +1,260 @@
+"""What can be printed and seen: single markers, chessboards and ChArUco boards, in the map frame.
+
+The frame of a print has its origin in the middle (of the black square of a marker, of the whole
+pattern of squares of a board), x to the right, y up, and z out of the paper toward the viewer.
+Corners of a marker are in OpenCV's order: top left, top right, bottom right, bottom left of the
+upright print seen from its front. Corners of boards go row by row from the top left one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.markers.families import Family, family
+
+# Corners that were measured are no exact square. Their largest distance from one, in sides.
+_SQUARE_TOLERANCE = 0.05
+_ROTATION_TOLERANCE = 1e-3
+
+_UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Where a print is: map_from_print.
+
+    Raises:
+        ValueError: for a mirrored or no rotation, or values that are not finite.
+    """
+
+    position: Array = field(default_factory=lambda: np.zeros(3))  # (3,) m, of its middle
+    rotation: Array = field(default_factory=lambda: np.eye(3))  # (3,3)
+
+    def __post_init__(self) -> None:
+        position = _finite(self.position, (3,), "position")
+        rotation = _finite(self.rotation, (3, 3), "rotation")
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if error > _ROTATION_TOLERANCE:
+            raise ValueError(f"rotation is no rotation: its rows are {rotation.tolist()}")
+        if np.linalg.det(rotation) < 0.0:
+            raise ValueError(
+                "the rotation mirrors (its determinant is -1): x is to the right, y up and z out "
+                "of the print"
+            )
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "rotation", rotation)
+
+    def __call__(self, points: Array) -> Array:
+        """Points (n,3) of the print in the map frame."""
+        return np.asarray(points @ self.rotation.T + self.position)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """A single marker by its corners; :meth:`at` makes one of a pose and a size.
+
+    Raises:
+        ValueError: for an id that the family does not have, or corners that are no square.
+    """
+
+    family: Family
+    id: int
+    corners: Array  # (4,3) m, map frame
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.id < self.family.count:
+            raise ValueError(
+                f"{self.family.name} has the ids 0 to {self.family.count - 1}, found {self.id}"
+            )
+        object.__setattr__(self, "corners", _finite(self.corners, (4, 3), "corners"))
+        _square_pose(self.corners)
+
+    @classmethod
+    def at(cls, family_name: str, id_: int, size: float, pose: Pose | None = None) -> Self:
+        """A square marker: ``size`` (m) is the side of its black square, without white rim."""
+        _positive(size, "size")
+        return cls(family(family_name), id_, (pose or Pose())(size * _UNIT_SQUARE))
+
+    @property
+    def size(self) -> float:
+        """Mean side, m."""
+        return _side(self.corners)
+
+    @property
+    def pose(self) -> Pose:
+        """That of the square that fits the corners best."""
+        return _square_pose(self.corners)
+
+    @property
+    def points(self) -> Array:
+        """The corners (4,3)."""
+        return self.corners
+
+    @property
+    def name(self) -> str:
+        return f"marker {self.family.name} {self.id}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chessboard:
+    """A chessboard by its inner corners.
+
+    It looks the same turned by half (a square one by a quarter, too): which corner is the first
+    is only known when columns + rows is odd, from the color of the square beyond it.
+    """
+
+    columns: int  # inner corners along a row
+    rows: int
+    square: float  # m
+    pose: Pose = field(default_factory=Pose)
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 3:  # OpenCV's own limit
+            raise ValueError(f"a board needs 3x3 inner corners, got {self.columns}x{self.rows}")
+        _positive(self.square, "square")
+
+    @property
+    def points(self) -> Array:
+        """Inner corners (n,3), row by row."""
+        return self.pose(_grid(self.columns, self.rows, self.square))
+
+    @property
+    def name(self) -> str:
+        return f"chessboard {self.columns}x{self.rows}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Charuco:
+    """A chessboard with a marker in each of its white squares: seen in part, it is known, too.
+
+    Markers have ids from ``first_id`` on, row by row from the top left. The top left square is
+    black; with ``legacy`` (OpenCV before 4.6) it is white when the number of rows is even.
+    """
+
+    columns: int  # squares along a row
+    rows: int
+    square: float  # m
+    marker: float  # m, side of the black square of a marker
+    family: Family
+    first_id: int = 0
+    legacy: bool = False
+    pose: Pose = field(default_factory=Pose)
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 2 or self.columns * self.rows < 6:
+            raise ValueError(
+                f"a ChArUco board needs 2x3 squares or more, got {self.columns}x{self.rows}"
+            )
+        _positive(self.square, "square")
+        _positive(self.marker, "marker")
+        if self.marker >= self.square:
+            raise ValueError(
+                f"the markers of {self.marker} m do not fit into squares of {self.square} m"
+            )
+        last = self.first_id + len(self.cells) - 1
+        if not 0 <= self.first_id <= last < self.family.count:
+            raise ValueError(
+                f"the board needs the ids {self.first_id} to {last}; {self.family.name} has 0 to "
+                f"{self.family.count - 1}"
+            )
+
+    @property
+    def cells(self) -> list[tuple[int, int]]:
+        """Column and row of each white square, in the order of the markers."""
+        white = 0 if self.legacy and self.rows % 2 == 0 else 1
+        cells = ((column, row) for row in range(self.rows) for column in range(self.columns))
+        return [(column, row) for column, row in cells if (column + row) % 2 == white]
+
+    @property
+    def points(self) -> Array:
+        """Inner corners (n,3) of the squares, row by row: (columns - 1) x (rows - 1)."""
+        return self.pose(_grid(self.columns - 1, self.rows - 1, self.square))
+
+    @property
+    def markers(self) -> list[Marker]:
+        """The markers in the white squares."""
+        middle = 0.5 * np.array([self.columns - 1, self.rows - 1])
+        made = []
+        for index, cell in enumerate(self.cells):
+            x, y = (np.array(cell) - middle) * self.square
+            corners = self.pose(self.marker * _UNIT_SQUARE + np.array([x, -y, 0.0]))
+            made.append(Marker(self.family, self.first_id + index, corners))
+        return made
+
+    @property
+    def name(self) -> str:
+        return f"charuco {self.columns}x{self.rows} of {self.family.name}"
+
+
+Board = Chessboard | Charuco
+
+
+def rotation_of_quaternion(quaternion: ArrayLike) -> Array:
+    """Rotation matrix (3,3) of ``x y z w``, which need not be of unit length.
+
+    Raises:
+        ValueError: for anything but four finite values that are not all zero.
+    """
+    q = _finite(quaternion, (4,), "quaternion (x, y, z, w)")
+    length = float(np.linalg.norm(q))
+    if not 0.5 < length < 2.0:
+        raise ValueError(f"the quaternion must have the length 1, found {length:g}")
+    x, y, z, w = q / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _grid(columns: int, rows: int, spacing: float) -> Array:
+    y, x = np.mgrid[:rows, :columns].astype(np.float64)
+    grid = np.stack([x - 0.5 * (columns - 1), 0.5 * (rows - 1) - y, np.zeros_like(x)], axis=-1)
+    return np.asarray(grid.reshape(-1, 3) * spacing)
+
+
+def _side(corners: Array) -> float:
+    return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+
+
+def _square_pose(corners: Array) -> Pose:
+    """Pose of the best square; ValueError when it fits badly."""
+    side, middle = _side(corners), corners.mean(axis=0)
+    if side == 0.0:
+        raise ValueError("all corners are the same point")
+    # Least squares (Kabsch, 1976): the square that is turned into the corners.
+    u, _, vt = np.linalg.svd((corners - middle).T @ _UNIT_SQUARE)
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ turn @ vt
+    misfit = np.abs(corners - middle - side * _UNIT_SQUARE @ rotation.T).max() / side
+    if misfit > _SQUARE_TOLERANCE:
+        raise ValueError(
+            "the corners are no square in the order top left, top right, bottom right, bottom "
+            f"left: they are {100 * misfit:.0f} % of a side away from one"
+        )
+    return Pose(middle, rotation)
+
+
+def _finite(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    try:
+        array = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, found {values!r}") from None
+    if array.shape != shape:
+        wanted = " x ".join(map(str, shape))
+        raise ValueError(f"{name} must have {wanted} values, found the shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, found {array.tolist()}")
+    return array
+
+
+def _positive(value: float, name: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise ValueError(f"{name} must be a length in metres above 0, found {value!r}")

@@ -1,0 +1,205 @@
+"""Map files: what is written is read; every fault is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.markers.families import FAMILIES, family
+from rs_localizer.markers.maps import (
+    MarkerMap,
+    MarkerMapError,
+    read_marker_map,
+    wall,
+    write_marker_map,
+)
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
+
+TURN = Rotation.from_euler("xyz", [20.0, -35.0, 110.0], degrees=True)
+IDENTITY = {"position": [0, 0, 0], "quaternion": [0, 0, 0, 1]}
+MARKER = {"family": "4x4_50", "id": 3, "size": 0.2, **IDENTITY}
+CHESSBOARD = {"type": "chessboard", "columns": 6, "rows": 4, "square": 0.03, **IDENTITY}
+GRID = {"type": "charuco", "columns": 3, "rows": 4, "square": 0.04, "marker": 0.03}
+CHARUCO = {**GRID, "family": "5x5_100", **IDENTITY}
+
+
+def read(tmp_path: Path, tree: Any) -> MarkerMap:
+    path = tmp_path / "map.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return read_marker_map(path)
+
+
+def test_corners_are_those_of_the_print_seen_from_its_front(tmp_path: Path) -> None:
+    tree = {"map_frame": "hall", "markers": [MARKER]}
+    found = read(tmp_path, tree)
+    # From the top left one clockwise; z out of the paper, so that y is up.
+    expected = [[-0.1, 0.1, 0], [0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0]]
+    np.testing.assert_allclose(found.points, expected)
+    assert found.map_frame == "hall"
+
+
+def test_pose_moves_the_print(tmp_path: Path) -> None:
+    place = {"position": [1, 2, 3], "quaternion": TURN.as_quat().tolist()}
+    by_matrix = {"position": [1, 2, 3], "rotation": TURN.as_matrix().tolist()}
+    still = read(tmp_path, {"map_frame": "map", "markers": [MARKER], "boards": [CHESSBOARD]})
+    for moved in (place, by_matrix):
+        entry = {key: MARKER[key] for key in ("family", "id", "size")} | moved
+        board = {k: CHESSBOARD[k] for k in ("type", "columns", "rows", "square")} | moved
+        found = read(tmp_path, {"map_frame": "map", "markers": [entry], "boards": [board]})
+        expected = TURN.apply(still.points) + np.array([1, 2, 3])
+        np.testing.assert_allclose(found.points, expected, atol=1e-12)
+
+
+def test_boards_go_row_by_row_from_the_top_left() -> None:
+    points = Chessboard(6, 4, 0.03).points
+    np.testing.assert_allclose(points[0], [-0.075, 0.045, 0], atol=1e-12)
+    np.testing.assert_allclose(points[5], [0.075, 0.045, 0], atol=1e-12)
+    np.testing.assert_allclose(points[-1], [0.075, -0.045, 0], atol=1e-12)
+    charuco = Charuco(3, 4, 0.04, 0.03, family("5x5_100"), first_id=7)
+    np.testing.assert_allclose(charuco.points[0], [-0.02, 0.04, 0], atol=1e-12)
+    assert [marker.id for marker in charuco.markers] == list(range(7, 13))
+    # The top left square is black: the first marker is in the middle of the first row.
+    np.testing.assert_allclose(charuco.markers[0].points.mean(axis=0), [0, 0.06, 0], atol=1e-12)
+    legacy = Charuco(3, 4, 0.04, 0.03, family("5x5_100"), legacy=True)
+    np.testing.assert_allclose(legacy.markers[0].points.mean(axis=0), [-0.04, 0.06, 0], atol=1e-12)
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    pose = Pose(np.array([0.3, -2.0, 1.0]), TURN.as_matrix())
+    measured = Marker.at("aruco_original", 1000, 0.1, pose).corners + 1e-3 * np.eye(4, 3)
+    written = MarkerMap(
+        markers=(
+            *wall("4x4_50", 4, 3, 0.16, 0.04, first_id=5, pose=pose),
+            Marker(family("aruco_original"), 1000, measured),
+        ),
+        boards=(
+            Chessboard(6, 4, 0.03, pose),
+            Charuco(5, 7, 0.04, 0.03, family("36h11"), 10, True, pose),
+        ),
+        map_frame="hall",
+    )
+    write_marker_map(tmp_path / "map.yaml", written)
+    read_back = read_marker_map(tmp_path / "map.yaml")
+    np.testing.assert_allclose(read_back.points, written.points, atol=1e-9)
+    assert read_back.map_frame == "hall"
+    names = [(marker.name, owner) for marker, owner in read_back.all_markers()]
+    assert names == [(marker.name, owner) for marker, owner in written.all_markers()]
+    # Poses are easier to read than corners, where they say the same.
+    entries = yaml.safe_load((tmp_path / "map.yaml").read_text())["markers"]
+    assert "size" in entries[0]
+    assert "corners" in entries[-1]
+
+
+def test_wall_is_a_grid_around_its_middle() -> None:
+    pose = Pose(np.array([0.0, 5.0, 1.0]), TURN.as_matrix())
+    markers = wall("apriltag_36h11", 3, 2, 0.1, 0.05, pose=pose)
+    assert [marker.id for marker in markers] == list(range(6))
+    centres = TURN.inv().apply([m.points.mean(axis=0) - pose.position for m in markers])
+    expected = [[x, y, 0] for y in (0.075, -0.075) for x in (-0.15, 0, 0.15)]
+    np.testing.assert_allclose(centres, expected, atol=1e-12)
+    assert markers[4].size == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    "name", ["4x4_50", "DICT_4X4_50", "tag36h11", "36h11", "DICT_APRILTAG_16h5", "aruco_6x6_250"]
+)
+def test_families_by_the_names_that_users_write(name: str) -> None:
+    assert family(name).name in FAMILIES
+
+
+PLAIN = {"family": "4x4_50", "id": 1, "size": 1, "position": [0, 0, 0]}
+CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("entry", "text"),
+    [
+        (MARKER | {"family": "4x4_51"}, "unknown family '4x4_51'; did you mean 4x4_50?"),
+        (MARKER | {"id": 50}, r"marker 1 \(4x4_50 50\): 4x4_50 has the ids 0 to 49, found 50"),
+        (MARKER | {"size": 0}, "size must be a length in metres above 0, found 0"),
+        (MARKER | {"size": "big"}, "size cannot be 'big'"),
+        (MARKER | {"position": [0, 0]}, "position must have 3 values"),
+        (MARKER | {"position": [0, 0, float("nan")]}, "position must be finite"),
+        (MARKER | {"quaternion": [0, 0, 0, 0]}, "quaternion must have the length 1, found 0"),
+        (MARKER | {"rotation": np.eye(3).tolist()}, "both a rotation and a quaternion"),
+        (MARKER | {"colour": "red"}, "unknown colour"),
+        ({"family": "4x4_50"}, "marker 1 has no id; it has nothing else"),
+        ({"family": "4x4_50", "id": 1, "size": 1}, "has no position"),
+        ("4x4_50", "marker 1 must be a mapping, found '4x4_50'"),
+        (
+            PLAIN | {"rotation": np.diag([-1.0, 1.0, 1.0]).tolist()},
+            "the rotation mirrors",
+        ),
+        ({"family": "4x4_50", "id": 1, "corners": CORNERS[:3]}, "corners must have 4 x 3 values"),
+        (
+            {"family": "4x4_50", "id": 1, "corners": [CORNERS[k] for k in (0, 2, 1, 3)]},
+            "the corners are no square in the order top left, top right",
+        ),
+        ({"family": "4x4_50", "id": 1, "corners": CORNERS, "size": 0.5}, "1 m apart, but size is"),
+    ],
+)
+def test_faults_of_markers(tmp_path: Path, entry: Any, text: str) -> None:
+    with pytest.raises(MarkerMapError, match=text) as error:
+        read(tmp_path, {"map_frame": "map", "markers": [entry]})
+    assert str(tmp_path / "map.yaml") in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("entry", "text"),
+    [
+        (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\): type must be chessboard or"),
+        (CHESSBOARD | {"columns": 2}, "needs 3x3 inner corners, got 2x4"),
+        (CHESSBOARD | {"columns": 2.5}, "columns cannot be 2.5"),
+        (CHARUCO | {"marker": 0.05}, "markers of 0.05 m do not fit into squares of 0.04 m"),
+        (CHARUCO | {"first_id": 95}, "needs the ids 95 to 100; 5x5_100 has 0 to 99"),
+        (CHARUCO | {"family": "5x6"}, "unknown family '5x6'"),
+    ],
+)
+def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
+    with pytest.raises(MarkerMapError, match=text):
+        read(tmp_path, {"map_frame": "map", "boards": [entry]})
+
+
+@pytest.mark.parametrize(
+    ("tree", "text"),
+    [
+        ({"map_frame": "map", "markers": []}, "neither markers nor boards"),
+        ({"markers": [MARKER]}, "the map has no map_frame"),
+        ({"map_frame": "", "markers": [MARKER]}, "map_frame is empty"),
+        ({"map_frame": "map", "markers": [MARKER, MARKER]}, "marker 4x4_50 3 is there twice"),
+        # The small dictionaries are the beginning of the large ones.
+        (
+            {"map_frame": "map", "markers": [MARKER, MARKER | {"family": "4x4_1000"}]},
+            "there twice: as marker 4x4_50 3 and as marker 4x4_1000 3",
+        ),
+        (
+            {
+                "map_frame": "map",
+                "markers": [MARKER | {"family": "5x5_50"}],
+                "boards": [CHARUCO],
+            },
+            "there twice: as marker 5x5_50 3 and as charuco 3x4 of 5x5_100",
+        ),
+        (
+            {"map_frame": "map", "boards": [CHESSBOARD, CHESSBOARD]},
+            "2 chessboards, which cannot be told apart",
+        ),
+        ([1, 2], "the map must be a mapping"),
+    ],
+)
+def test_faults_of_maps(tmp_path: Path, tree: Any, text: str) -> None:
+    with pytest.raises(MarkerMapError, match=text):
+        read(tmp_path, tree)
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(MarkerMapError, match="cannot be read: No such file"):
+        read_marker_map(tmp_path / "missing.yaml")
+    (tmp_path / "map.yaml").write_text("a: [1")
+    with pytest.raises(MarkerMapError, match="is no YAML file"):
+        read_marker_map(tmp_path / "map.yaml")
