@@ -118,7 +118,14 @@ class FrameLocalizer:
         Raises:
             MessageError: for one that cannot be used, saying what was found; the previous stays.
         """
-        calibration = read_camera_info(message)
+        self.calibrate(read_camera_info(message))
+
+    def calibrate(self, calibration: Calibration) -> None:
+        """Use this calibration from the next frame on.
+
+        Raises:
+            MessageError: for one that no camera can have; the previous stays.
+        """
         if calibration != self._calibration:  # drivers repeat it with every image
             self._camera, self._localizer, self._tracker = _build(calibration, self._config)
             self._calibration = calibration

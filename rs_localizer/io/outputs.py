@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -61,49 +63,95 @@ class Frame:
         return True
 
 
-def messages(frame: Frame, make: Make) -> dict[str, Any]:
+def messages(frame: Frame, make: Make, wanted: Collection[str] = TYPES) -> dict[str, Any]:
     """The messages of a frame by output topic (see :data:`TYPES`), the same for node and replay.
 
     Without a twist there is no odometry either: zeros would be a claim.
+
+    Args:
+        frame: what to say.
+        make: builds the messages.
+        wanted: topics; the messages of others are not built.
     """
-    in_map = make_header(make, frame.stamp_ns, frame.map_frame)
-    pose = _pose(make, frame.pose)
-    pose_with_covariance = make(
-        "geometry_msgs/msg/PoseWithCovariance",
-        pose=pose,
-        covariance=frame.pose.covariance.ravel(),
-    )
-    result = {
-        "pose": make(TYPES["pose"], header=in_map, pose=pose),
-        "pose_with_covariance": make(
-            TYPES["pose_with_covariance"], header=in_map, pose=pose_with_covariance
-        ),
-    }
-    if frame.twist is not None:
-        in_body = make_header(make, frame.stamp_ns, frame.body_frame)
-        twist = make(
+    parts = _Parts(frame, make)
+    builders = _WITHOUT_TWIST if frame.twist is None else _BUILDERS
+    return {name: build(parts) for name, build in builders.items() if name in wanted}
+
+
+class _Parts:
+    """What the messages of a frame share, built when the first of them needs it."""
+
+    def __init__(self, frame: Frame, make: Make) -> None:
+        self.frame = frame
+        self.make = make
+
+    @cached_property
+    def in_map(self) -> Any:
+        return make_header(self.make, self.frame.stamp_ns, self.frame.map_frame)
+
+    @cached_property
+    def in_body(self) -> Any:
+        return make_header(self.make, self.frame.stamp_ns, self.frame.body_frame)
+
+    @cached_property
+    def pose(self) -> Any:
+        return _pose(self.make, self.frame.pose)
+
+    @cached_property
+    def pose_with_covariance(self) -> Any:
+        return self.make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=self.pose,
+            covariance=self.frame.pose.covariance.ravel(),
+        )
+
+    @cached_property
+    def twist(self) -> Any:
+        return self.make(
             "geometry_msgs/msg/Twist",
-            linear=_vector(make, frame.twist.linear),
-            angular=_vector(make, frame.twist.angular),
+            linear=_vector(self.make, self._twist.linear),
+            angular=_vector(self.make, self._twist.angular),
         )
-        twist_with_covariance = make(
+
+    @cached_property
+    def twist_with_covariance(self) -> Any:
+        return self.make(
             "geometry_msgs/msg/TwistWithCovariance",
-            twist=twist,
-            covariance=frame.twist.covariance.ravel(),
+            twist=self.twist,
+            covariance=self._twist.covariance.ravel(),
         )
-        result["twist"] = make(TYPES["twist"], header=in_body, twist=twist)
-        result["twist_with_covariance"] = make(
-            TYPES["twist_with_covariance"], header=in_body, twist=twist_with_covariance
-        )
-        result["odometry"] = make(
-            TYPES["odometry"],
-            header=in_map,
-            child_frame_id=frame.body_frame,
-            pose=pose_with_covariance,
-            twist=twist_with_covariance,
-        )
-    result["inliers"] = make_cloud(make, frame.input_stamp_ns, frame.map_frame, frame.inliers)
-    return result
+
+    @property
+    def _twist(self) -> Twist:
+        assert self.frame.twist is not None
+        return self.frame.twist
+
+
+_BUILDERS: dict[str, Callable[[_Parts], Any]] = {
+    "pose": lambda of: of.make(TYPES["pose"], header=of.in_map, pose=of.pose),
+    "pose_with_covariance": lambda of: of.make(
+        TYPES["pose_with_covariance"], header=of.in_map, pose=of.pose_with_covariance
+    ),
+    "twist": lambda of: of.make(TYPES["twist"], header=of.in_body, twist=of.twist),
+    "twist_with_covariance": lambda of: of.make(
+        TYPES["twist_with_covariance"], header=of.in_body, twist=of.twist_with_covariance
+    ),
+    "odometry": lambda of: of.make(
+        TYPES["odometry"],
+        header=of.in_map,
+        child_frame_id=of.frame.body_frame,
+        pose=of.pose_with_covariance,
+        twist=of.twist_with_covariance,
+    ),
+    "inliers": lambda of: make_cloud(
+        of.make, of.frame.input_stamp_ns, of.frame.map_frame, of.frame.inliers
+    ),
+}
+_WITHOUT_TWIST = {
+    name: build
+    for name, build in _BUILDERS.items()
+    if name not in ("twist", "twist_with_covariance", "odometry")
+}
 
 
 def _pose(make: Make, pose: Pose) -> Any:

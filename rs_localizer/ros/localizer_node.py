@@ -1,47 +1,45 @@
-"""The node ``rs_localizer``: correspondences and camera_info in; pose, twist and inliers out."""
+"""The node ``rs_localizer``: correspondences and camera_info in; pose, twist and inliers out.
+
+The executor's thread runs this file: it takes messages, checks them where that is cheap, and hands
+them to the worker, whose thread localizes and publishes.
+"""
 
 from __future__ import annotations
 
+import functools
 import time
 import traceback
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
-import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
-from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_srvs.srv import Trigger
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.frames import FrameLocalizer
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.outputs import TYPES, messages
 from rs_localizer.ros import parameters
-from rs_localizer.ros.conversion import make_message, message_class
+from rs_localizer.ros.inputs import Inputs, Topic
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
+from rs_localizer.ros.outputs import Outputs
 from rs_localizer.ros.refusals import Refusals
+from rs_localizer.ros.statistics import Statistics
+from rs_localizer.ros.worker import Localize, Worker
 from rs_localizer.settings import NODE_NAME
-from rs_localizer.stopping import StopRequest
 
-# Sensor data: the newest counts, and a late one is worth less than none.
-_INPUT_QOS = {"depth": 1, "reliability": ReliabilityPolicy.BEST_EFFORT}
-_OUTPUT_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
-# A waiting executor does not see signals: it looks up this often, in s.
-_SIGNAL_LATENCY = 0.1
+# A change of settings that takes longer (s) has compiled kernels, and says so.
+_LONG_CHANGE = 0.5
 
 
 class LocalizerNode(RobustLifecycleNode):
     """A managed node; only while active it takes and publishes messages.
 
     Args:
-        compiling: entered while kernels are compiled.
+        compiling: entered while configuring compiles kernels.
 
     Raises:
         ValueError: when it is started with parameters that are refused, saying what was found.
@@ -59,10 +57,12 @@ class LocalizerNode(RobustLifecycleNode):
         parameters.on_change(self, check=FrameLocalizer, apply=self._take_config)
         self.autostart = config.autostart
         self.refusals = Refusals(self._warn)
-        self._frames: FrameLocalizer | None = None
-        self._inputs: list[Subscription] = []
-        self._outputs: dict[str, Publisher] = {}
+        # From configuring to cleaning up.
+        self._worker: Worker | None = None
+        self._outputs: Outputs | None = None
         self._reset_service: Service | None = None
+        # From activating to deactivating.
+        self._inputs: Inputs | None = None
 
     # -- life cycle -------------------------------------------------------------------------
 
@@ -70,45 +70,31 @@ class LocalizerNode(RobustLifecycleNode):
         try:
             frames = FrameLocalizer(parameters.read(self), self.refusals.notice)
             self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
-            self._warm_up(frames)
+            with self._compiling():
+                seconds = _warm_up(frames)
+            self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
-        self._frames = frames
-        self._outputs = {
-            name: self.create_lifecycle_publisher(
-                message_class(type_name),
-                f"~/{name}",
-                QoSProfile(**_OUTPUT_QOS),  # a new one each: overrides are written into it
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
-            for name, type_name in TYPES.items()
-        }
+        self._outputs = Outputs(self)
+        self._worker = Worker(
+            frames,
+            self._outputs.publish,
+            Statistics(self.refusals),
+            functools.partial(self.refusals.add, "internal_error"),
+        )
         self._reset_service = self.create_service(Trigger, "~/reset", self._reset)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        # camera_info first: the executor goes through waiting messages in this order.
-        self._inputs = [
-            self.create_subscription(
-                message_type,
-                topic,
-                callback,
-                QoSProfile(**_INPUT_QOS),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
-            for message_type, topic, callback in (
-                (CameraInfo, "camera_info", self._take_camera_info),
-                (PointCloud2, "correspondences", self._take_correspondences),
-            )
-        ]
-        if self._frames.config.readout_time == 0.0:
+        self._inputs = Inputs(self, self._topics())
+        config = parameters.read(self)
+        if config.readout_time == 0.0:
             self._warn(
                 "readout_time is 0 (unknown): no twist is published and frames are not tracked"
             )
         self.get_logger().info(
-            f"active with solver {self._frames.config.solver}, listening to "
-            + " and ".join(subscription.topic_name for subscription in self._inputs)
+            f"active with solver {config.solver}, listening to {' and '.join(self._inputs.topics)}"
         )
         return super().on_activate(state)
 
@@ -125,92 +111,87 @@ class LocalizerNode(RobustLifecycleNode):
         self._close_outputs()
         return super().on_shutdown(state)
 
+    def destroy_node(self) -> None:
+        self._close_inputs()
+        self._close_outputs()
+        super().destroy_node()
+
     def _close_inputs(self) -> None:
-        for subscription in self._inputs:
-            self.destroy_subscription(subscription)
-        self._inputs = []
+        if self._inputs is not None:
+            self._inputs.close()
+            self._inputs = None
+        if self._worker is not None:
+            self._worker.pause()
 
     def _close_outputs(self) -> None:
-        for publisher in self._outputs.values():
-            self.destroy_lifecycle_publisher(publisher)
-        self._outputs = {}
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+        if self._outputs is not None:
+            self._outputs.close()
+            self._outputs = None
         if self._reset_service is not None:
             self.destroy_service(self._reset_service)
             self._reset_service = None
-        self._frames = None
+
+    # -- inputs -----------------------------------------------------------------------------
+
+    def _topics(self) -> dict[str, Topic]:
+        """The inputs; what changes the state comes before the frames."""
+        return {
+            "camera_info": Topic(CameraInfo, self._take_camera_info),
+            "correspondences": self._frames(
+                "correspondences", lambda frames, message: frames.localize(message)
+            ),
+        }
+
+    def _frames(self, topic: str, localize: Localize) -> Topic:
+        """A topic whose messages are frames, which the worker localizes in this way."""
+
+        def take(message: PointCloud2) -> None:
+            self._worker.localize(topic, message, localize)
+
+        return Topic(PointCloud2, take)
 
     # -- callbacks --------------------------------------------------------------------------
 
-    def _take_config(self, config: NodeConfig) -> None:
-        if self._frames is not None:
-            self._frames.config = config
-            self._warm_up(self._frames)
-
     def _take_camera_info(self, message: CameraInfo) -> None:
+        # Read here, not in the worker, where a bad one could take the place of a good one.
         try:
-            self._frames.take_camera_info(message)
+            calibration = read_camera_info(message)
         except MessageError as error:
             self.refusals.add("bad_camera_info", str(error))
-
-    def _take_correspondences(self, message: PointCloud2) -> None:
-        result = self._frames.localize(message)
-        if not result:
-            self.refusals.add(result.reason, result.detail)
             return
-        for name, output in messages(result, make_message).items():
-            self._outputs[name].publish(output)
+        self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
+
+    def _take_config(self, config: NodeConfig) -> None:
+        if self._worker is not None:
+            self._worker.update("settings", lambda frames: self._change(frames, config))
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._frames.reset()
+        self._worker.update("reset", FrameLocalizer.reset)
         response.success, response.message = True, "the previous pose and twist are forgotten"
         return response
 
-    def _warm_up(self, frames: FrameLocalizer) -> None:
-        started = time.monotonic()
-        with self._compiling():
-            frames.warm_up()
-        seconds = time.monotonic() - started
-        self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
+    # -- in the worker's thread, between two frames ------------------------------------------
+
+    def _calibrate(self, frames: FrameLocalizer, calibration: Any) -> None:
+        try:
+            frames.calibrate(calibration)
+        except MessageError as error:
+            self.refusals.add("bad_camera_info", str(error))
+
+    def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
+        frames.config = config
+        if (seconds := _warm_up(frames)) > _LONG_CHANGE:
+            self.get_logger().info(f"kernels for the new settings are ready after {seconds:.1f} s")
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
 
 
-def run(stop: StopRequest, args: list[str] | None = None) -> int:
-    """Run the node until ``stop`` is requested; the exit code."""
-    try:
-        # rclpy's own handlers end the context from a thread while the node still uses it.
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = LocalizerNode(compiling=stop.at_once)
-    except (ValueError, RuntimeError) as error:
-        rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
-        rclpy.try_shutdown()
-        return 1
-    try:
-        return _run(node, stop)
-    except ExternalShutdownException:
-        return 0
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-
-
-def _run(node: LocalizerNode, stop: StopRequest) -> int:
-    if node.autostart:
-        for transition in (node.trigger_configure, node.trigger_activate):
-            if transition() != TransitionCallbackReturn.SUCCESS:
-                return 1
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    while not stop.requested:
-        try:
-            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
-        except ExternalShutdownException:
-            raise
-        except Exception as error:  # one callback's: the others go on
-            where = traceback.extract_tb(error.__traceback__)[-1]
-            node.refusals.add(
-                "internal_error", f"{error!r} in {where.name}, {where.filename}:{where.lineno}"
-            )
-    executor.remove_node(node)
-    return 0
+def _warm_up(frames: FrameLocalizer) -> float:
+    """Compile all kernels that the settings need; how many seconds it took."""
+    started = time.monotonic()
+    frames.warm_up()
+    return time.monotonic() - started

@@ -12,7 +12,7 @@ def main(args: list[str] | None = None) -> int:
     with StopRequest() as stop:
         try:
             with stop.at_once():
-                from rs_localizer.ros.localizer_node import run
+                from rs_localizer.ros.run import run
         except ImportError as error:
             sys.stderr.write(
                 f"localizer: {' '.join(str(error).split())}: it needs ROS 2 and the Python "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -26,7 +27,8 @@ class _Logged:
 class Refusals:
     """Counts refusals and passes on one text per kind and period.
 
-    Of one kind are those of the same reason whose details differ in their numbers only.
+    Of one kind are those of the same reason whose details differ in their numbers only. All methods
+    may be called from any thread.
 
     Args:
         log: takes a line of text.
@@ -39,15 +41,24 @@ class Refusals:
         self.counts: Counter[str] = Counter()
         self._log = log
         self._clock = clock
+        self._lock = threading.Lock()
         self._logged: dict[str, dict[str, _Logged]] = {}  # by reason and kind
 
     def add(self, reason: str, detail: str) -> None:
         """Count one more; ``detail`` is one sentence."""
-        self.counts[reason] += 1
+        with self._lock:
+            self.counts[reason] += 1
         self.notice(reason, detail)
 
     def notice(self, reason: str, detail: str) -> None:
         """Log likewise what is no refusal."""
+        with self._lock:
+            line = self._line(reason, detail)
+        if line is not None:
+            self._log(line)
+
+    def _line(self, reason: str, detail: str) -> str | None:
+        """What to log of it; None if it has been said."""
         now = self._clock()
         kinds = self._logged.setdefault(reason, {})
         kind = re.sub(r"\d+", "0", detail)
@@ -56,10 +67,10 @@ class Refusals:
         last = kinds.get(kind)
         if last is not None and now - last.when < _PERIOD:
             last.silent += 1
-            return
+            return None
         more = "" if last is None else _more(last.silent)
         kinds[kind] = _Logged(now)
-        self._log(f"{reason}: {detail}{more}")
+        return f"{reason}: {detail}{more}"
 
 
 def _room_for(kind: str, kinds: dict[str, _Logged], now: float) -> str:
