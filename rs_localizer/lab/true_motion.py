@@ -57,6 +57,16 @@ class TrueMotion(Protocol):
         """The camera at ``stamp_ns`` plus ``offsets`` (n,) seconds."""
 
 
+def sampled_way(motion: TrueMotion, spacing: float = 0.1) -> TrueState:
+    """The camera at instants ``spacing`` seconds apart, all along a motion."""
+    states = [
+        motion.state(first, np.arange(0.0, max((last - first) * 1e-9, spacing), spacing))
+        for first, last in motion.intervals_ns
+    ]
+    columns = ("rotations", "positions", "angular", "linear")
+    return TrueState(*(np.concatenate([getattr(s, name) for s in states]) for name in columns))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ConstantVelocity:
     """A camera that turns at a constant body rate while its centre moves on a straight line.
