@@ -15,6 +15,7 @@ class Family:
     kind: str  # families of one kind share their patterns: 4x4_50 is the start of 4x4_100
     bits: int  # cells along a side inside the black border of one cell
     count: int  # ids are 0 to count - 1
+    first: int  # pattern of id 0, upright: row by row from the top left, 1 is white
 
     @property
     def cells(self) -> int:
@@ -28,21 +29,22 @@ class Family:
 
 
 def _table() -> dict[str, Family]:
-    sizes = dict.fromkeys((4, 5, 6, 7), (50, 100, 250, 1000))
+    nested = ((4, 0xB532), (5, 0x145B2BC), (6, 0x1E3DD82A6), (7, 0x1BAB8D94B9415))
     rows = [
-        Family(f"{bits}x{bits}_{count}", f"{bits}x{bits}", bits, count)
-        for bits, counts in sizes.items()
-        for count in counts
+        Family(f"{bits}x{bits}_{count}", f"{bits}x{bits}", bits, count, first)
+        for bits, first in nested
+        for count in (50, 100, 250, 1000)
     ]
-    for name, bits, count in (
-        ("aruco_original", 5, 1024),
-        ("aruco_mip_36h12", 6, 250),  # OpenCV 4.8 and later
-        ("apriltag_16h5", 4, 30),
-        ("apriltag_25h9", 5, 35),
-        ("apriltag_36h10", 6, 2320),
-        ("apriltag_36h11", 6, 587),
+    for name, bits, count, first in (
+        ("aruco_original", 5, 1024, 0x1084210),
+        ("aruco_mip_36h12", 6, 250, 0xD2B63A09D),  # OpenCV 4.8 and later
+        # Upright as AprilRobotics prints them: these are the codes of their library.
+        ("apriltag_16h5", 4, 30, 0x231B),
+        ("apriltag_25h9", 5, 35, 0x155CBF1),
+        ("apriltag_36h10", 6, 2320, 0x1CA92A687),
+        ("apriltag_36h11", 6, 587, 0xD5D628584),
     ):
-        rows.append(Family(name, name, bits, count))
+        rows.append(Family(name, name, bits, count, first))
     return {family.name: family for family in rows}
 
 

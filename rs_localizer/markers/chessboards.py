@@ -1,0 +1,133 @@
+"""Inner corners of chessboards and ChArUco boards in images."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.markers.dictionaries import Gray
+from rs_localizer.markers.prints import Charuco, Chessboard
+
+# Half the window of the sub-pixel search, as a share of the smallest distance between corners:
+# the next corner must stay outside, and more of the edges inside means less noise.
+_WINDOW_SHARE = 0.45
+_WINDOW_RANGE = (2, 15)
+_SMOOTHING = 1.0  # px
+_REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+
+
+def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = None) -> Array | None:
+    """Pixels (n,2) of the inner corners of a chessboard in the order of ``board.points``.
+
+    The board is taken for one whose top left square is black. When it looks the same turned by
+    half (columns + rows is even; a square board also turned by a quarter), the order is the one
+    that is closest to the ``previous`` corners; without them, the one that reads as text does.
+
+    Returns:
+        None when the whole board is not seen.
+    """
+    found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows))
+    if not found:
+        return None
+    grid = np.asarray(corners, np.float64).reshape(board.rows, board.columns, 2)
+    gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
+    window = int(np.clip(_WINDOW_SHARE * min(gaps), *_WINDOW_RANGE))
+    refined = _refine(_smooth(image), grid, window)
+    return _ordered(refined.reshape(board.rows, board.columns, 2), image, previous)
+
+
+def find_charuco(
+    image: Gray, board: Charuco, ids: NDArray[np.int64], quads: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Which inner corners of a ChArUco board are seen, and where.
+
+    Args:
+        image: gray.
+        board: the board.
+        ids: (m,) of the board's markers that are seen.
+        quads: (m,4,2) their corners.
+
+    Returns:
+        rows (k,) of ``board.points`` and their pixels (k,2).
+    """
+    predicted: dict[int, list[Array]] = {}
+    limits: dict[int, float] = {}
+    for id_, quad in zip(ids.tolist(), quads, strict=True):
+        for corner, pixel, limit in _around(board, id_ - board.first_id, quad):
+            predicted.setdefault(corner, []).append(pixel)
+            limits[corner] = min(limit, limits.get(corner, np.inf))
+    rows, pixels = [], []
+    smooth = _smooth(image) if predicted else image
+    for corner in sorted(predicted):
+        start = np.mean(predicted[corner], axis=0)
+        window = int(np.clip(limits[corner], *_WINDOW_RANGE))
+        if not _inside(image, start, window):
+            continue
+        refined = _refine(smooth, start, window)[0]
+        if np.abs(refined - start).max() <= window:
+            rows.append(corner)
+            pixels.append(refined)
+    return np.array(rows, np.int64), np.array(pixels, np.float64).reshape(-1, 2)
+
+
+def _around(board: Charuco, index: int, quad: Array) -> list[tuple[int, Array, float]]:
+    """Inner corners at the square of a marker: row in the board, predicted pixel, window."""
+    column, row = board.cells[index]
+    # Corners of the square in units of the marker, which is the unit square here.
+    rim = 0.5 * (board.square / board.marker - 1.0)
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
+    square = np.array([[-rim, -rim], [1 + rim, -rim], [1 + rim, 1 + rim], [-rim, 1 + rim]])
+    to_image = cv2.getPerspectiveTransform(unit, quad.astype(np.float32))
+    seen = cv2.perspectiveTransform(square[None], to_image)[0]
+    side = float(np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).min())
+    # The window must not reach the marker's own corner, nor the next corner of the board.
+    limit = side * min(rim, _WINDOW_SHARE)
+    places = ((column - 1, row - 1), (column, row - 1), (column, row), (column - 1, row))
+    return [
+        (y * (board.columns - 1) + x, pixel, limit)
+        for (x, y), pixel in zip(places, seen, strict=True)
+        if 0 <= x < board.columns - 1 and 0 <= y < board.rows - 1
+    ]
+
+
+def _inside(image: Gray, pixel: Array, window: int) -> bool:
+    height, width = image.shape
+    margin = window + 1
+    return bool(margin <= pixel[0] < width - margin and margin <= pixel[1] < height - margin)
+
+
+def _smooth(image: Gray) -> Gray:
+    # The gradients of the raw image are those of its noise and of JPEG's blocks, too.
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTHING), np.uint8)
+
+
+def _refine(smooth: Gray, corners: Array, window: int) -> Array:
+    """Saddles near the corners, to a fraction of a pixel: (n,2)."""
+    start = np.ascontiguousarray(np.reshape(corners, (-1, 1, 2)), np.float32)
+    refined = cv2.cornerSubPix(smooth, start, (window, window), (-1, -1), _REFINE_CRITERIA)
+    return np.asarray(refined, np.float64).reshape(-1, 2)
+
+
+def _ordered(grid: Array, image: Gray, previous: Array | None) -> Array:
+    along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if along[0] * down[1] - along[1] * down[0] < 0.0:
+        grid = grid[:, ::-1]  # a mirrored order would show the board from behind
+    turns = range(4) if grid.shape[0] == grid.shape[1] else range(0, 4, 2)
+    candidates = [np.rot90(grid, turn) for turn in turns]
+    black = [candidate for candidate in candidates if _starts_black(candidate, image)]
+    if previous is not None:
+        reference = previous.reshape(grid.shape)
+        costs = [float(np.abs(candidate - reference).sum()) for candidate in black or candidates]
+    else:
+        costs = [float(candidate[0, 0].sum()) for candidate in black or candidates]
+    return (black or candidates)[int(np.argmin(costs))].reshape(-1, 2)
+
+
+def _starts_black(grid: Array, image: Gray) -> bool:
+    """Whether the first square between the corners, as the one diagonally before it, is black."""
+    first = grid[0:2, 0:2].mean(axis=(0, 1))
+    second = grid[0:2, 1:3].mean(axis=(0, 1))
+    (x, y), (u, v) = np.rint(first).astype(int), np.rint(second).astype(int)
+    return bool(image[y, x] < image[v, u])

@@ -1,0 +1,202 @@
+"""Images -> corners of the map's markers and boards: the correspondences of one frame.
+
+The node and the offline command run this one class, so the same images give the same corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.markers.chessboards import find_charuco, find_chessboard
+from rs_localizer.markers.dictionaries import DictionaryError, Gray, MarkerFinder
+from rs_localizer.markers.edges import refine
+from rs_localizer.markers.families import Family
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError
+from rs_localizer.markers.prints import Charuco, Chessboard
+
+IntArray = NDArray[np.int64]
+
+# After this long without a chessboard (ns) it may lie the other way round.
+_LONGEST_LOSS_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Markers of one kind in an image."""
+
+    family: Family
+    ids: IntArray  # (m,)
+    quads: Array  # (m,4,2) px
+    found: NDArray[np.bool_]  # (m,4) which corners are exact
+    known: NDArray[np.bool_]  # (m,) which are in the map, and only once in the image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """What one image shows of the map."""
+
+    ids: IntArray  # (n,) rows of MarkerMap.points
+    points: Array  # (n,3) m, map frame
+    pixels: Array  # (n,2) raw pixels, centre of the first one at 0, 0
+    scores: Array  # (n,) px: shortest side of the marker, or distance to the next corner
+    markers: tuple[Seen, ...]  # all that were seen, for pictures and messages
+    boards: tuple[tuple[str, Array], ...]  # names and pixels (k,2) of those that were seen
+    unknown: tuple[str, ...]  # markers that are not in the map
+    repeated: tuple[str, ...]  # markers that the image shows more than once: not used
+
+
+class MarkerDetector:
+    """Finds the markers and boards of a map.
+
+    Args:
+        marker_map: what to look for.
+        min_side: markers with a shorter side (px) are left out.
+
+    Raises:
+        MarkerMapError: for a map that this OpenCV cannot look for.
+    """
+
+    def __init__(self, marker_map: MarkerMap, min_side: float = 0.0) -> None:
+        self.map = marker_map
+        self._min_side = min_side
+        self._points = marker_map.points
+        self._finders = _finders(marker_map)
+        self._places: dict[tuple[str, int], int] = {}  # kind and id of a marker -> row
+        row = 0
+        for marker in marker_map.markers:
+            self._places[marker.family.kind, marker.id] = row
+            row += 4
+        self._boards: list[tuple[int, Chessboard | Charuco]] = []
+        self._on_boards: set[tuple[str, int]] = set()
+        for board in marker_map.boards:
+            self._boards.append((row, board))
+            row += len(board.points)
+            if isinstance(board, Charuco):
+                self._on_boards |= {(m.family.kind, m.id) for m in board.markers}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget how a chessboard lay in the last image."""
+        self._chessboard: Array | None = None
+        self._chessboard_ns = 0
+
+    def detect(self, image: Gray, stamp_ns: int = 0) -> Detections:
+        """All corners of the map that an image shows.
+
+        Args:
+            image: (h,w) uint8.
+            stamp_ns: for chessboards that look the same turned by half: they keep their order
+                from image to image, unless they were lost for a second or time went back.
+
+        Raises:
+            ValueError: for another kind of array.
+        """
+        if image.dtype != np.uint8 or image.ndim != 2 or 0 in image.shape:
+            raise ValueError(f"an image must be (h,w) uint8, got {image.dtype} {image.shape}")
+        image = np.ascontiguousarray(image)
+        seen = [self._seen(finder, image) for finder in self._finders]
+        parts = [part for item in seen for part in self._corners(item)]
+        boards = []
+        for row, board in self._boards:
+            rows, pixels = self._board(image, board, seen, stamp_ns)
+            if len(rows):
+                parts.append((row + rows, pixels, _spacings(pixels)))
+                boards.append((board.name, pixels))
+        rows = np.concatenate([np.empty(0, np.int64), *(part[0] for part in parts)])
+        return Detections(
+            ids=rows,
+            points=self._points[rows],
+            pixels=np.concatenate([np.empty((0, 2)), *(part[1] for part in parts)]),
+            scores=np.concatenate([np.empty(0), *(part[2] for part in parts)]),
+            markers=tuple(seen),
+            boards=tuple(boards),
+            unknown=tuple(
+                f"{item.family.name} {i}"
+                for item in seen
+                for i in np.unique(item.ids).tolist()
+                if not self._knows(item.family, i)
+            ),
+            repeated=tuple(
+                f"{item.family.name} {i}" for item in seen for i in _twice(item.ids).tolist()
+            ),
+        )
+
+    def _seen(self, finder: MarkerFinder, image: Gray) -> Seen:
+        family = finder.family
+        ids, quads = finder.find(image)
+        order = np.argsort(ids, kind="stable")  # OpenCV's threads may give any order
+        ids, quads = ids[order], np.ascontiguousarray(quads[order])
+        large = _sides(quads) >= self._min_side
+        ids, quads = ids[large], quads[large]
+        found = refine(image, quads, np.full(len(ids), family.cells))
+        known = np.array([self._knows(family, i) for i in ids.tolist()], bool)
+        return Seen(family, ids, quads, found, known & ~np.isin(ids, _twice(ids)))
+
+    def _knows(self, family: Family, id_: int) -> bool:
+        key = (family.kind, id_)
+        return key in self._places or key in self._on_boards
+
+    def _corners(self, seen: Seen) -> Iterable[tuple[IntArray, Array, Array]]:
+        """Rows, pixels and scores of the single markers."""
+        sides = _sides(seen.quads)
+        for m in np.flatnonzero(seen.known):
+            row = self._places.get((seen.family.kind, int(seen.ids[m])))
+            if row is not None:
+                used = np.flatnonzero(seen.found[m])
+                yield row + used, seen.quads[m, used], np.full(len(used), sides[m])
+
+    def _board(
+        self, image: Gray, board: Chessboard | Charuco, seen: list[Seen], stamp_ns: int
+    ) -> tuple[IntArray, Array]:
+        """Rows of the board's points, and their pixels."""
+        if isinstance(board, Charuco):
+            (item,) = (item for item in seen if item.family.kind == board.family.kind)
+            last = board.first_id + len(board.cells)
+            own = item.known & (item.ids >= board.first_id) & (item.ids < last)
+            own &= item.found.all(axis=1)
+            return find_charuco(image, board, item.ids[own], item.quads[own])
+        if not 0 <= stamp_ns - self._chessboard_ns <= _LONGEST_LOSS_NS:
+            self._chessboard = None
+        corners = find_chessboard(image, board, self._chessboard)
+        if corners is None:
+            return np.empty(0, np.int64), np.empty((0, 2))
+        self._chessboard, self._chessboard_ns = corners, stamp_ns
+        return np.arange(len(corners)), corners
+
+
+def _finders(marker_map: MarkerMap) -> list[MarkerFinder]:
+    """One per kind of family: the largest that the map names."""
+    families: dict[str, Family] = {}
+    for marker, _ in marker_map.all_markers():
+        kind = marker.family.kind
+        largest = families.setdefault(kind, marker.family)
+        if marker.family.count > largest.count:
+            families[kind] = marker.family
+    try:
+        return [MarkerFinder(family) for family in families.values()]
+    except DictionaryError as error:
+        raise MarkerMapError(str(error)) from error
+
+
+def _twice(ids: IntArray) -> IntArray:
+    """Those that occur more than once."""
+    values, counts = np.unique(ids, return_counts=True)
+    return values[counts > 1]
+
+
+def _sides(quads: Array) -> Array:
+    """Shortest side (m,) of quadrilaterals (m,4,2)."""
+    return np.asarray(np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).min(axis=1))
+
+
+def _spacings(pixels: Array) -> Array:
+    """Distance (n,) of each pixel (n,2) to the next one."""
+    apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    nearest = apart.min(axis=1)
+    return np.where(np.isfinite(nearest), nearest, 0.0)

@@ -1,0 +1,104 @@
+"""OpenCV's markers, the same from OpenCV 4.6 to 5: their patterns, and where an image shows them.
+
+OpenCV holds the AprilTag patterns upside down (4.x and 5.0; a later one will not, see
+https://github.com/opencv/opencv/pull/28823), so that it draws them turned by half and gives their
+corners from the bottom right one on. Here, upright is what the family's own authors print: the
+pattern of id 0 is known, and by it every dictionary is turned.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.markers.families import Family
+
+Gray = NDArray[np.uint8]
+
+_aruco: Any = getattr(cv2, "aruco", None)
+
+
+class DictionaryError(ValueError):
+    """This OpenCV cannot do it; the message says what is missing."""
+
+
+def pattern(family: Family, id_: int) -> NDArray[np.bool_]:
+    """Cells (n,n) of an upright marker with its black border; true is white."""
+    if not 0 <= id_ < family.count:
+        raise ValueError(f"{family.name} has the ids 0 to {family.count - 1}, found {id_}")
+    inside = np.rot90(_bits(family, id_), _turns(family))
+    return np.pad(inside, 1).astype(bool)
+
+
+class MarkerFinder:
+    """Finds the markers of one family.
+
+    Raises:
+        DictionaryError: when this OpenCV does not know the family.
+    """
+
+    def __init__(self, family: Family) -> None:
+        self.family = family
+        self._turns = _turns(family)
+        dictionary = _dictionary(family)
+        if hasattr(_aruco, "ArucoDetector"):
+            parameters = _configured(_aruco.DetectorParameters())
+            self._find = _aruco.ArucoDetector(dictionary, parameters).detectMarkers
+        else:
+            parameters = _configured(_aruco.DetectorParameters_create())
+            self._find = lambda image: _aruco.detectMarkers(
+                image, dictionary, parameters=parameters
+            )
+
+    def find(self, image: Gray) -> tuple[NDArray[np.int64], Array]:
+        """Ids (m,) and corners (m,4,2), clockwise from the upright print's top left one.
+
+        The corners are within a pixel or so (see :mod:`rs_localizer.markers.edges`).
+        """
+        corners, ids, _ = self._find(image)
+        if ids is None or len(ids) == 0:
+            return np.empty(0, np.int64), np.empty((0, 4, 2))
+        quads = np.concatenate(corners).reshape(-1, 4, 2).astype(np.float64)
+        return np.asarray(ids, np.int64).ravel(), np.roll(quads, -self._turns, axis=1)
+
+
+def _configured(parameters: Any) -> Any:
+    # Of OpenCV's own refinements, the AprilTag one is off by 0.46 px along x and y, and the
+    # sub-pixel search moves the corners of a blurred marker inward by 0.1 to 0.4 px.
+    parameters.cornerRefinementMethod = _aruco.CORNER_REFINE_NONE
+    return parameters
+
+
+@lru_cache(maxsize=32)
+def _dictionary(family: Family) -> Any:
+    if _aruco is None:
+        raise DictionaryError(
+            f"OpenCV {cv2.__version__} is installed without its aruco module; before OpenCV 4.7 "
+            "that is in opencv-contrib-python-headless"
+        )
+    number = getattr(_aruco, family.constant, None)
+    if number is None:
+        raise DictionaryError(f"OpenCV {cv2.__version__} does not know the family {family.name}")
+    return _aruco.getPredefinedDictionary(number)
+
+
+def _bits(family: Family, id_: int) -> NDArray[np.uint8]:
+    row = _dictionary(family).bytesList[id_ : id_ + 1]
+    return np.asarray(_aruco.Dictionary_getBitsFromByteList(row, family.bits), np.uint8)
+
+
+@lru_cache(maxsize=32)
+def _turns(family: Family) -> int:
+    """By how many quarters, anticlockwise, OpenCV's pattern has to be turned to be upright."""
+    found = _bits(family, 0)
+    for turns in range(4):
+        if int("".join(map(str, np.rot90(found, turns).ravel())), 2) == family.first:
+            return turns
+    raise DictionaryError(
+        f"OpenCV {cv2.__version__} has another pattern for {family.name} 0 than is known here"
+    )
