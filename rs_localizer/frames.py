@@ -100,6 +100,16 @@ class FrameLocalizer:
         )
         self._config = config
 
+    @property
+    def camera_frame(self) -> str:
+        """The camera's optical frame; empty as long as it is unknown."""
+        return "" if self._calibration is None else self._calibration.frame
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What has to come before a frame can be localized, in words of users."""
+        return ("camera_info",) if self._calibration is None else ()
+
     def reset(self) -> None:
         """Forget the previous frames."""
         self._last = None

@@ -17,6 +17,11 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
+def type_name(message_type: Any) -> str:
+    """The name of an rclpy class, such as ``geometry_msgs/msg/Pose``."""
+    return f"{message_type.__module__.split('.')[0]}/msg/{message_type.__name__}"
+
+
 def make_message(type_name: str, **fields: Any) -> Any:
     """An rclpy message (see :data:`rs_localizer.io.messages.Make`)."""
     for name, value in fields.items():

@@ -23,6 +23,8 @@ from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.ros import parameters
+from rs_localizer.ros.diagnostics import Diagnostics
+from rs_localizer.ros.health import Condition, Health, diagnose
 from rs_localizer.ros.inputs import Inputs, Topic
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.outputs import Outputs
@@ -33,6 +35,8 @@ from rs_localizer.settings import NODE_NAME
 
 # A change of settings that takes longer (s) has compiled kernels, and says so.
 _LONG_CHANGE = 0.5
+# Inputs that are localized; the others say with what.
+_FRAME_TOPICS = ("correspondences",)
 
 
 class LocalizerNode(RobustLifecycleNode):
@@ -57,12 +61,16 @@ class LocalizerNode(RobustLifecycleNode):
         parameters.on_change(self, check=FrameLocalizer, apply=self._take_config)
         self.autostart = config.autostart
         self.refusals = Refusals(self._warn)
+        self._statistics = Statistics(self.refusals, lambda: self.get_clock().now().nanoseconds)
+        self._changing = False
         # From configuring to cleaning up.
+        self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._worker: Worker | None = None
         self._outputs: Outputs | None = None
         self._reset_service: Service | None = None
         # From activating to deactivating.
         self._inputs: Inputs | None = None
+        self._diagnostics = Diagnostics(self, self._examine, self.refusals.notice)
 
     # -- life cycle -------------------------------------------------------------------------
 
@@ -70,6 +78,7 @@ class LocalizerNode(RobustLifecycleNode):
         try:
             frames = FrameLocalizer(parameters.read(self), self.refusals.notice)
             self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
+            self._diagnostics.publish()
             with self._compiling():
                 seconds = _warm_up(frames)
             self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
@@ -77,17 +86,18 @@ class LocalizerNode(RobustLifecycleNode):
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
         self._outputs = Outputs(self)
+        self._localizer = frames
         self._worker = Worker(
             frames,
             self._outputs.publish,
-            Statistics(self.refusals),
+            self._statistics,
             functools.partial(self.refusals.add, "internal_error"),
         )
         self._reset_service = self.create_service(Trigger, "~/reset", self._reset)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._inputs = Inputs(self, self._topics())
+        self._inputs = Inputs(self, self._topics(), self.refusals.notice)
         config = parameters.read(self)
         if config.readout_time == 0.0:
             self._warn(
@@ -126,7 +136,7 @@ class LocalizerNode(RobustLifecycleNode):
     def _close_outputs(self) -> None:
         if self._worker is not None:
             self._worker.close()
-            self._worker = None
+            self._worker = self._localizer = None
         if self._outputs is not None:
             self._outputs.close()
             self._outputs = None
@@ -173,6 +183,19 @@ class LocalizerNode(RobustLifecycleNode):
         response.success, response.message = True, "the previous pose and twist are forgotten"
         return response
 
+    def _examine(self) -> tuple[Health, str]:
+        """For the diagnostics: how the node is, and its camera."""
+        frames = self._localizer
+        condition = Condition(
+            life_cycle=self._state_machine.current_state[1],
+            changing=self._changing,
+            missing=() if frames is None else frames.missing,
+            frame_topics=_FRAME_TOPICS,
+            silence={} if self._inputs is None else self._inputs.silence(),
+        )
+        health = diagnose(condition, self._statistics.summary())
+        return health, "" if frames is None else frames.camera_frame
+
     # -- in the worker's thread, between two frames ------------------------------------------
 
     def _calibrate(self, frames: FrameLocalizer, calibration: Any) -> None:
@@ -182,8 +205,13 @@ class LocalizerNode(RobustLifecycleNode):
             self.refusals.add("bad_camera_info", str(error))
 
     def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
-        frames.config = config
-        if (seconds := _warm_up(frames)) > _LONG_CHANGE:
+        self._changing = True
+        try:
+            frames.config = config
+            seconds = _warm_up(frames)
+        finally:
+            self._changing = False
+        if seconds > _LONG_CHANGE:
             self.get_logger().info(f"kernels for the new settings are ready after {seconds:.1f} s")
 
     def _warn(self, text: str) -> None:

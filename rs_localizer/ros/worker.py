@@ -68,7 +68,7 @@ class Worker:
         self._statistics.received(topic)
         arrival = Arrival(topic, message, localize, time.monotonic())
         if self._mailbox.put(topic, arrival):
-            self._statistics.replaced(topic)
+            self._statistics.replaced()
 
     def pause(self) -> None:
         """Forget the frames so far, the one that is worked on included."""
@@ -96,15 +96,19 @@ class Worker:
             self._failed(describe(error))
 
     def _localize(self, work: Work[FrameLocalizer, Arrival], arrival: Arrival) -> None:
-        result = arrival.localize(self._frames, arrival.message)
+        self._statistics.started()
+        try:
+            result = arrival.localize(self._frames, arrival.message)
+        finally:
+            self._statistics.ended()
         if not result:
-            self._statistics.refused(arrival.topic, result)
+            self._statistics.refused(result)
             return
         with self._publishing:
             if not self._mailbox.is_current(work):
                 return
             self._publish(result)
-        self._statistics.answered(arrival.topic, result, arrival.received)
+        self._statistics.answered(result, arrival.received)
 
 
 def describe(error: Exception) -> str:

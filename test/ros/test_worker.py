@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,8 +17,15 @@ from rs_localizer.ros.worker import Worker, wait_for_workers
 PATIENCE = 10.0  # s, of a machine that is busy
 
 
+class Count(Statistics):
+    """Frames are plain text here, of which there are no details."""
+
+    def answered(self, frame: Any, received: float) -> None:
+        assert received <= time.monotonic()
+
+
 class Fake:
-    """Stands in for the localizer of the frames; frames are plain text here."""
+    """Stands in for the localizer of the frames."""
 
     def __init__(self) -> None:
         self.settings = "old"
@@ -27,7 +35,7 @@ class Fake:
         self.done = threading.Semaphore(0)
         self.errors: list[str] = []
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Statistics(self.refusals)
+        self.statistics = Count(self.refusals)
         frames: Any = self
         self.worker = Worker(frames, self._publish, self.statistics, self._fail)
 
@@ -76,8 +84,8 @@ def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake: Fake) -> No
     fake.wait(fake.done)
     fake.wait(fake.done)
     assert fake.published == ["one old", "four old"]
-    assert fake.statistics.frames_in == {"frames": 4}
-    assert fake.statistics.frames_replaced == {"frames": 2}
+    summary = fake.statistics.summary()
+    assert (summary.received, summary.replaced) == ({"frames": 4}, 2)
 
 
 def test_topics_do_not_replace_each_other(fake: Fake) -> None:

@@ -1,0 +1,152 @@
+"""What the numbers mean for a user: a level, one sentence, and the numbers by readable names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from rs_localizer.ros.inputs import Silence
+from rs_localizer.ros.statistics import WINDOW, Percentiles, Summary
+
+# Frames in a row without a pose after which the camera is lost.
+_LOST = 5
+# Share of the frames that may be refused or replaced before it is worth a warning.
+_SOME = 0.05
+# A frame that is worked on for longer (s) holds up the others.
+_LONG_WORK = 1.0
+
+
+class Level(IntEnum):
+    """As in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What the node knows of itself."""
+
+    life_cycle: str  # label of the state
+    changing: bool  # new settings compile kernels
+    missing: Sequence[str]  # what no frame can be localized without: camera_info, a map
+    frame_topics: Sequence[str]  # of the inputs, those with frames
+    silence: Mapping[str, Silence]  # by input topic
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """A diagnosis."""
+
+    level: Level
+    state: str
+    message: str
+    values: dict[str, str]
+
+
+def diagnose(condition: Condition, summary: Summary) -> Health:
+    """Judge the node.
+
+    The states are ``inactive``, ``compiling``, ``waiting for`` what is missing or for frames,
+    ``busy``, ``lost``, ``localized`` (by a search) and ``tracking``.
+    """
+    level, state, message = _judge(condition, summary)
+    return Health(level, state, message, {"State": state} | _values(condition, summary))
+
+
+def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
+    if condition.life_cycle != "active":
+        return Level.STALE, "inactive", f"the node is {condition.life_cycle}: activate it"
+    if condition.changing:
+        return Level.WARN, "compiling", "the kernels for the new settings are being compiled"
+    if summary.busy is not None and summary.busy > _LONG_WORK:
+        return Level.WARN, "busy", f"a frame has been worked on for {summary.busy:.1f} s"
+    silent = _silent_frames(condition)
+    if condition.missing:
+        level = Level.WARN if silent else Level.ERROR
+        what = " and ".join(condition.missing)
+        causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
+        if any(item.mismatch for item in condition.silence.values()):
+            level = Level.ERROR
+        return level, f"waiting for {what}", "; ".join([f"waiting for {what}", *causes])
+    if silent is not None:
+        return silent
+    return _judge_frames(summary)
+
+
+def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
+    """What to say where no frames come; None where they do."""
+    silences = [condition.silence[name] for name in condition.frame_topics]
+    if not silences or any(item.heard and not item.cause for item in silences):
+        return None
+    causes = [f"{item.topic}: {item.cause}" for item in silences if item.cause]
+    latest = min(silences, key=lambda item: (not item.heard, item.seconds))
+    if any(item.mismatch for item in silences):
+        level = Level.ERROR
+    else:
+        level = Level.STALE if latest.heard else Level.WARN
+    since = f" for {latest.seconds:.0f} s" if latest.heard else ""
+    return level, "waiting for frames", "; ".join([f"no frame has come{since}", *causes])
+
+
+def _judge_frames(summary: Summary) -> tuple[Level, str, str]:
+    last = summary.last
+    if last is None or summary.refused_since_answer >= _LOST:
+        if summary.refused_since_answer == 0:
+            return Level.WARN, "waiting for frames", "no frame has been localized yet"
+        message = f"the last {summary.refused_since_answer} frames gave no pose"
+        if reasons := summary.recently_refused:
+            message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
+        return Level.ERROR, "lost", message
+    state = "tracking" if last.tracked else "localized"
+    refused, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
+    if refused > _SOME * summary.recently_received:
+        return Level.WARN, state, f"{refused} frames were refused in the last {WINDOW:.0f} s"
+    if replaced > _SOME * summary.recently_received:
+        message = f"{replaced} frames came while another was localized in the last {WINDOW:.0f} s"
+        return Level.WARN, state, message
+    return Level.OK, state, f"{state} with {last.inliers} of {last.points} points"
+
+
+def _values(condition: Condition, summary: Summary) -> dict[str, str]:
+    values = {
+        "Frames in (Hz)": f"{summary.rate_in:.1f}",
+        "Poses out (Hz)": f"{summary.rate_out:.1f}",
+        **_milliseconds("Latency", summary.latency),
+        **_milliseconds("Delay of the stamp", summary.delay),
+    }
+    if summary.last is not None:
+        values |= {
+            "Points": str(summary.last.points),
+            "Inliers with rolling shutter": str(summary.last.inliers),
+            "Inliers with global shutter": str(summary.last.global_shutter_inliers),
+            "Residual RMS (px)": f"{summary.last.residual:.3f}",
+            "Iterations": str(summary.last.iterations),
+        }
+    values |= {
+        "Frames received": str(sum(summary.received.values())),
+        "Poses published": str(summary.answered),
+        "Frames replaced": str(summary.replaced),
+        "Frames refused": str(summary.refused),
+    }
+    values |= {f"Refused: {reason}": str(n) for reason, n in sorted(summary.refusals.items())}
+    values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
+    return values
+
+
+def _milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:
+    if value is None:
+        return {}
+    return {
+        f"{name} p50 (ms)": f"{1e3 * value[0]:.2f}",
+        f"{name} p95 (ms)": f"{1e3 * value[1]:.2f}",
+    }
+
+
+def _heard(item: Silence) -> str:
+    if not item.cause:
+        return "messages come" if item.heard else "no message yet"
+    return f"silent for {item.seconds:.0f} s: {item.cause}"
