@@ -22,6 +22,14 @@ class PoseTime(StrEnum):
     MID_FRAME = "mid_frame"
 
 
+class PublishTf(StrEnum):
+    """What goes out on TF."""
+
+    NONE = "none"
+    MAP_TO_CAMERA = "map_to_camera"
+    MAP_TO_ODOM = "map_to_odom"
+
+
 SOLVER_NAMES = (
     "p3p",
     "r6p",
@@ -208,4 +216,39 @@ class NodeConfig(LocalizerConfig):
         "rolling-shutter solver",
     )
     acceleration: Acceleration = field(default_factory=Acceleration)
+    base_frame: str = setting(
+        "",
+        "Frame of the body whose pose and twist are published, connected to the camera by TF; "
+        "empty: the camera's optical frame",
+        read_only=True,
+    )
+    odom_frame: str = setting(
+        "odom", "Frame of the odometry, for publish_tf map_to_odom", read_only=True
+    )
+    publish_tf: str = setting(
+        PublishTf.NONE.value,
+        "Transform to publish: map_to_camera: the body (base_frame if set) in the map; "
+        "map_to_odom: REP-105, needs odometry on TF",
+        choices=tuple(choice.value for choice in PublishTf),
+    )
+    transform_tolerance: float = setting(
+        0.2,
+        "How long to wait for a transform that is not there yet, and how far map_to_odom is "
+        "stamped into the future, in s",
+        minimum=0.0,
+        maximum=10.0,
+    )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
+
+    def __post_init__(self) -> None:
+        LocalizerConfig.__post_init__(self)
+        for name in ("base_frame", "odom_frame"):
+            if getattr(self, name).startswith("/"):
+                raise ValueError(
+                    f"{name} must not start with '/' (TF's names do not), "
+                    f"got {getattr(self, name)!r}"
+                )
+        if not self.odom_frame:
+            raise ValueError("odom_frame must not be empty")
+        if self.base_frame == self.odom_frame:
+            raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")

@@ -7,7 +7,7 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -25,8 +25,11 @@ from rs_localizer.io.clouds import (
 )
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
+from rs_localizer.io.transform_tree import TransformTree
+from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.localizer import Localizer
 from rs_localizer.moments import pose_at, twist_at
+from rs_localizer.mounting import base_pose, base_twist, find_mounting
 from rs_localizer.solvers import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -53,8 +56,8 @@ _STILL = Estimate(
 class Refusal:
     """A frame without a pose; false in a condition.
 
-    Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud`` and
-    ``bad_cloud`` (a message that cannot be read).
+    Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud``, ``bad_cloud``
+    (a message that cannot be read) and ``no_transform`` (from the camera to ``base_frame``).
     """
 
     reason: str
@@ -74,15 +77,21 @@ class FrameLocalizer:
         config: settings; assigning :attr:`config` changes them from the next frame on.
         notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
             (a recording that starts over) and ``map_changed``. The frame is localized all the same.
+        transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
+            may change and move. Without it there is none.
 
     Raises:
         ValueError: for settings that the localizer refuses.
     """
 
     def __init__(
-        self, config: NodeConfig, notice: Callable[[str, str], None] = lambda name, text: None
+        self,
+        config: NodeConfig,
+        notice: Callable[[str, str], None] = lambda name, text: None,
+        transforms: Transforms | None = None,
     ) -> None:
         self._notice = notice
+        self._transforms = transforms or TransformTree()
         self._last: tuple[int, str] | None = None  # stamp and map of the last cloud
         self._calibration: Calibration | None = None
         self._config = config
@@ -121,6 +130,7 @@ class FrameLocalizer:
         self._localizer.warm_up()
         so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
         twist_at(_STILL, 0.5, 1.0)
+        so3.log(np.eye(3))
 
     def take_camera_info(self, message: Any) -> None:
         """Use this sensor_msgs/CameraInfo from the next frame on.
@@ -158,7 +168,7 @@ class FrameLocalizer:
             result = self._tracker.localize(self._middle_row_ns(cloud.stamp_ns), *given)
         if not result:
             return Refusal(str(result.reason), result.detail)
-        return self._frame(cloud, result, self._calibration.frame)
+        return self._mounted(self._frame(cloud, result, self._calibration.frame))
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""
@@ -207,6 +217,28 @@ class FrameLocalizer:
             inliers=select_inliers(cloud.table, estimate.inliers, estimate.residuals),
             dropped=cloud.dropped,
             estimate=estimate,
+        )
+
+    def _mounted(self, frame: Frame) -> Frame | Refusal:
+        """The frame of ``base_frame``, from that of the camera."""
+        base = self._config.base_frame
+        if base in ("", frame.body_frame):
+            return frame
+        # Who gives no time gets the latest, as everywhere in TF.
+        stamp_ns = frame.stamp_ns if min(frame.input_stamp_ns, frame.stamp_ns) > 0 else None
+        span_ns = round(self._config.readout_time * 1e9) if frame.twist else 0
+        try:
+            mounting = find_mounting(self._transforms, frame.body_frame, base, stamp_ns, span_ns)
+        except TransformError as error:
+            return Refusal(
+                "no_transform",
+                f"from the camera {frame.body_frame!r} to base_frame {base!r}: {error}",
+            )
+        return replace(
+            frame,
+            body_frame=base,
+            pose=base_pose(frame.pose, mounting),
+            twist=base_twist(frame.twist, mounting) if frame.twist else None,
         )
 
 
