@@ -54,29 +54,29 @@ def tree() -> TransformTree:
 # above: translation x y z, rotation x y z w.
 OF_TF2 = [
     ("base", "camera", None,
-     "0x1.0ceccf10c8f41p-2 0x1.36eb486353472p-2 0x1.21ad1468c1667p+0 "
+     ("0x1.0ceccf10c8f41p-2 0x1.36eb486353472p-2 0x1.21ad1468c1667p+0 "
      "-0x1.dacf2c1ebf387p-2 0x1.0e025f51f26b9p-2 "
-     "-0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1"),
+     "-0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1")),
     ("camera", "base", None,
-     "0x1.4869ed381bd5cp-3 0x1.b01e32b5a6d3ep-1 -0x1.ad73f814b3092p-1 "
+     ("0x1.4869ed381bd5cp-3 0x1.b01e32b5a6d3ep-1 -0x1.ad73f814b3092p-1 "
      "0x1.dacf2c1ebf387p-2 -0x1.0e025f51f26b9p-2 "
-     "0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1"),
+     "0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1")),
     ("lidar", "camera", None,
-     "0x1.058f26dd8371ap-1 -0x1.95c243c5db8c6p-3 -0x1.7b9ed7defea10p-3 "
+     ("0x1.058f26dd8371ap-1 -0x1.95c243c5db8c6p-3 -0x1.7b9ed7defea10p-3 "
      "0x1.61b62338b334cp-1 0x1.40bd30c22726cp-1 "
-     "-0x1.2bec9be4333f4p-4 0x1.69f4de5ba11bep-2"),
+     "-0x1.2bec9be4333f4p-4 0x1.69f4de5ba11bep-2")),
     ("odom", "camera", 1012345678,
-     "0x1.80895f396d818p-1 0x1.295b1a30633a5p+1 0x1.3aff8e8fc4167p+0 "
+     ("0x1.80895f396d818p-1 0x1.295b1a30633a5p+1 0x1.3aff8e8fc4167p+0 "
      "-0x1.07c9073ebeb0dp-1 -0x1.8a5ebbfb2411dp-4 "
-     "0x1.357831c718c02p-3 0x1.ad1f2ce418002p-1"),
+     "0x1.357831c718c02p-3 0x1.ad1f2ce418002p-1")),
     ("camera", "odom", 1000000000,
-     "-0x1.771824254abc0p+0 0x1.7d056681c9c84p-2 -0x1.26d2a236d665ep+1 "
+     ("-0x1.771824254abc0p+0 0x1.7d056681c9c84p-2 -0x1.26d2a236d665ep+1 "
      "0x1.0eed2e3e7b9d5p-1 0x1.138338dd2995dp-4 "
-     "-0x1.568e693b6197dp-3 0x1.a886c7d81536dp-1"),
+     "-0x1.568e693b6197dp-3 0x1.a886c7d81536dp-1")),
     ("odom", "base", None,
-     "0x1.199999999999ap+0 0x1.0cccccccccccdp+1 0x1.999999999999ap-4 "
+     ("0x1.199999999999ap+0 0x1.0cccccccccccdp+1 0x1.999999999999ap-4 "
      "0x0.0p+0 -0x1.999999999999cp-4 "
-     "0x1.3333333333334p-1 0x1.96632cbc9f77ep-1"),
+     "0x1.3333333333334p-1 0x1.96632cbc9f77ep-1")),
 ]  # fmt: skip
 
 
