@@ -5,156 +5,110 @@ from __future__ import annotations
 import argparse
 import shlex
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer import data
 from rs_localizer.arguments import integer, number
 from rs_localizer.cli import UsageError
-from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
+from rs_localizer.cli.simulated_camera import (
+    add_camera_arguments,
+    add_motion_arguments,
+    camera_of,
+    motion_of,
+    option,
+    stamps_of,
+)
 from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import STORAGES, BagWriter
-from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.recording import PARAMETERS, write_parameters, write_simulated
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import FrameSettings, frame_stamps, simulate_frames
-from rs_localizer.lab.true_motion import (
-    BODY_FROM_CAMERA,
-    KNOT_SPACING,
-    ConstantVelocity,
-    RecordedMotion,
-    TrueMotion,
+from rs_localizer.lab.image_sequence import FORMATS, Encoding, rendered_frames
+from rs_localizer.lab.recording import (
+    MARKER_MAP,
+    PARAMETERS,
+    write_parameters,
+    write_rendered,
+    write_simulated,
 )
-from rs_localizer.settings import settings
+from rs_localizer.lab.rendering import ImageSettings, Renderer
+from rs_localizer.lab.scene import room
+from rs_localizer.lab.simulation import FrameSettings, simulate_frames
+from rs_localizer.lab.true_motion import TrueMotion, sampled_way
+from rs_localizer.lab.walls import SCENES
+from rs_localizer.markers.maps import write_marker_map
 
-# A still hand is no example: without any motion given, the camera turns and walks like this.
-_ANGULAR_VELOCITY = (0.0, 1.0, 0.0)
-_LINEAR_VELOCITY = (0.3, 0.0, 0.0)
-_DURATION = 10.0
-# A time of 0 means "none" to ROS.
-_START_NS = 1_000_000_000
-# Stands for the bundled trajectory.
-_BUNDLED = "tum_vi_room5"
+# Options of the one kind of recording that mean nothing to the other.
+_OF_CORRESPONDENCES = ("points", "noise", "outliers")
+_OF_IMAGES = ("walls", "exposure", "grey_noise", "vignetting", "format", "quality")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    frames = FrameSettings()
     parser.add_argument("out", type=Path, metavar="OUT", help="bag directory to create")
-    motion = parser.add_argument_group("motion")
-    motion.add_argument(
-        "--trajectory",
-        type=Path,
-        metavar="FILE",
-        help="follow recorded poses: TUM text, also .gz; gaps are left out, never bridged "
-        f"({_BUNDLED}: the bundled motion of a hand-held rig)",
+    add_motion_arguments(parser.add_argument_group("motion"))
+    add_camera_arguments(parser.add_argument_group("camera"))
+    frames = FrameSettings()
+    seen = parser.add_argument_group("what it sees: points")
+    option(seen, "--points", integer(1), frames.points, "N", "of a frame, if it sees so many")
+    option(seen, "--noise", number(0.0), frames.noise, "PX", "deviation of each raw coordinate")
+    option(seen, "--outliers", number(0.0, 1.0), frames.outliers, "SHARE", "of the points")
+    pictures, encoding = ImageSettings(), Encoding()
+    images = parser.add_argument_group("what it sees: images")
+    images.add_argument(
+        "--images", action="store_true", help="render camera images, instead of points"
     )
-    motion.add_argument(
-        "--axes",
-        choices=sorted(BODY_FROM_CAMERA),
-        default="forward_left_up",
-        help="axes of the recorded body; the camera looks forward (default: %(default)s)",
+    images.add_argument(
+        "--walls",
+        choices=list(SCENES),
+        default=next(iter(SCENES)),
+        help="three: walls of markers at right angles, with their map; "
+        "poster, room: generated pictures (default: %(default)s)",
     )
-    motion.add_argument(
-        "--knot-spacing",
-        type=number(0.0),
-        default=KNOT_SPACING,
-        metavar="S",
-        help="seconds between the knots of the spline through recorded poses; 0: through every "
-        "pose, shaking with its noise (default: %(default)s)",
+    option(images, "--exposure", number(0.0), pictures.exposure, "S", "of a row: motion blur")
+    option(images, "--grey-noise", number(0.0), pictures.noise, "GREY", "deviation, of 255")
+    option(
+        images, "--vignetting", number(0.0, 1.0), pictures.vignetting, "SHARE",
+        "of the light that the corners lose",
+    )  # fmt: skip
+    images.add_argument(
+        "--format", choices=list(FORMATS), default=encoding.format, help="(default: %(default)s)"
     )
-    motion.add_argument(
-        "--angular-velocity",
-        type=number(),
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="rad/s in camera axes (x right, y down, z forward) "
-        f"(without any motion given: {_words(_ANGULAR_VELOCITY)})",
-    )
-    motion.add_argument(
-        "--linear-velocity",
-        type=number(),
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="m/s along the camera axes at the start "
-        f"(without any motion given: {_words(_LINEAR_VELOCITY)})",
-    )
-    _option(motion, "--start", number(0.0), 0.0, "S", "seconds to skip")
-    motion.add_argument(
-        "--duration",
-        type=number(0.0, above=True),
-        metavar="S",
-        help=f"seconds (default: the whole trajectory; {_DURATION:g} at constant velocity)",
-    )
-    camera = parser.add_argument_group("camera")
-    _option(camera, "--width", integer(2), 640, "PX")
-    _option(camera, "--height", integer(2), 480, "PX")
-    _option(camera, "--focal", number(0.0, above=True), 500.0, "PX", "focal length")
-    camera.add_argument(
-        "--distortion-model",
-        choices=[model.value for model in DistortionModel],
-        default=DistortionModel.PLUMB_BOB.value,
-        help="(default: %(default)s)",
-    )
-    camera.add_argument(
-        "--distortion",
-        type=number(),
-        nargs="+",
-        default=[],
-        metavar="D",
-        help="coefficients in the order of CameraInfo (default: none)",
-    )
-    longest = settings()["readout_time"].maximum or 0.0
-    _option(
-        camera, "--readout-time", number(0.0, longest), 0.03, "S", "from the first row to the last"
-    )
-    camera.add_argument(
-        "--scan-direction",
-        choices=[direction.value for direction in ScanDirection],
-        default=ScanDirection.TOP_TO_BOTTOM.value,
-        help="(default: %(default)s)",
-    )
-    seen = parser.add_argument_group("what it sees")
-    _option(seen, "--rate", number(0.0, above=True), frames.rate, "HZ", "frames per second")
-    _option(seen, "--points", integer(1), frames.points, "N", "of a frame, if it sees so many")
-    _option(seen, "--noise", number(0.0), frames.noise, "PX", "deviation of each raw coordinate")
-    _option(seen, "--outliers", number(0.0, 1.0), frames.outliers, "SHARE", "of the points")
-    _option(seen, "--seed", integer(0), 0, "N", "of all random numbers")
+    option(images, "--quality", number(1.0, 100.0), encoding.quality, "PERCENT", "of JPEG")
+    parser.add_argument(
+        "--seed", type=integer(0), default=0, metavar="N",
+        help="of all random numbers (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument(
         "--storage", choices=list(STORAGES), default="mcap", help="(default: %(default)s)"
     )
-
-
-def _option(
-    group: argparse._ArgumentGroup,
-    name: str,
-    kind: Callable[[str], float],
-    default: float,
-    unit: str,
-    text: str = "",
-) -> None:
-    said = f"{text} (default: %(default)s)".strip()
-    group.add_argument(name, type=kind, default=default, metavar=unit, help=said)
+    parser.set_defaults(defaults={
+        name: parser.get_default(name) for name in (*_OF_CORRESPONDENCES, *_OF_IMAGES)
+    })  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> None:
-    camera = _camera(args)
+    foreign = _OF_CORRESPONDENCES if args.images else _OF_IMAGES
+    given = [name for name in foreign if getattr(args, name) != args.defaults[name]]
+    if given:
+        option = f"--{given[0].replace('_', '-')}"
+        raise UsageError(
+            f"{option} is for points; images have --grey-noise and --exposure"
+            if args.images
+            else f"{option} is for images; give --images, too"
+        )
+    if args.images:
+        _write_images(args)
+    else:
+        _write_correspondences(args)
+
+
+def _write_correspondences(args: argparse.Namespace) -> None:
+    camera, motion = camera_of(args), motion_of(args)
     seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
-    motion = _motion(args)
-    start_ns = motion.intervals_ns[0][0] + round(args.start * 1e9)
-    stamps = [stamp for stamp in frame_stamps(motion, camera, args.rate) if stamp >= start_ns]
-    if args.duration is not None:
-        stamps = [stamp for stamp in stamps if stamp < start_ns + round(args.duration * 1e9)]
-    if not stamps:
-        raise ValueError("no frame lies within the motion, --start and --duration")
+    stamps = stamps_of(args, camera, motion)
     map_points = room(_way(motion), np.random.default_rng(args.seed))
     counts: list[int] = []
     with BagWriter(args.out, args.storage) as bag:
-        frames = simulate_frames(
-            camera, motion, map_points, seen, stamps_ns=stamps, seed=args.seed
-        )
+        frames = simulate_frames(camera, motion, map_points, seen, stamps_ns=stamps, seed=args.seed)
         for frame in tqdm(frames, total=len(stamps), unit="frame", desc="simulate", disable=None):
             write_simulated(bag, camera, frame)
             counts.append(len(frame.points))
@@ -173,58 +127,35 @@ def run(args: argparse.Namespace) -> None:
     print(f"next: rs_localizer replay {out} --params {out}/{PARAMETERS} --out {poses}")
 
 
+def _write_images(args: argparse.Namespace) -> None:
+    camera, motion = camera_of(args), motion_of(args)
+    stamps = stamps_of(args, camera, motion)
+    scene = SCENES[args.walls](sampled_way(motion))
+    settings = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
+    renderer = Renderer(camera, scene.planes, settings)
+    encoding = Encoding(args.format, round(args.quality))
+    with BagWriter(args.out, args.storage) as bag:
+        frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
+        for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
+            write_rendered(bag, camera, frame)
+    write_parameters(args.out, args.readout_time, args.scan_direction)
+    said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
+    if scene.marker_map is None:
+        print(said)
+        return
+    write_marker_map(args.out / MARKER_MAP, scene.marker_map)
+    print(f"{said}, {len(scene.marker_map.markers)} markers on three walls")
+    out = shlex.quote(str(args.out))
+    found = shlex.quote(f"{args.out}_markers")
+    print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {found}")
+
+
 def _fewer(counts: list[int], wanted: int) -> str:
     """What to add when some frames see fewer points than were asked for."""
     few, none = sum(count < wanted for count in counts), counts.count(0)
     if few == 0:
         return ""
     return f" (of {wanted} asked for; {few} frames see fewer, {none} of them none)"
-
-
-def _camera(args: argparse.Namespace) -> Camera:
-    K = np.array(
-        [
-            [args.focal, 0.0, 0.5 * (args.width - 1)],
-            [0.0, args.focal, 0.5 * (args.height - 1)],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    try:
-        return Camera(
-            width=args.width,
-            height=args.height,
-            K=K,
-            D=np.array(args.distortion),
-            distortion_model=args.distortion_model,
-            readout_time=args.readout_time,
-            scan_direction=args.scan_direction,
-        )
-    except ValueError as error:  # the other arguments are checked already
-        raise UsageError(f"--distortion: {error}") from error
-
-
-def _motion(args: argparse.Namespace) -> TrueMotion:
-    velocities = (args.angular_velocity, args.linear_velocity)
-    if args.trajectory is not None:
-        if velocities != (None, None):
-            raise UsageError("give either --trajectory or velocities, not both")
-        file = args.trajectory
-        if file == Path(_BUNDLED) and not file.exists():
-            file = data.path(data.HAND_MOTION)
-        return RecordedMotion(read_tum(file), args.axes, args.knot_spacing)
-    angular, linear = velocities
-    if angular is None and linear is None:
-        angular, linear = _ANGULAR_VELOCITY, _LINEAR_VELOCITY
-    return ConstantVelocity(
-        np.array(angular or (0.0, 0.0, 0.0)),
-        np.array(linear or (0.0, 0.0, 0.0)),
-        args.start + (_DURATION if args.duration is None else args.duration),
-        start_ns=_START_NS,
-    )
-
-
-def _words(numbers: tuple[float, ...]) -> str:
-    return " ".join(f"{number:g}" for number in numbers)
 
 
 def _way(motion: TrueMotion) -> Array:

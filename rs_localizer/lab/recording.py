@@ -15,6 +15,7 @@ from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import make_header
+from rs_localizer.lab.image_sequence import RenderedFrame
 from rs_localizer.lab.simulation import SimulatedFrame
 from rs_localizer.lab.true_motion import TrueState
 from rs_localizer.settings import NODE_NAME
@@ -24,10 +25,12 @@ MAP_FRAME = "map"
 CAMERA_INFO_TOPIC = "/camera_info"
 CORRESPONDENCES_TOPIC = "/correspondences"
 IMAGE_TOPIC = "/image/compressed"
+RAW_IMAGE_TOPIC = "/image_raw/compressed"
 TRUE_POSE_TOPIC = "/truth/pose"
 TRUE_TWIST_TOPIC = "/truth/twist"
-# A params file in the directory of a recording.
+# A params file and a map of markers in the directory of a recording.
 PARAMETERS = "parameters.yaml"
+MARKER_MAP = "marker_map.yaml"
 
 # Single precision is what RViz shows and most trackers give: 3e-5 px at the rim of an image.
 _ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "u", "v")] + [("id", "<u4")])
@@ -47,6 +50,15 @@ def write_parameters(directory: Path, readout_time: float, scan_direction: str) 
 def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame) -> None:
     """Camera info, correspondences, and the truth at the first and at the middle row."""
     write_frame(bag, camera, frame.stamp_ns, frame.points, frame.pixels, frame.ids)
+    write_truth(bag, frame.stamp_ns, frame.first_row)
+    if frame.middle_ns != frame.stamp_ns:
+        write_truth(bag, frame.middle_ns, frame.middle_row)
+
+
+def write_rendered(bag: BagWriter, camera: Camera, frame: RenderedFrame) -> None:
+    """Camera info, image, and the truth at the first and at the middle row."""
+    bag.write(CAMERA_INFO_TOPIC, _camera_info(camera, frame.stamp_ns), frame.stamp_ns)
+    write_image(bag, RAW_IMAGE_TOPIC, frame.stamp_ns, frame.format, frame.data)
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
         write_truth(bag, frame.middle_ns, frame.middle_row)
@@ -98,13 +110,18 @@ def write_truth(bag: BagWriter, stamp_ns: int, state: TrueState) -> None:
 
 def write_jpeg(bag: BagWriter, stamp_ns: int, jpeg: bytes) -> None:
     """A JPEG image as sensor_msgs/CompressedImage."""
+    write_image(bag, IMAGE_TOPIC, stamp_ns, "jpeg", jpeg)
+
+
+def write_image(bag: BagWriter, topic: str, stamp_ns: int, encoding: str, data: bytes) -> None:
+    """A compressed image (``jpeg`` or ``png``) as sensor_msgs/CompressedImage."""
     message = make_message(
         "sensor_msgs/msg/CompressedImage",
         header=make_header(make_message, stamp_ns, CAMERA_FRAME),
-        format="jpeg",
-        data=np.frombuffer(jpeg, np.uint8),
+        format=encoding,
+        data=np.frombuffer(data, np.uint8),
     )
-    bag.write(IMAGE_TOPIC, message, stamp_ns)
+    bag.write(topic, message, stamp_ns)
 
 
 def _vector(vector: Array) -> Any:

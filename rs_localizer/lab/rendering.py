@@ -17,6 +17,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.so3 import Array
 from rs_localizer.lab.planes import TexturedPlane, pyramids
 from rs_localizer.lab.render_kernel import render_lines
+from rs_localizer.lab.simulation import middle_stamp
 from rs_localizer.lab.true_motion import TrueMotion
 from rs_localizer.lab.video import Image
 
@@ -86,7 +87,7 @@ class Renderer:
             seed: of the noise.
         """
         camera = self.camera
-        middle_ns = stamp_ns + round(-camera.first_row_time * camera.readout_time * 1e9)
+        middle_ns = middle_stamp(camera, stamp_ns)
         offsets = self._exposure_instants(motion, middle_ns)
         times = self._tau[:, None] * camera.readout_time + offsets
         state = motion.state(middle_ns, times.ravel())

@@ -93,6 +93,11 @@ def frame_stamps(motion: TrueMotion, camera: Camera, rate: float) -> list[int]:
     ]
 
 
+def middle_stamp(camera: Camera, stamp_ns: int) -> int:
+    """When the sensor's middle row is exposed, of a frame whose first row is at ``stamp_ns``."""
+    return stamp_ns + round(-camera.first_row_time * camera.readout_time * 1e9)
+
+
 def simulate_frames(
     camera: Camera,
     motion: TrueMotion,
@@ -124,7 +129,7 @@ def _frame(
     stamp_ns: int,
     rng: np.random.Generator,
 ) -> SimulatedFrame:
-    middle_ns = stamp_ns + round(-camera.first_row_time * camera.readout_time * 1e9)
+    middle_ns = middle_stamp(camera, stamp_ns)
     now = np.zeros(1)
     middle_row = motion.state(middle_ns, now)
     ids, pixels = _visible(camera, motion, middle_ns, map_points, settings, rng)
