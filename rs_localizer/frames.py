@@ -91,7 +91,7 @@ class FrameLocalizer:
         transforms: Transforms | None = None,
     ) -> None:
         self._notice = notice
-        self._transforms = transforms or TransformTree()
+        self.transforms: Transforms = TransformTree() if transforms is None else transforms
         self._last: tuple[int, str] | None = None  # stamp and map of the last cloud
         self._calibration: Calibration | None = None
         self._config = config
@@ -228,7 +228,7 @@ class FrameLocalizer:
         stamp_ns = frame.stamp_ns if min(frame.input_stamp_ns, frame.stamp_ns) > 0 else None
         span_ns = round(self._config.readout_time * 1e9) if frame.twist else 0
         try:
-            mounting = find_mounting(self._transforms, frame.body_frame, base, stamp_ns, span_ns)
+            mounting = find_mounting(self.transforms, frame.body_frame, base, stamp_ns, span_ns)
         except TransformError as error:
             return Refusal(
                 "no_transform",

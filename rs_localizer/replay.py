@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.bags import BagError, BagReader
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
+from rs_localizer.io.transform_tree import TransformTree
+from rs_localizer.io.transforms import TransformError
 
 _INPUTS = {
     "correspondences": "sensor_msgs/msg/PointCloud2",
     "camera_info": "sensor_msgs/msg/CameraInfo",
 }
+
+TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +66,50 @@ def _find(bag: BagReader, name: str, given: str | None) -> str:
         f"{bag.path} has no topic of type {type_name} for the {name}; it has "
         f"{_describe(bag.topics)}"
     )
+
+
+def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> TransformTree:
+    """The transforms of the recording that the settings need; an empty tree where they need none.
+
+    All are known from the start. A live node hears them as they come.
+
+    Raises:
+        BagError: when the camera's frame is not connected to ``base_frame``, or to ``odom_frame``
+            for ``publish_tf: map_to_odom``.
+    """
+    wanted = {}
+    if config.base_frame:
+        wanted["base_frame"] = config.base_frame
+    if config.publish_tf == PublishTf.MAP_TO_ODOM:
+        wanted["odom_frame"] = config.odom_frame
+    tree = TransformTree()
+    camera = next((m.header.frame_id for _, _, m in bag.messages((topics.camera_info,))), None)
+    if not wanted or camera is None:
+        return tree
+    found = [t for t in ("/tf_static", "/tf") if bag.topics.get(t) == TF_TYPE]
+    for topic in found:
+        for _, _, message in bag.messages((topic,)):
+            tree.add(message, static=topic == "/tf_static")
+        if topic == "/tf_static" and all(_connected(tree, f, camera) for f in wanted.values()):
+            break  # /tf is long
+    for name, frame in wanted.items():
+        try:
+            tree.moves(frame, camera)
+        except TransformError as error:
+            where = " and ".join(found) or "no topic /tf_static or /tf"
+            raise BagError(
+                f"{bag.path} does not say where the camera {camera!r} is in {name} {frame!r}: "
+                f"{error} (found {where})"
+            ) from error
+    return tree
+
+
+def _connected(tree: TransformTree, target: str, source: str) -> bool:
+    try:
+        tree.moves(target, source)
+    except TransformError:
+        return False
+    return True
 
 
 def replay(

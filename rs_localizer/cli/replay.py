@@ -8,12 +8,12 @@ import shlex
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from rs_localizer.broadcasts import broadcast
 from rs_localizer.cli import UsageError
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
@@ -21,7 +21,8 @@ from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, open_bag
 from rs_localizer.io.outputs import Frame, messages
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
-from rs_localizer.replay import Topics, find_topics, replay
+from rs_localizer.io.transforms import TransformError, make_transform
+from rs_localizer.replay import TF_TYPE, Topics, find_topics, find_transforms, replay
 from rs_localizer.settings import NODE_NAME, build, load_params_file, parse_assignment
 
 # What replay writes into its output directory.
@@ -35,7 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
     topics.add_argument("--correspondences", metavar="TOPIC")
     topics.add_argument("--camera-info", metavar="TOPIC")
-    offline = parser.add_argument_group("offline (default): at full speed, no ROS needed")
+    offline = parser.add_argument_group(
+        "offline (default): at full speed, no ROS needed",
+        "With the settings base_frame and publish_tf, transforms come from the recording's "
+        f"/tf_static and /tf, and go to /tf of {RESULT}.",
+    )
     offline.add_argument(
         "--out",
         type=Path,
@@ -71,12 +76,12 @@ def run(args: argparse.Namespace) -> None:
         with open_bag(args.bag) as bag:
             _play(bag, find_topics(bag, args.correspondences, args.camera_info), args.rate or 1.0)
         return
+    config = _config(args.params, args.assignments)
     notices: Counter[str] = Counter()
-    localizer = _localizer(
-        args.params, args.assignments, lambda name, text: notices.update((name,))
-    )
     with open_bag(args.bag) as bag:
         topics = find_topics(bag, args.correspondences, args.camera_info)
+        transforms = find_transforms(bag, topics, config)
+        localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         _prepare(out, args.overwrite)
         _hint(args.bag, args.params)
@@ -98,22 +103,21 @@ def _check_usage(args: argparse.Namespace) -> None:
         raise UsageError(f"--rate must be positive, got {args.rate}")
 
 
-def _localizer(
-    params: Path | None, assignments: list[str], notice: Callable[[str, str], None]
-) -> FrameLocalizer:
+def _config(params: Path | None, assignments: list[str]) -> NodeConfig:
     try:
         values = {} if params is None else load_params_file(params)
     except ValueError as error:
         raise UsageError(f"--params: {error}") from error
     try:
-        localizer = FrameLocalizer(build(values), notice)
+        FrameLocalizer(build(values))  # refuses what it cannot do
     except ValueError as error:
         raise UsageError(f"--params: {params}: {error}") from error
     try:
-        localizer.config = build(values | dict(map(parse_assignment, assignments)))
+        config = build(values | dict(map(parse_assignment, assignments)))
+        FrameLocalizer(config)
     except ValueError as error:
         raise UsageError(f"-p: {error}") from error
-    return localizer
+    return config
 
 
 def _prepare(out: Path, overwrite: bool) -> None:
@@ -149,7 +153,9 @@ def _replay(
 ) -> None:
     localizer.warm_up()
     frames: list[Frame] = []
+    last = "nothing came"
     refused: Counter[str] = Counter()
+    not_sent = 0
     total = bag.count([topics.correspondences])
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
@@ -162,18 +168,36 @@ def _replay(
                 frames.append(result)
                 for name, message in messages(result, writer.make).items():
                     writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
+                not_sent += not _write_transform(writer, result, localizer, recorded_ns)
             else:
                 refused[result.reason] += 1
+                last = f"{result.reason}: {result.detail}"
             bar.update(1 if result or result.reason != "bad_camera_info" else 0)
     seconds = time.perf_counter() - start
     repeated = _write_texts(out, frames)
-    _print_summary(total, frames, refused, notices, repeated, seconds)
+    _print_summary(total, frames, refused, notices, repeated, not_sent, seconds)
     moving = any(frame.twist for frame in frames)
     if frames and not moving:
         print(f"no twists: {_why_no_twists(localizer.config)}")
     print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}")
     if not frames:
-        raise ValueError(f"no frame of {bag.path} was localized")
+        raise ValueError(f"no frame of {bag.path} was localized; of the last one, {last}")
+
+
+def _write_transform(
+    writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
+) -> bool:
+    """Write what publish_tf asks for; whether it could be told."""
+    try:
+        item = broadcast(frame, localizer.config, localizer.transforms)
+    except TransformError:
+        return False
+    if item is not None:
+        transform = make_transform(
+            writer.make, item.stamp_ns, item.parent, item.child, item.parent_from_child
+        )
+        writer.write("/tf", writer.make(TF_TYPE, transforms=[transform]), recorded_ns)
+    return True
 
 
 def _write_texts(out: Path, frames: list[Frame]) -> int:
@@ -210,6 +234,7 @@ def _print_summary(
     refused: Counter[str],
     notices: Counter[str],
     repeated: int,
+    not_sent: int,
     seconds: float,
 ) -> None:
     rows = [("frames", total), ("localized", len(frames))]
@@ -218,6 +243,7 @@ def _print_summary(
     dropped = sum(frame.dropped for frame in frames)
     rows += [("rows dropped (not finite)", dropped)] if dropped else []
     rows += [("stamps repeated, not in the text files", repeated)] if repeated else []
+    rows += [("without a transform on /tf", not_sent)] if not_sent else []
     for name, count in rows:
         print(f"{name:40} {count:8}")
     print(f"{'frames per second':40} {total / seconds:8.0f}")

@@ -1,0 +1,174 @@
+"""``rs_localizer replay`` with base_frame and publish_tf: transforms from the recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.so3 import Array
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.trajectories import read_tum, read_twists
+from rs_localizer.lab.recording import write_simulated
+from rs_localizer.lab.scene import room
+from rs_localizer.lab.simulation import FrameSettings, simulate_frames
+from rs_localizer.lab.true_motion import ConstantVelocity
+
+READOUT_TIME = 0.03
+FRAMES = 5
+CAMERA = "camera_optical_frame"
+SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
+# A camera that looks to the left from the front of a base.
+LEVER = np.array([0.5, 0.2, 0.9])
+TURN = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def tf(parent: str, child: str, position: Any, turn: Rotation, stamp_ns: int = 0) -> Any:
+    x, y, z, w = turn.as_quat().tolist()
+    px, py, pz = map(float, position)
+    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    stamp = make_message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    transform = make_message(
+        "geometry_msgs/msg/TransformStamped",
+        header=make_message("std_msgs/msg/Header", stamp=stamp, frame_id=parent),
+        child_frame_id=child,
+        transform=make_message(
+            "geometry_msgs/msg/Transform",
+            translation=make_message("geometry_msgs/msg/Vector3", x=px, y=py, z=pz),
+            rotation=make_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        ),
+    )
+    return make_message("tf2_msgs/msg/TFMessage", transforms=[transform])
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
+    motion = ConstantVelocity(
+        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.3, start_ns=10**12
+    )
+    world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
+    settings = FrameSettings(points=100, noise=0.3, outliers=0.2)
+    frames = list(simulate_frames(camera, motion, world, settings))[:FRAMES]
+
+    def write(transforms: list[tuple[str, Any]]) -> Path:
+        path = tmp_path_factory.mktemp("bags") / "flight"
+        with BagWriter(path) as bag:
+            for frame in frames:
+                write_simulated(bag, camera, frame)
+            for topic, message in transforms:  # behind: a recording is read as a whole
+                bag.write(topic, message, 2 * 10**12)
+        return path
+
+    return write
+
+
+STATIC = [("/tf_static", tf("base_link", CAMERA, LEVER, TURN))]
+
+
+def replayed(bag: Path, out: Path, *settings: str) -> list[tuple[Array, Array, Array, Array]]:
+    """Position, quaternion, linear and angular velocity of each frame."""
+    assert main(["replay", str(bag), "--out", str(out), *SHUTTER, *settings]) == 0
+    poses, twists = read_tum(out / "poses.txt"), read_twists(out / "twists.txt")
+    columns = (poses.positions, poses.quaternions, twists.linear, twists.angular)
+    return list(zip(*columns, strict=True))
+
+
+@pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
+def test_base_frame(record: Any, tmp_path: Path, pose_time: str) -> None:
+    bag = record(STATIC)
+    mode = ("-p", f"pose_time:={pose_time}")
+    of_camera = replayed(bag, tmp_path / "camera", *mode)
+    of_base = replayed(bag, tmp_path / "base", *mode, "-p", "base_frame:=base_link")
+    assert len(of_camera) == len(of_base) == FRAMES
+    arm = TURN.inv().apply(-LEVER)  # of the base's origin, in camera axes
+    for camera, base in zip(of_camera, of_base, strict=True):
+        map_from_camera = Rotation.from_quat(camera[1])
+        assert np.allclose(base[0], camera[0] + map_from_camera.apply(arm), atol=1e-8)
+        turn = map_from_camera.inv() * Rotation.from_quat(base[1])
+        assert np.allclose(turn.as_matrix(), TURN.inv().as_matrix(), atol=1e-8)
+        assert np.allclose(base[2], TURN.apply(camera[2] + np.cross(camera[3], arm)), atol=1e-8)
+        assert np.allclose(base[3], TURN.apply(camera[3]), atol=1e-8)
+    with open_bag(tmp_path / "base" / "result") as result:
+        for _, _, message in result.messages(["/rs_localizer/odometry"]):
+            assert message.child_frame_id == "base_link"
+        assert "/tf" not in result.topics
+
+
+def test_transforms_come_out(record: Any, tmp_path: Path) -> None:
+    drift = Rotation.from_euler("z", 25.0, degrees=True)
+    stamps = [10**12 + 20_000_000 * i for i in range(6)]  # the last frames come later
+    odometry = [
+        ("/tf", tf("odom", "base_link", (0.1 * i, 0.0, 0.0), drift, stamp))
+        for i, stamp in enumerate(stamps)
+    ]
+    bag = record(STATIC + odometry)
+    settings = ("-p", "base_frame:=base_link", "-p", "publish_tf:=map_to_odom")
+    poses = replayed(bag, tmp_path / "out", *settings, "-p", "transform_tolerance:=0.05")
+    with open_bag(tmp_path / "out" / "result") as result:
+        found = [message.transforms[0] for _, _, message in result.messages(["/tf"])]
+        inputs = [m.header.stamp for _, _, m in result.messages(["/rs_localizer/pose"])]
+    assert 0 < len(found) < len(poses) == FRAMES
+    for transform, pose, stamp in zip(found, poses, inputs, strict=False):
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
+        ahead = transform.header.stamp.sec * 10**9 + transform.header.stamp.nanosec
+        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+        assert ahead == stamp_ns + 50_000_000
+        # map_from_odom of where odometry believes the base to be is where it is.
+        t, q = transform.transform.translation, transform.transform.rotation
+        map_from_odom = Rotation.from_quat([q.x, q.y, q.z, q.w])
+        believed = [0.1 * (stamp_ns - 10**12) / 20_000_000, 0.0, 0.0]
+        position = np.add(map_from_odom.apply(believed), (t.x, t.y, t.z))
+        assert np.allclose(position, pose[0], atol=1e-8)
+        turn = (map_from_odom * drift).inv() * Rotation.from_quat(pose[1])
+        assert turn.magnitude() < 1e-8
+
+
+def test_frames_that_odometry_does_not_reach_are_counted(
+    record: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = record([("/tf", tf("odom", CAMERA, (0.0, 0.0, 0.0), TURN, 10**12))])
+    replayed(bag, tmp_path / "out", "-p", "publish_tf:=map_to_odom")
+    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines()[:4])
+    assert rows["localized"] == str(FRAMES)
+    assert int(rows["without a transform on /tf"]) >= FRAMES - 1
+
+
+@pytest.mark.parametrize(
+    ("transforms", "text"),
+    [
+        ([], "frame 'base_link' does not exist; there are none (found no topic "),
+        (
+            [("/tf_static", tf("base_link", "lidar", LEVER, TURN))],
+            "frame {camera!r} does not exist; there are base_link, lidar (found /tf_static)",
+        ),
+        (
+            [
+                ("/tf_static", tf("base_link", "lidar", LEVER, TURN)),
+                ("/tf", tf("mast", CAMERA, LEVER, TURN)),
+            ],
+            "frames 'base_link' and {camera!r} are not connected (found /tf_static and /tf)",
+        ),
+    ],
+)
+def test_a_mounting_that_the_recording_does_not_have(
+    record: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    transforms: list[tuple[str, Any]],
+    text: str,
+) -> None:
+    bag = record(transforms)
+    arguments = ["replay", str(bag), "--out", str(tmp_path / "out"), "-p", "base_frame:=base_link"]
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    where = "does not say where the camera 'camera_optical_frame' is in base_frame 'base_link': "
+    assert f"{bag} {where}{text.replace('{camera!r}', repr(CAMERA))}" in error
+    assert not (tmp_path / "out").exists()
