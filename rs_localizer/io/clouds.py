@@ -1,4 +1,4 @@
-"""PointCloud2 <-> correspondences.
+"""PointCloud2 <-> structured arrays, and correspondences.
 
 Fields are looked up by name and may lie anywhere in a row; unknown ones are ignored. The data are
 read in place through a NumPy structured view, whatever their padding and byte order.
@@ -6,7 +6,8 @@ read in place through a NumPy structured view, whatever their padding and byte o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -23,10 +24,14 @@ _NAMES = dict(
     zip(_FORMATS, "INT8 UINT8 INT16 UINT16 INT32 UINT32 FLOAT32 FLOAT64".split(), strict=True)
 )
 _NUMBERS = {np.dtype(code): number for number, code in _FORMATS.items()}
-_REALS = (7, 8)
-_INTEGERS = (1, 2, 3, 4, 5, 6)
-_REQUIRED = ("x", "y", "z", "u", "v")
-_TYPES = dict.fromkeys((*_REQUIRED, "score"), _REALS) | {"id": _INTEGERS}
+# What each known field may hold; a name means the same in every cloud.
+_TYPES = dict.fromkeys(("x", "y", "z", "u", "v", "score"), (7, 8)) | {
+    "id": (1, 2, 3, 4, 5, 6),
+    "descriptor": (2, 7),
+}
+_ARRAYS = ("descriptor",)  # several values per point
+# NumPy has no larger rows.
+_LONGEST_ROW = 2**31 - 1
 # Added to the rows that were kept.
 _RESIDUAL = ("residual", "<f4")
 
@@ -60,28 +65,60 @@ def read_correspondences(message: Any) -> Correspondences:
         MessageError: for anything that cannot be read, saying what was found.
     """
     frame = frame_id(message, "the frame of x, y, z")
-    table = _view(message)
-    names = [name for name in (*_REQUIRED, "score") if name in (table.dtype.names or ())]
-    values = np.empty((len(names), len(table)))
-    with np.errstate(invalid="ignore"):  # a signaling NaN warns when it is converted
-        for row, name in zip(values, names, strict=True):
-            row[:] = table[name]
-    finite = np.isfinite(values).all(axis=0)
-    dropped = len(table) - int(np.count_nonzero(finite))
-    if dropped:
-        values, table = values[:, finite], table[finite]
+    rows = read_rows(message, ("x", "y", "z", "u", "v"), ("score", "id"))
     return Correspondences(
         stamp_ns=stamp_ns(message),
         frame=frame,
-        points=np.ascontiguousarray(values[:3].T),
-        pixels=np.ascontiguousarray(values[3:5].T),
-        scores=values[5] if len(names) > 5 else None,
-        dropped=dropped,
-        table=table,
+        points=rows.columns("x", "y", "z"),
+        pixels=rows.columns("u", "v"),
+        scores=rows.columns("score")[:, 0] if rows.has("score") else None,
+        dropped=rows.dropped,
+        table=rows.table,
     )
 
 
-def _view(message: Any) -> NDArray[Any]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """The rows of a cloud without NaN and infinity in the fields that were asked for."""
+
+    table: NDArray[Any]  # (n,) structured: these fields as they came
+    dropped: int  # rows that held NaN or infinity
+    _values: dict[str, Array]  # (n,) of each field of one real number
+
+    def has(self, name: str) -> bool:
+        return name in (self.table.dtype.names or ())
+
+    def columns(self, *names: str) -> Array:
+        """Fields of one real number each as an array (n, len(names))."""
+        return np.stack([self._values[name] for name in names], axis=1)
+
+
+def read_rows(message: Any, required: Sequence[str], optional: Sequence[str]) -> Rows:
+    """The rows of a sensor_msgs/PointCloud2 with these fields; unusable rows are dropped.
+
+    Raises:
+        EmptyCloudError: for a cloud without points.
+        MessageError: for anything that cannot be read, saying what was found.
+    """
+    table = _view(message, required, optional)
+    values: dict[str, Array] = {}
+    finite = np.ones(len(table), dtype=np.bool_)
+    for name, (kind, *_) in (table.dtype.fields or {}).items():
+        if kind.base.kind != "f":
+            continue
+        if name in _ARRAYS:
+            finite &= np.isfinite(table[name].reshape(len(table), -1)).all(axis=1)
+        else:
+            with np.errstate(invalid="ignore"):  # a signaling NaN warns when it is converted
+                values[name] = table[name].astype(np.float64)
+            finite &= np.isfinite(values[name])
+    dropped = len(table) - int(np.count_nonzero(finite))
+    if dropped:
+        values, table = {name: column[finite] for name, column in values.items()}, table[finite]
+    return Rows(table, dropped, values)
+
+
+def _view(message: Any, required: Sequence[str], optional: Sequence[str]) -> NDArray[Any]:
     """The known fields of a cloud as a structured array (n,) over the message's own data."""
     width, height = int(message.width), int(message.height)
     point_step, row_step = int(message.point_step), int(message.row_step)
@@ -101,14 +138,14 @@ def _view(message: Any) -> NDArray[Any]:
             f"{expected} bytes, found {len(message.data)}"
         )
     names = [str(item.name) for item in message.fields]
-    if missing := [name for name in _REQUIRED if name not in names]:
+    if missing := [name for name in required if name not in names]:
         raise MessageError(
             f"the cloud has no field {', '.join(missing)}; found {', '.join(names) or 'none'}"
         )
     fields = tuple(
         (str(item.name), int(item.offset), int(item.datatype), int(item.count))
         for item in message.fields
-        if item.name in _TYPES
+        if item.name in (*required, *optional)
     )
     row_type = _row_type(fields, point_step, bool(message.is_bigendian))
     rows: NDArray[Any] = np.ndarray(
@@ -120,8 +157,11 @@ def _view(message: Any) -> NDArray[Any]:
 @lru_cache(maxsize=16)
 def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> np.dtype[Any]:
     """Structured type of one row; a camera's clouds all have the same."""
+    if point_step > _LONGEST_ROW:
+        raise MessageError(f"point_step is {point_step}, more than {_LONGEST_ROW}")
     names = [field[0] for field in fields]
-    order, codes = ">" if big_endian else "<", []
+    order = ">" if big_endian else "<"
+    codes: list[Any] = []
     for name, offset, number, count in fields:
         if names.count(name) > 1:
             raise MessageError(f"the cloud has {names.count(name)} fields {name!r}")
@@ -129,14 +169,16 @@ def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> n
             allowed = ", ".join(_NAMES[allowed] for allowed in _TYPES[name])
             found = _NAMES.get(number, f"the unknown type {number}")
             raise MessageError(f"field {name!r} must be one of {allowed}; found {found}")
-        if count not in (0, 1):  # 0 is an old way to write 1
+        count = count or 1  # 0 is an old way to write 1
+        if count > 1 and name not in _ARRAYS:
             raise MessageError(f"field {name!r} must hold one value, found {count}")
-        codes.append(order + _FORMATS[number])
-        end = offset + np.dtype(codes[-1]).itemsize
+        code = np.dtype(order + _FORMATS[number])
+        end = offset + count * code.itemsize
         if end > point_step:
             raise MessageError(
                 f"point_step is {point_step}, but field {name!r} ends at byte {end}"
             )
+        codes.append((code, (count,)) if name in _ARRAYS else code)
     offsets = [field[1] for field in fields]
     return np.dtype(
         {"names": names, "formats": codes, "offsets": offsets, "itemsize": point_step}
@@ -166,15 +208,15 @@ def _packed(row_type: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def make_cloud(make: Make, stamp: int, frame: str, rows: NDArray[Any]) -> Any:
-    """A sensor_msgs/PointCloud2 of packed little-endian rows (k,)."""
+    """A sensor_msgs/PointCloud2 of packed little-endian rows (k,), of numbers or arrays of them."""
     row_type = rows.dtype
     fields = [
         make(
             "sensor_msgs/msg/PointField",
             name=name,
             offset=offset,
-            datatype=_NUMBERS[kind.newbyteorder("=")],
-            count=1,
+            datatype=_NUMBERS[kind.base.newbyteorder("=")],
+            count=math.prod(kind.shape),
         )
         for name, (kind, offset, *_) in (row_type.fields or {}).items()
     ]

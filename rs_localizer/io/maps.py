@@ -1,0 +1,151 @@
+"""A map: landmarks with what they are recognized by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+
+Ids = NDArray[np.int64]
+Descriptors = NDArray[np.uint8] | NDArray[np.float32]
+
+# PointField has no wider integers: all ids fit the one or the other.
+_ID_TYPES = (np.dtype("<u4"), np.dtype("<i4"))
+# Beyond this, float32 pixels and poses say nothing (m).
+_FARTHEST = 1e9
+
+
+class MapError(ValueError):
+    """A map that cannot be used; the text says what was found."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Map:
+    """Landmarks in one frame.
+
+    Args:
+        points: (n,3) m.
+        ids: (n,) each of one landmark alone, or None.
+        descriptors: (n,d) uint8, binary ones that are compared bit by bit, or float32, compared
+            by their Euclidean distance; or None.
+        frame: in which the points are given.
+        dropped: landmarks that were left out because they held NaN or infinity.
+
+    Raises:
+        MapError: for anything else, saying what was found.
+    """
+
+    points: Array
+    ids: Ids | None
+    descriptors: Descriptors | None
+    frame: str
+    dropped: int = 0
+
+    def __post_init__(self) -> None:
+        count = len(self.points)
+        if self.points.shape != (count, 3) or self.points.dtype != np.float64:
+            raise MapError(
+                f"points must be (n,3) float64, got {self.points.shape} {self.points.dtype}"
+            )
+        if count == 0:
+            dropped = f"; {self.dropped} with NaN or infinity were dropped" if self.dropped else ""
+            raise MapError(f"the map has no landmarks{dropped}")
+        if not self.frame:
+            raise MapError("the map's frame has no name")
+        if not np.abs(self.points).max() < _FARTHEST:
+            raise MapError(f"points must be finite and within {_FARTHEST:g} m")
+        if self.ids is not None:
+            _check_ids(self.ids, count)
+        if self.descriptors is not None:
+            _check_descriptors(self.descriptors, count)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def id_type(self) -> np.dtype[Any]:
+        """The type of a PointField that holds all ids."""
+        ids = np.zeros(1, np.int64) if self.ids is None else self.ids
+        return next(kind for kind in _ID_TYPES if _fit(ids, kind))
+
+
+def make_map(
+    points: NDArray[Any],
+    ids: NDArray[Any] | None,
+    descriptors: NDArray[Any] | None,
+    frame: str,
+) -> Map:
+    """A map of arrays as they were read: points (n,3), integers (n,), uint8 or floats (n,d).
+
+    Landmarks with a value that is not finite are dropped and counted.
+
+    Raises:
+        MapError: for arrays that make no map, saying what was found.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise MapError(f"points must be (n,3) numbers, found {points.shape} {points.dtype}")
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    finite = np.isfinite(points).all(axis=1)
+    if ids is not None:
+        if ids.shape != (len(points),) or ids.dtype.kind not in "iu":
+            raise MapError(f"ids must be ({len(points)},) integers, found {ids.shape} {ids.dtype}")
+        if len(ids) and not -(2**31) <= int(ids.min()) <= int(ids.max()) < 2**32:
+            raise MapError(_id_range(int(ids.min()), int(ids.max())))
+        ids = np.ascontiguousarray(ids, dtype=np.int64)
+    if descriptors is not None:
+        if descriptors.ndim != 2 or len(descriptors) != len(points):
+            raise MapError(f"descriptors must be ({len(points)},d), found {descriptors.shape}")
+        if descriptors.dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
+            finite &= np.isfinite(descriptors).all(axis=1)
+        elif descriptors.dtype == np.uint8:
+            descriptors = np.ascontiguousarray(descriptors)
+        else:
+            raise MapError(f"descriptors must be uint8 or floats, found {descriptors.dtype}")
+    dropped = len(points) - int(np.count_nonzero(finite))
+    if dropped:
+        points = points[finite]
+        ids = None if ids is None else ids[finite]
+        descriptors = None if descriptors is None else descriptors[finite]
+    return Map(points, ids, descriptors, frame, dropped)
+
+
+def _check_ids(ids: Ids, count: int) -> None:
+    if ids.shape != (count,) or ids.dtype != np.int64:
+        raise MapError(f"ids must be ({count},) int64, got {ids.shape} {ids.dtype}")
+    if not any(_fit(ids, kind) for kind in _ID_TYPES):
+        raise MapError(_id_range(int(ids.min()), int(ids.max())))
+    ordered = np.sort(ids)
+    repeated = np.unique(ordered[1:][ordered[1:] == ordered[:-1]])
+    if len(repeated):
+        raise MapError(
+            f"{len(repeated)} ids stand for several landmarks each, the first of them is "
+            f"{repeated[0]}"
+        )
+
+
+def _check_descriptors(descriptors: Descriptors, count: int) -> None:
+    shape, kind = descriptors.shape, descriptors.dtype
+    if len(shape) != 2 or shape[0] != count or shape[1] == 0:
+        raise MapError(f"descriptors must be ({count},d), found {shape}")
+    if kind not in (np.uint8, np.float32):
+        raise MapError(f"descriptors must be uint8 or float32, found {kind}")
+    if kind == np.float32 and not np.isfinite(descriptors).all():
+        raise MapError("descriptors must be finite, found NaN or infinity")
+
+
+def _fit(ids: Ids, kind: np.dtype[Any]) -> bool:
+    limits = np.iinfo(kind)
+    return bool(limits.min <= ids.min() and ids.max() <= limits.max)
+
+
+def _id_range(lowest: int, highest: int) -> str:
+    return (
+        "ids must lie between 0 and 4294967295 or between -2147483648 and 2147483647, the "
+        f"integers of a PointCloud2; found {lowest} to {highest}"
+    )

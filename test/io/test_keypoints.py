@@ -1,0 +1,177 @@
+"""Clouds of keypoints and of landmarks: every layout is read, the others are refused."""
+
+from __future__ import annotations
+
+import array
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.clouds import EmptyCloudError, make_cloud
+from rs_localizer.io.keypoints import read_keypoints, read_map
+from rs_localizer.io.messages import MessageError
+
+COUNT = 6
+RNG = np.random.default_rng(0)
+BINARY = RNG.integers(0, 256, (COUNT, 32), dtype=np.uint8)
+FLOATS = RNG.normal(size=(COUNT, 7)).astype(np.float32)
+VALUES = {
+    **{name: np.arange(COUNT) + 0.5 * k for k, name in enumerate(("u", "v", "x", "y", "z"))},
+    "id": np.arange(COUNT) * 10,
+    "score": np.arange(COUNT) - 2.0,
+    "other": np.full(COUNT, 9),
+}
+
+
+def cloud(*fields: tuple[Any, ...], order: str = "<", frame: str = "map") -> Any:
+    """A message with these fields (name, type, perhaps count), as a structured array packs them."""
+    kinds = [
+        (name, order + kind if kind[0] in "<>" else kind, *more) for name, kind, *more in fields
+    ]
+    rows = np.zeros(COUNT, kinds)
+    for name in rows.dtype.names or ():
+        if name == "descriptor":
+            rows[name] = BINARY[:, :32] if rows.dtype[name].base == np.uint8 else FLOATS
+        else:
+            rows[name] = VALUES[name]
+    message = make_cloud(make_message, 5_000_000_007, frame, rows)
+    if order == ">":
+        big = rows.astype([(n, rows.dtype[n].newbyteorder(">")) for n in rows.dtype.names or ()])
+        message = SimpleNamespace(
+            **vars(message) | {"data": big.view(np.uint8), "is_bigendian": True}
+        )
+    return message
+
+
+UV = (("u", "f4"), ("v", "f8"))
+XYZ = (("x", "f4"), ("y", "f8"), ("z", "f4"))
+BITS = ("descriptor", "u1", (32,))
+NUMBERS = ("descriptor", "f4", (7,))
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("mark", [("id",), ("bits",), ("numbers",), ("id", "bits")])
+@pytest.mark.parametrize("container", [np.asarray, lambda data: array.array("B", data.tobytes())])
+def test_keypoints_and_landmarks_of_any_layout(
+    order: str, mark: tuple[str, ...], container: Any
+) -> None:
+    chosen = {"id": ("id", "i2"), "bits": BITS, "numbers": NUMBERS}
+    marks = [chosen[name] for name in mark]
+    message = cloud(("other", "i4"), *UV, *marks, ("score", "f4"), order=order)
+    message.data = container(message.data)
+    keypoints = read_keypoints(message)
+    assert keypoints.stamp_ns == 5_000_000_007
+    assert keypoints.pixels.tolist() == np.stack([VALUES["u"], VALUES["v"]], axis=1).tolist()
+    assert keypoints.scores is not None
+    assert keypoints.scores.tolist() == VALUES["score"].tolist()
+    message = cloud(*marks, *XYZ, order=order)
+    message.data = container(message.data)
+    landmarks = read_map(message)
+    assert landmarks.frame == "map"
+    assert landmarks.points.tolist() == np.stack([VALUES[n] for n in "xyz"], axis=1).tolist()
+    for read in (keypoints, landmarks):
+        if "id" in mark:
+            assert read.ids is not None
+            assert read.ids.tolist() == VALUES["id"].tolist()
+        else:
+            assert read.ids is None
+        if mark[-1] == "id":
+            assert read.descriptors is None
+        else:
+            expected = BINARY if mark[-1] == "bits" else FLOATS
+            assert read.descriptors is not None
+            assert read.descriptors.dtype == expected.dtype
+            assert read.descriptors.tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize("name", ["u", "descriptor", "score"])
+def test_rows_that_are_not_finite_are_dropped_and_counted(name: str) -> None:
+    message = cloud(*UV, NUMBERS, ("score", "f4"))
+    kinds = {field.name: field for field in message.fields}
+    data = message.data.copy()
+    start = 2 * message.point_step + kinds[name].offset
+    data[start : start + 4] = np.array([np.nan], "<f4").view(np.uint8)
+    message.data = data
+    read = read_keypoints(message)
+    assert read.dropped == 1
+    assert read.descriptors is not None
+    assert read.descriptors.tolist() == np.delete(FLOATS, 2, axis=0).tolist()
+    assert len(read) == COUNT - 1
+
+
+def test_landmarks_that_are_not_finite() -> None:
+    message = cloud(("x", "f4"), ("y", "f4"), ("z", "f4"), ("id", "u4"))
+    data = message.data.copy()
+    data.reshape(COUNT, -1)[1:4, :4] = np.array([np.inf], "<f4").view(np.uint8)
+    message.data = data
+    assert (len(read_map(message)), read_map(message).dropped) == (3, 3)
+    data.reshape(COUNT, -1)[:, :4] = np.array([np.inf], "<f4").view(np.uint8)
+    with pytest.raises(MessageError, match="no landmarks"):
+        read_map(message)
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ((*UV,), "neither a field id nor descriptor; found u, v"),
+        ((("u", "f4"), ("id", "u4")), "no field v; found u, id"),
+        (
+            (*UV, ("descriptor", "i2", (4,))),
+            "'descriptor' must be one of UINT8, FLOAT32; found INT16",
+        ),
+        ((*UV, ("id", "u4", (2,))), "'id' must hold one value, found 2"),
+        ((*UV, ("id", "f4")), "'id' must be one of INT8"),
+        ((("u", "f4", (2,)), ("v", "f4"), ("id", "u4")), "'u' must hold one value, found 2"),
+    ],
+)
+def test_bad_keypoints(fields: tuple[Any, ...], text: str) -> None:
+    rows = np.zeros(2, list(fields))
+    with pytest.raises(MessageError, match=text):
+        read_keypoints(make_cloud(make_message, 0, "camera", rows))
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ((*XYZ,), "neither a field id nor descriptor; found x, y, z"),
+        ((*UV, ("id", "u4")), "no field x, y, z; found u, v, id"),
+        ((*XYZ, ("id", "u4")), "1 ids stand for several landmarks each, the first of them is 0"),
+    ],
+)
+def test_bad_landmarks(fields: tuple[Any, ...], text: str) -> None:
+    rows = np.zeros(2, list(fields))
+    with pytest.raises(MessageError, match=text):
+        read_map(make_cloud(make_message, 0, "map", rows))
+
+
+def test_other_bad_clouds() -> None:
+    message = cloud(*XYZ, ("id", "u4"), frame="")
+    with pytest.raises(MessageError, match=r"frame_id is empty; it must name the frame of x, y, z"):
+        read_map(message)
+    assert len(read_keypoints(cloud(*UV, ("id", "u4"), frame=""))) == COUNT
+    message = cloud(*UV, BITS)
+    message.fields[2].count = 2**32 - 1
+    with pytest.raises(MessageError, match="'descriptor' ends at byte"):
+        read_keypoints(message)
+    message.width = 2**31
+    with pytest.raises(MessageError, match="truncated"):
+        read_keypoints(message)
+    message.width = 0
+    with pytest.raises(EmptyCloudError):
+        read_keypoints(message)
+    # A wrong descriptor is nobody's business who does not read it.
+    far = np.zeros(2, [*XYZ, ("u", "f4"), ("v", "f4"), ("id", "u4"), ("descriptor", "i4")])
+    far["x"], far["id"] = 1e10, (1, 2)
+    with pytest.raises(MessageError, match=r"within 1e\+09 m"):
+        read_map(make_cloud(make_message, 0, "map", far[["x", "y", "z", "id"]].copy()))
+
+
+def test_a_descriptor_of_one_byte() -> None:
+    message = cloud(*UV, ("descriptor", "u1", (32,)))
+    message.fields[2].count = 0
+    read = read_keypoints(message).descriptors
+    assert read is not None
+    assert read.tolist() == BINARY[:, :1].tolist()
