@@ -134,6 +134,8 @@ class MarkerDetector:
         large = _sides(quads) >= self._min_side
         ids, quads = ids[large], quads[large]
         found = refine(image, quads, np.full(len(ids), family.cells))
+        different = _different(ids, quads, found)
+        ids, quads, found = ids[different], quads[different], found[different]
         known = np.array([self._knows(family, i) for i in ids.tolist()], bool)
         return Seen(family, ids, quads, found, known & ~np.isin(ids, _twice(ids)))
 
@@ -181,6 +183,20 @@ def _finders(marker_map: MarkerMap) -> list[MarkerFinder]:
         return [MarkerFinder(family) for family in families.values()]
     except DictionaryError as error:
         raise MarkerMapError(str(error)) from error
+
+
+def _different(ids: IntArray, quads: Array, found: NDArray[np.bool_]) -> IntArray:
+    """Which quadrilaterals to keep when OpenCV (4.6) gives one marker twice."""
+    keep: list[int] = []
+    for m in range(len(ids)):
+        if keep and ids[keep[-1]] == ids[m]:
+            apart = np.linalg.norm(quads[m].mean(axis=0) - quads[keep[-1]].mean(axis=0))
+            if apart < 0.5 * _sides(quads[m : m + 1])[0]:
+                if found[m].sum() > found[keep[-1]].sum():
+                    keep[-1] = m
+                continue
+        keep.append(m)
+    return np.array(keep, np.int64)
 
 
 def _twice(ids: IntArray) -> IntArray:

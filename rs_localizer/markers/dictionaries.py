@@ -20,6 +20,10 @@ from rs_localizer.markers.families import Family
 
 Gray = NDArray[np.uint8]
 
+# Before OpenCV 4.10, of candidates that are nearer than this (of the perimeter) the outer one wins.
+# At the default of 0.05, a white rim of one cell before a darker wall hides the marker in it.
+_NEAREST = 0.02
+
 _aruco: Any = getattr(cv2, "aruco", None)
 
 
@@ -71,6 +75,8 @@ def _configured(parameters: Any) -> Any:
     # Of OpenCV's own refinements, the AprilTag one is off by 0.46 px along x and y, and the
     # sub-pixel search moves the corners of a blurred marker inward by 0.1 to 0.4 px.
     parameters.cornerRefinementMethod = _aruco.CORNER_REFINE_NONE
+    if not hasattr(parameters, "minGroupDistance"):
+        parameters.minMarkerDistanceRate = _NEAREST
     return parameters
 
 

@@ -1,0 +1,268 @@
+"""Corners of rendered markers and boards: where they are, their order, and which are left out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.markers.detection import MarkerDetector
+from rs_localizer.markers.dictionaries import DictionaryError, pattern
+from rs_localizer.markers.edges import refine
+from rs_localizer.markers.families import FAMILIES, Family, family
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
+
+SIZE = 0.1
+
+
+def printed(one: Family) -> Any:
+    """Cells of id 0 as its authors print it, from its code and not by OpenCV."""
+    bits = [one.first >> k & 1 for k in reversed(range(one.bits**2))]
+    return np.pad(np.array(bits, bool).reshape(one.bits, one.bits), 1)
+
+
+def available() -> list[str]:
+    return [name for name, one in FAMILIES.items() if hasattr(cv2.aruco, one.constant)]
+
+
+@pytest.mark.parametrize("name", available())
+def test_corners_of_every_family_are_those_of_the_upright_print(
+    name: str, render: Any, look: Any, project: Any
+) -> None:
+    marker = Marker.at(name, 0, SIZE)
+    detector = MarkerDetector(MarkerMap((marker,)))
+    # The camera upright, and turned by a bit more than each quarter.
+    for roll in (0.0, 100.0, 195.0, 290.0):
+        pose = look(roll)
+        found = detector.detect(render([(printed(marker.family), marker.corners)], pose))
+        assert found.ids.tolist() == [0, 1, 2, 3]
+        np.testing.assert_allclose(found.pixels, project(marker.corners, pose), atol=0.1)
+        np.testing.assert_allclose(found.points, marker.corners)
+
+
+def test_april_tags_are_the_published_ones() -> None:
+    # tag36_11_00000.png of github.com/AprilRobotics/apriltag-imgs, inside its black border.
+    expected = """
+        ##.#.#
+        .###.#
+        .##...
+        #.#..#
+        .##...
+        .#..##
+    """
+    # There # is white: the file's pixels row by row.
+    rows = expected.split()
+    white = [[cell == "#" for cell in row] for row in rows]
+    code = int("".join("1" if cell else "0" for row in white for cell in row), 2)
+    assert (code == family("36h11").first) == (
+        pattern(family("36h11"), 0)[1:-1, 1:-1] == white
+    ).all()
+
+
+@pytest.mark.parametrize("blur", [0.5, 1.0])
+def test_corners_have_no_bias(blur: float, render: Any, look: Any, project: Any) -> None:
+    rng = np.random.default_rng(5)
+    errors, outward = [], []
+    for index in range(40):
+        name = ("5x5_100", "apriltag_36h11")[index % 2]
+        marker = Marker.at(name, index % 20, SIZE)
+        pose = look(
+            rng.uniform(0, 360),
+            rng.uniform(-30, 30),
+            rng.uniform(0.3, 0.6),
+            *rng.uniform(-0.03, 0.03, 2),
+        )
+        cells = pattern(marker.family, marker.id)
+        image = render([(cells, marker.corners)], pose, blur=blur, noise=2.0, seed=index)
+        found = MarkerDetector(MarkerMap((marker,))).detect(image)
+        assert len(found.ids) == 4
+        true = project(marker.corners, pose)
+        away = true - true.mean(axis=0)
+        errors.append(found.pixels - true)
+        outward.append(np.sum(errors[-1] * away / np.linalg.norm(away, axis=1)[:, None], axis=1))
+    error = np.concatenate(errors)
+    assert np.abs(error.mean(axis=0)).max() < 0.01
+    assert abs(np.mean(outward)) < 0.02  # cv2.cornerSubPix: -0.2 to -0.4
+    assert np.sqrt(np.mean(error**2)) < 0.06
+
+
+def test_what_covers_a_corner_does_not_move_it(render: Any, look: Any, project: Any) -> None:
+    marker = Marker.at("4x4_50", 3, SIZE)
+    pose = look()
+    image = render([(pattern(marker.family, 3), marker.corners)], pose)
+    pixels = project(marker.corners, pose)
+    x, y = np.rint(pixels[1]).astype(int)
+    for covered, expected in ((25, [0, 1, 2, 3]), (60, [0, 3])):
+        image[y - 5 : y + covered, x - 5 : x + 12] = 120
+        quads = pixels[None] + 0.5
+        found = refine(image, quads, np.array([marker.family.cells]))
+        assert np.flatnonzero(found[0]).tolist() == expected
+        np.testing.assert_allclose(quads[found], pixels[found[0]], atol=0.25)
+
+
+def test_ids_are_rows_of_the_maps_points(render: Any, look: Any, project: Any) -> None:
+    turned = Pose(np.array([0.0, 0.0, 0.0]), np.diag([-1.0, -1.0, 1.0]))
+    walls = wall("4x4_50", 2, 2, 0.06, 0.02, first_id=10, pose=turned)
+    board = Chessboard(4, 3, 0.02, Pose(np.array([0.0, 0.13, 0.0])))
+    marker_map = MarkerMap(walls, (board,), "hall")
+    prints = [(pattern(m.family, m.id), m.corners) for m in walls]
+    y, x = np.mgrid[:4, :5]
+    rim = np.array([[-0.05, 0.17, 0], [0.05, 0.17, 0], [0.05, 0.09, 0], [-0.05, 0.09, 0]])
+    pose = look(roll=20.0, distance=0.5, y=0.05)
+    image = render([*prints, ((x + y) % 2 == 1, rim)], pose)
+    found = MarkerDetector(marker_map).detect(image)
+    assert found.ids.tolist() == list(range(16 + 12))
+    np.testing.assert_allclose(found.points, marker_map.points)
+    np.testing.assert_allclose(found.pixels, project(found.points, pose), atol=0.12)
+    assert found.scores.min() > 5.0
+    assert [name for name, _ in found.boards] == ["chessboard 4x3"]
+    again = MarkerDetector(marker_map).detect(image)
+    np.testing.assert_array_equal(again.pixels, found.pixels)
+
+
+def test_markers_that_are_not_in_the_map_are_named(render: Any, look: Any) -> None:
+    known, other = wall("5x5_50", 2, 1, 0.08, 0.04)
+    prints = [(pattern(m.family, m.id), m.corners) for m in (known, other)]
+    found = MarkerDetector(MarkerMap((known,))).detect(render(prints, look()))
+    assert found.ids.tolist() == [0, 1, 2, 3]
+    assert found.unknown == ("5x5_50 1",)
+    assert found.repeated == ()
+
+
+def test_a_marker_that_is_seen_twice_is_not_used(render: Any, look: Any) -> None:
+    first, second, third = wall("5x5_50", 3, 1, 0.06, 0.03)
+    prints = [
+        (pattern(first.family, number), m.corners)
+        for number, m in ((0, first), (1, second), (0, third))
+    ]
+    found = MarkerDetector(MarkerMap((first, second))).detect(render(prints, look()))
+    assert found.ids.tolist() == [4, 5, 6, 7]
+    assert found.repeated == ("5x5_50 0",)
+
+
+def test_small_markers_are_left_out(render: Any, look: Any) -> None:
+    marker = Marker.at("4x4_50", 0, SIZE)
+    image = render([(pattern(marker.family, 0), marker.corners)], look(distance=0.9))
+    assert len(MarkerDetector(MarkerMap((marker,))).detect(image).ids) == 4
+    assert len(MarkerDetector(MarkerMap((marker,)), min_side=40.0).detect(image).ids) == 0
+
+
+def test_noise_shows_nothing() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
+    marker_map = MarkerMap(
+        wall("apriltag_36h11", 10, 10, 0.1, 0.1),
+        (Charuco(5, 7, 0.04, 0.03, family("5x5_100")),),
+    )
+    assert len(MarkerDetector(marker_map).detect(noise).ids) == 0
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4)), np.zeros((0, 4))]
+)
+def test_other_arrays_are_refused(image: Any) -> None:
+    with pytest.raises(ValueError, match=r"an image must be \(h,w\) uint8, got"):
+        MarkerDetector(MarkerMap(wall("4x4_50", 1, 1, 0.1, 0.1))).detect(image)
+
+
+def test_families_of_another_opencv_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    missing = Family("9x9_10", "9x9", 9, 10, 0)
+    with pytest.raises(DictionaryError, match="does not know the family 9x9_10"):
+        pattern(missing, 0)
+    changed = Family("4x4_50", "4x4", 4, 50, 1)
+    with pytest.raises(DictionaryError, match="another pattern for 4x4_50 0"):
+        pattern(changed, 0)
+
+
+# -- boards -------------------------------------------------------------------------------------
+
+
+def board_image(columns: int, rows: int, pose: Any, render: Any, cells: Any, rectangle: Any) -> Any:
+    outline = rectangle(0.03 * (columns + 1), 0.03 * (rows + 1))
+    return render([(cells(columns + 1, rows + 1), outline)], pose)
+
+
+def detect_board(board: Chessboard, *images: Any) -> list[Any]:
+    detector = MarkerDetector(MarkerMap(boards=(board,)))
+    return [detector.detect(image, index * 10**8) for index, image in enumerate(images)]
+
+
+def test_chessboard_corners_are_where_they_were_rendered(
+    render: Any, look: Any, project: Any, chessboard_cells: Any, rectangle: Any
+) -> None:
+    board = Chessboard(6, 4, 0.03)
+    for roll in (-40.0, 0.0, 25.0):
+        image = board_image(6, 4, look(roll), render, chessboard_cells, rectangle)
+        (found,) = detect_board(board, image)
+        errors = found.pixels - project(board.points, look(roll))
+        assert np.abs(errors).max() < 0.12  # the squares are 25 px wide
+        assert np.abs(errors.mean(axis=0)).max() < 0.02
+
+
+def test_order_of_a_symmetric_board_is_kept_through_a_full_turn(
+    render: Any, look: Any, project: Any, chessboard_cells: Any, rectangle: Any
+) -> None:
+    board, rolls = Chessboard(6, 4, 0.03), np.arange(0.0, 360.0, 30.0)
+    poses = [look(roll) for roll in rolls]
+    images = [board_image(6, 4, p, render, chessboard_cells, rectangle) for p in poses]
+    for found, pose in zip(detect_board(board, *images), poses, strict=True):
+        np.testing.assert_allclose(found.pixels, project(board.points, pose), atol=0.15)
+    # Alone, or a second after the board was seen last, it is read as text.
+    upside_down = images[6]
+    (found,) = detect_board(board, upside_down)
+    np.testing.assert_allclose(found.pixels, project(board.points, poses[6])[::-1], atol=0.12)
+    detector = MarkerDetector(MarkerMap(boards=(board,)))
+    for now, reversed_order in ((10**9, True), (3 * 10**9, True), (2 * 10**9, True)):
+        detector.detect(images[0], 0)
+        found = detector.detect(upside_down, now + 1)
+        true = project(board.points, poses[6])
+        np.testing.assert_allclose(found.pixels, true[::-1] if reversed_order else true, atol=0.12)
+
+
+def test_order_of_other_boards_follows_from_their_colors(
+    render: Any, look: Any, project: Any, chessboard_cells: Any, rectangle: Any
+) -> None:
+    for columns, rows in ((5, 4), (4, 5)):
+        board = Chessboard(columns, rows, 0.03)
+        for roll in (0.0, 80.0, 180.0, 250.0):
+            image = board_image(columns, rows, look(roll), render, chessboard_cells, rectangle)
+            (found,) = detect_board(board, image)
+            np.testing.assert_allclose(found.pixels, project(board.points, look(roll)), atol=0.15)
+
+
+def charuco_cells(board: Charuco) -> Any:
+    """The board as OpenCV draws it, 12 x 12 dots per square and 8 x 8 per marker."""
+    aruco = cv2.aruco
+    dictionary = aruco.getPredefinedDictionary(getattr(aruco, board.family.constant))
+    size, dots = (board.columns, board.rows), (12 * board.columns, 12 * board.rows)
+    if hasattr(aruco, "CharucoBoard_create"):
+        drawn = aruco.CharucoBoard_create(*size, 3.0, 2.0, dictionary).draw(dots)
+    else:
+        drawing = aruco.CharucoBoard(size, 3.0, 2.0, dictionary)
+        if board.legacy:
+            drawing.setLegacyPattern(True)
+        drawn = drawing.generateImage(dots)
+    return drawn > 127
+
+
+@pytest.mark.parametrize(("rows", "legacy"), [(5, False), (6, False), (6, True)])
+def test_charuco_corners_are_those_of_opencvs_board(
+    rows: int, legacy: bool, render: Any, look: Any, project: Any, rectangle: Any
+) -> None:
+    if legacy and not hasattr(cv2.aruco.CharucoBoard, "setLegacyPattern"):
+        return  # before OpenCV 4.8, it draws one kind only
+    board = Charuco(4, rows, 0.03, 0.02, family("6x6_250"), legacy=legacy)
+    cells, outline = charuco_cells(board), rectangle(0.12, 0.03 * rows)
+    detector = MarkerDetector(MarkerMap(boards=(board,)))
+    for roll in (0.0, 130.0):
+        pose = look(roll, distance=0.32)
+        found = detector.detect(render([(cells, outline)], pose))
+        assert found.ids.tolist() == list(range(3 * (rows - 1)))
+        np.testing.assert_allclose(found.pixels, project(board.points, pose), atol=0.15)
+    # Half of it is enough.
+    pose = look(10.0, distance=0.25, x=0.12)
+    found = detector.detect(render([(cells, outline)], pose))
+    assert 3 <= len(found.ids) < 3 * (rows - 1)
+    np.testing.assert_allclose(found.pixels, project(board.points[found.ids], pose), atol=0.15)
