@@ -1,0 +1,157 @@
+"""sensor_msgs/Image and CompressedImage -> gray images, raw rows where the sensor has them.
+
+There is no limit of size: 50 megapixels work, they only take long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.io.messages import MessageError, stamp_ns
+
+Gray = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class _Encoding:
+    channels: int  # per pixel, in the message
+    kind: str  # NumPy's code of a channel, without byte order
+    to_gray: int = -1  # OpenCV's conversion
+    luma: int | None = None  # the channel that is gray already
+
+
+def _encodings() -> dict[str, _Encoding]:
+    table = {
+        "mono8": _Encoding(1, "u1", luma=0),
+        "8UC1": _Encoding(1, "u1", luma=0),
+        "mono16": _Encoding(1, "u2", luma=0),
+        "16UC1": _Encoding(1, "u2", luma=0),
+        "8UC3": _Encoding(3, "u1", cv2.COLOR_BGR2GRAY),
+        "8UC4": _Encoding(4, "u1", cv2.COLOR_BGRA2GRAY),
+        # Two bytes per pixel, of which one is the brightness.
+        **dict.fromkeys(("yuv422", "uyvy"), _Encoding(2, "u1", luma=1)),
+        **dict.fromkeys(("yuv422_yuy2", "yuyv"), _Encoding(2, "u1", luma=0)),
+    }
+    for bits, kind in ((8, "u1"), (16, "u2")):
+        table[f"bgr{bits}"] = _Encoding(3, kind, cv2.COLOR_BGR2GRAY)
+        table[f"rgb{bits}"] = _Encoding(3, kind, cv2.COLOR_RGB2GRAY)
+        table[f"bgra{bits}"] = _Encoding(4, kind, cv2.COLOR_BGRA2GRAY)
+        table[f"rgba{bits}"] = _Encoding(4, kind, cv2.COLOR_RGBA2GRAY)
+        # ROS names the first two pixels of the first two rows, OpenCV the next ones in its second.
+        table[f"bayer_rggb{bits}"] = _Encoding(1, kind, cv2.COLOR_BayerBG2GRAY)
+        table[f"bayer_bggr{bits}"] = _Encoding(1, kind, cv2.COLOR_BayerRG2GRAY)
+        table[f"bayer_gbrg{bits}"] = _Encoding(1, kind, cv2.COLOR_BayerGR2GRAY)
+        table[f"bayer_grbg{bits}"] = _Encoding(1, kind, cv2.COLOR_BayerGB2GRAY)
+    return table
+
+
+_ENCODINGS = _encodings()
+
+# Name, start and end of what can be decompressed.
+_FORMATS = (
+    ("JPEG", b"\xff\xd8", b"\xff\xd9"),
+    ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"),
+)
+# Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.
+_AS_IT_IS = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """A gray image of a message."""
+
+    stamp_ns: int
+    frame: str  # the camera's optical frame, or what the message says of it
+    pixels: Gray  # (h,w)
+
+
+def read_image(message: Any) -> Image:
+    """Read a sensor_msgs/Image.
+
+    Raises:
+        MessageError: for an encoding that is not supported, or data that do not fit the size.
+    """
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    name = str(message.encoding)
+    encoding = _ENCODINGS.get(name)
+    if encoding is None:
+        raise MessageError(
+            f"the encoding {name!r} is not supported; supported are {', '.join(_ENCODINGS)}"
+        )
+    if width == 0 or height == 0:
+        raise MessageError(f"the image has no pixels: width {width}, height {height}")
+    kind = np.dtype((">" if message.is_bigendian else "<") + encoding.kind)
+    row = width * encoding.channels * kind.itemsize
+    if step == 0:  # some drivers leave it out
+        step = row
+    if step < row:
+        raise MessageError(f"step is {step}, too small for {width} pixels of {name}: {row} bytes")
+    expected = (height - 1) * step + row
+    if len(message.data) < expected:
+        raise MessageError(
+            f"the data are truncated: {width} x {height} pixels of {name} take {expected} bytes, "
+            f"found {len(message.data)}"
+        )
+    pixel = encoding.channels * kind.itemsize
+    raw: NDArray[Any] = np.ndarray(
+        (height, width, encoding.channels),
+        kind,
+        message.data,
+        strides=(step, pixel, kind.itemsize),
+    )
+    return Image(stamp_ns(message), str(message.header.frame_id), _gray(raw, encoding))
+
+
+def read_compressed_image(message: Any) -> Image:
+    """Read a sensor_msgs/CompressedImage: JPEG or PNG.
+
+    Raises:
+        MessageError: for anything else, or an image that is truncated or damaged.
+    """
+    data = np.frombuffer(message.data, np.uint8)
+    start = data[:8].tobytes()
+    found = [item for item in _FORMATS if start.startswith(item[1])]
+    if not found:
+        raise MessageError(
+            f"the compressed image is neither JPEG nor PNG: its format is {str(message.format)!r} "
+            f"and its {len(data)} bytes start with {start.hex(' ') or 'nothing'}"
+        )
+    name, _, end = found[0]
+    # OpenCV fills what is missing with gray and says nothing.
+    if not _ends_with(data, end):
+        raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
+    try:
+        decoded = cv2.imdecode(data, _AS_IT_IS)
+    except cv2.error as error:
+        raise MessageError(f"the {name} image cannot be decoded: {error}") from error
+    if decoded is None:
+        raise MessageError(f"the {name} image of {len(data)} bytes cannot be decoded")
+    return Image(stamp_ns(message), str(message.header.frame_id), _eight_bits(np.asarray(decoded)))
+
+
+def _ends_with(data: Gray, mark: bytes) -> bool:
+    """Whether the mark is at the end; zeros may follow, of drivers that send whole buffers."""
+    last = np.flatnonzero(data)
+    end = int(last[-1]) + 1 if len(last) else 0
+    return data[max(0, end - len(mark)) : end].tobytes() == mark
+
+
+def _gray(raw: NDArray[Any], encoding: _Encoding) -> Gray:
+    if encoding.luma is not None:
+        return _eight_bits(raw[:, :, encoding.luma])
+    single = raw[:, :, 0] if encoding.channels == 1 else raw
+    native = np.ascontiguousarray(single, single.dtype.newbyteorder("="))
+    return _eight_bits(np.asarray(cv2.cvtColor(native, encoding.to_gray)))
+
+
+def _eight_bits(image: NDArray[Any]) -> Gray:
+    """The upper eight bits of those that the image uses: sensors fill 10 or 12 of 16."""
+    if image.dtype.itemsize == 1:
+        return np.ascontiguousarray(image, np.uint8)
+    unused = max(0, int(image.max()).bit_length() - 8)
+    return np.ascontiguousarray(image >> unused, np.uint8)

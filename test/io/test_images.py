@@ -1,0 +1,165 @@
+"""Images of all encodings, and what is wrong with those that cannot be read."""
+
+from __future__ import annotations
+
+import array
+import struct
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.io.images import read_compressed_image, read_image
+from rs_localizer.io.messages import MessageError
+
+HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=3, nanosec=4), frame_id="camera")
+
+
+def image(encoding: str, rows: list[bytes], width: int, step: int = 0, big: int = 0) -> Any:
+    step = step or max(map(len, rows))
+    data = b"".join(row.ljust(step, b"\xaa") for row in rows)
+    return SimpleNamespace(
+        header=HEADER,
+        height=len(rows),
+        width=width,
+        encoding=encoding,
+        is_bigendian=big,
+        step=step,
+        data=array.array("B", data),
+    )
+
+
+def compressed(data: bytes, name: str = "jpeg") -> Any:
+    return SimpleNamespace(header=HEADER, format=name, data=array.array("B", data))
+
+
+GRAY = np.random.default_rng(0).integers(0, 256, (6, 8), np.uint8)
+
+
+def test_gray_with_padded_rows() -> None:
+    for step in (8, 11):
+        found = read_image(image("mono8", [row.tobytes() for row in GRAY], 8, step))
+        np.testing.assert_array_equal(found.pixels, GRAY)
+        assert (found.stamp_ns, found.frame) == (3_000_000_004, "camera")
+    missing = image("8UC1", [row.tobytes() for row in GRAY], 8)
+    missing.step = 0
+    np.testing.assert_array_equal(read_image(missing).pixels, GRAY)
+
+
+@pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "bgra8", "rgba8", "8UC3", "8UC4"])
+def test_color(encoding: str) -> None:
+    # ITU-R BT.601, as in every other converter.
+    weights = {"r": 0.299, "g": 0.587, "b": 0.114, "a": 0.0}
+    order = {"8UC3": "bgr8", "8UC4": "bgra8"}.get(encoding, encoding)[:-1]
+    channels = np.random.default_rng(1).integers(0, 256, (4, 5, len(order)), np.uint8)
+    found = read_image(image(encoding, [row.tobytes() for row in channels], 5, step=32))
+    expected = channels @ np.array([weights[c] for c in order])
+    np.testing.assert_allclose(found.pixels, expected, atol=0.51)
+
+
+@pytest.mark.parametrize("encoding", ["mono16", "16UC1", "bgr16"])
+@pytest.mark.parametrize("big", [0, 1])
+@pytest.mark.parametrize(("bits", "shift"), [(16, 8), (12, 4), (8, 0)])
+def test_sixteen_bits(encoding: str, big: int, bits: int, shift: int) -> None:
+    values = np.array([[0, 2**bits - 1], [2**bits // 3, 2**bits // 2]])
+    count = 3 if encoding == "bgr16" else 1
+    rows = [
+        struct.pack((">" if big else "<") + f"{2 * count}H", *np.repeat(r, count)) for r in values
+    ]
+    found = read_image(image(encoding, rows, 2, big=big))
+    np.testing.assert_allclose(found.pixels, values >> shift, atol=1)
+
+
+@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_bayer(order: str, bits: int) -> None:
+    # An evenly colored wall: every pixel is the same gray, whatever the pattern.
+    color = {"r": 255, "g": 100, "b": 40}
+    pattern = np.array([color[c] for c in order]).reshape(2, 2)
+    mosaic = np.tile(pattern, (8, 8)) << (bits - 8)
+    rows = [row.astype(f"<u{bits // 8}").tobytes() for row in mosaic]
+    found = read_image(image(f"bayer_{order}{bits}", rows, 16))
+    expected = 0.299 * 255 + 0.587 * 100 + 0.114 * 40
+    np.testing.assert_allclose(found.pixels[2:-2, 2:-2], expected, atol=1.5)
+
+
+def test_yuv() -> None:
+    luma = np.arange(12, dtype=np.uint8).reshape(2, 6)
+    for encoding, place in (("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)):
+        data = np.full((2, 6, 2), 128, np.uint8)
+        data[:, :, place] = luma
+        found = read_image(image(encoding, [row.tobytes() for row in data], 6))
+        np.testing.assert_array_equal(found.pixels, luma)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"encoding": "32FC1"}, "the encoding '32FC1' is not supported; supported are mono8"),
+        ({"encoding": ""}, "the encoding '' is not supported"),
+        ({"width": 0}, "the image has no pixels: width 0, height 6"),
+        ({"height": 0}, "the image has no pixels: width 8, height 0"),
+        ({"step": 7}, "step is 7, too small for 8 pixels of mono8: 8 bytes"),
+        ({"encoding": "bgr8"}, "step is 8, too small for 8 pixels of bgr8: 24 bytes"),
+        ({"height": 7}, "truncated: 8 x 7 pixels of mono8 take 56 bytes, found 48"),
+        (
+            {"height": 2**32 - 1, "width": 2**32 - 1, "step": 2**32 - 1},
+            "take 18446744065119617025 bytes, found 48",
+        ),
+        ({"data": array.array("B")}, "found 0"),
+    ],
+)
+def test_bad_images(changes: dict[str, Any], text: str) -> None:
+    message = image("mono8", [row.tobytes() for row in GRAY], 8)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    with pytest.raises(MessageError, match=text):
+        read_image(message)
+
+
+SMOOTH = np.add.outer(np.arange(0, 120, 2), np.arange(0, 80)).astype(np.uint8)
+JPEG = cv2.imencode(".jpg", SMOOTH)[1].tobytes()
+PNG = cv2.imencode(".png", SMOOTH)[1].tobytes()
+
+
+def test_jpeg_and_png() -> None:
+    np.testing.assert_array_equal(read_compressed_image(compressed(PNG, "png")).pixels, SMOOTH)
+    found = read_compressed_image(compressed(JPEG, "mono8; jpeg compressed mono8"))
+    np.testing.assert_allclose(found.pixels, SMOOTH, atol=6)
+    # Some drivers send their whole buffer.
+    padded = read_compressed_image(compressed(JPEG + bytes(500)))
+    np.testing.assert_array_equal(padded.pixels, found.pixels)
+    deep = SMOOTH.astype(np.uint16) << 4
+    deep_png = cv2.imencode(".png", deep)[1].tobytes()
+    np.testing.assert_array_equal(read_compressed_image(compressed(deep_png)).pixels, SMOOTH)
+    color = cv2.imencode(".png", np.dstack([SMOOTH] * 3))[1].tobytes()
+    np.testing.assert_allclose(read_compressed_image(compressed(color)).pixels, SMOOTH, atol=1)
+
+
+def test_rows_stay_where_the_sensor_has_them() -> None:
+    # An Exif note "show this turned by a quarter" (orientation 6).
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
+    tiff = b"II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
+    exif = b"Exif\0\0" + tiff
+    segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
+    turned = JPEG[:2] + segment + JPEG[2:]
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), 0).shape == SMOOTH.T.shape
+    assert read_compressed_image(compressed(turned)).pixels.shape == SMOOTH.shape
+
+
+@pytest.mark.parametrize(
+    ("data", "name", "text"),
+    [
+        (b"", "jpeg", "neither JPEG nor PNG: its format is 'jpeg' and its 0 bytes start with noth"),
+        (b"\0\0\0\1\x67B", "h264", "its format is 'h264' and its 6 bytes start with 00 00 00 01"),
+        (JPEG[: len(JPEG) // 2], "jpeg", "the JPEG image is truncated: its .* no end mark"),
+        (JPEG[:-1], "jpeg", "the JPEG image is truncated"),
+        (PNG[: len(PNG) // 2], "png", "the PNG image is truncated"),
+        (b"\xff\xd8\xff\xd9", "jpeg", "the JPEG image of 4 bytes cannot be decoded"),
+    ],
+)
+def test_bad_compressed_images(data: bytes, name: str, text: str) -> None:
+    with pytest.raises(MessageError, match=text):
+        read_compressed_image(compressed(data, name))
