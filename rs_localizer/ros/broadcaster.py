@@ -1,0 +1,125 @@
+"""Sends what ``publish_tf`` asks for, and no pose waits for it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.node import Node
+
+from rs_localizer.broadcasts import Broadcast, broadcast
+from rs_localizer.config import NodeConfig, PublishTf
+from rs_localizer.io.outputs import Frame
+from rs_localizer.io.transforms import TransformError, make_transform
+from rs_localizer.ros.conversion import make_message
+from rs_localizer.ros.transforms import AtOnce, NotYetError, Tf, import_tf2_ros
+
+# Frames that wait for odometry, which mostly comes later than they do.
+_MOST_PENDING = 100
+
+
+@dataclass(frozen=True, slots=True)
+class _Pending:
+    """A frame whose transform is to be sent."""
+
+    frame: Frame
+    config: NodeConfig
+    deadline: float  # time.monotonic()
+
+
+class Broadcaster:
+    """TF's side of the outputs.
+
+    :meth:`publish` may be called from any thread, all else belongs to the executor's.
+
+    Args:
+        node: sends, and listens for the odometry.
+        notice: told of what was not sent, by a name and one sentence.
+    """
+
+    def __init__(self, node: Node, notice: Callable[[str, str], None]) -> None:
+        self.tf = Tf(node, self._hear)
+        self._node = node
+        self._notice = notice
+        self._broadcaster: Any = None
+        self._pending: deque[_Pending] = deque(maxlen=_MOST_PENDING)
+        self._sending = threading.Lock()
+        self._own: set[tuple[str, str]] = set()  # parents and children that we have sent
+        self._parents: dict[str, str] = {}  # that others have sent, by child
+
+    def configure(self, config: NodeConfig) -> None:
+        """Have what these settings need.
+
+        Raises:
+            ValueError: without tf2_ros.
+        """
+        self.tf.configure(config)
+        if config.publish_tf != PublishTf.NONE and self._broadcaster is None:
+            self._broadcaster = import_tf2_ros(config).TransformBroadcaster(self._node)
+
+    def forget(self) -> None:
+        """Send nothing of the frames so far."""
+        with self._sending:
+            self._pending.clear()
+
+    def close(self) -> None:
+        self.forget()
+        self.tf.close()
+        if self._broadcaster is not None:
+            self._node.destroy_publisher(self._broadcaster.pub_tf)
+            self._broadcaster = None
+
+    def publish(self, frame: Frame, config: NodeConfig) -> None:
+        """Send the frame's transform: now, or when odometry has come so far.
+
+        After ``transform_tolerance`` it is given up.
+        """
+        if config.publish_tf == PublishTf.NONE:
+            return
+        deadline = time.monotonic() + config.transform_tolerance
+        with self._sending:
+            self._pending.append(_Pending(frame, config, deadline))
+        self._flush()
+
+    def _hear(self, transforms: list[Any]) -> None:
+        for item in transforms:
+            parent = item.header.frame_id.removeprefix("/")
+            child = item.child_frame_id.removeprefix("/")
+            if (parent, child) not in self._own:
+                self._parents[child] = parent
+        self._flush()
+
+    def _flush(self) -> None:
+        with self._sending:
+            waiting = list(self._pending)
+            self._pending.clear()
+            for item in waiting:
+                try:
+                    self._send(broadcast(item.frame, item.config, AtOnce(self.tf)))
+                except NotYetError as error:
+                    if time.monotonic() < item.deadline:
+                        self._pending.append(item)
+                    else:
+                        self._notice("not_broadcast", str(error))
+                except TransformError as error:
+                    self._notice("not_broadcast", str(error))
+
+    def _send(self, item: Broadcast | None) -> None:
+        if item is None or self._broadcaster is None:
+            return
+        other = self._parents.get(item.child, item.parent)
+        if other != item.parent:
+            raise TransformError(
+                f"frame {item.child!r} hangs on {other!r} already and can have one parent only; "
+                "choose publish_tf map_to_odom, or the root of the camera's frames as base_frame"
+            )
+        self._own.add((item.parent, item.child))
+        self._broadcaster.sendTransform(
+            make_transform(
+                make_message, item.stamp_ns, item.parent, item.child, item.parent_from_child
+            )
+        )

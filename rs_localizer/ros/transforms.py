@@ -1,0 +1,218 @@
+"""TF in the node: where the camera is on the robot, and where odometry believes the robot.
+
+tf2_ros is imported when a setting needs it: it is not on PyPI, and all else works without it. The
+listener's callbacks run in the node's executor, which never waits here; the worker does, for what
+is not known yet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.time import Time
+
+from rs_localizer.config import NodeConfig, PublishTf
+from rs_localizer.io.messages import stamp_ns as stamp_of
+from rs_localizer.io.transforms import Transform, TransformError, read_transform
+
+# For how long tf2's buffer remembers, in ns: its default.
+_MEMORY = 10_000_000_000
+
+
+class NotYetError(TransformError):
+    """The transform is known for earlier times only."""
+
+
+def check(config: NodeConfig) -> None:
+    """Raise ``ValueError`` if settings need tf2_ros and it is not installed."""
+    if needed(config):
+        import_tf2_ros(config)
+
+
+def needed(config: NodeConfig) -> str:
+    """The setting that needs TF, and its value; empty if there is none."""
+    if config.base_frame:
+        return f"base_frame {config.base_frame!r}"
+    return f"publish_tf {config.publish_tf}" if config.publish_tf != PublishTf.NONE else ""
+
+
+def import_tf2_ros(config: NodeConfig) -> ModuleType:
+    try:
+        return importlib.import_module("tf2_ros")
+    except ImportError as error:
+        raise ValueError(
+            f"{needed(config)} needs the Python package tf2_ros, which cannot be imported "
+            f"({error}): it comes with ROS 2, sudo apt install ros-jazzy-tf2-ros-py"
+        ) from error
+
+
+class Tf:
+    """Transforms from TF (see :class:`rs_localizer.io.transforms.Transforms`).
+
+    :meth:`lookup` and :meth:`moves` may be called from any thread but the executor's, where the
+    first would wait in vain; all else belongs to the executor's.
+
+    Args:
+        node: listens.
+        heard: told of the transforms that have come, geometry_msgs/TransformStamped.
+    """
+
+    def __init__(self, node: Node, heard: Callable[[list[Any]], None]) -> None:
+        self._node = node
+        self._heard = heard
+        self._tolerance = 0.0
+        self._buffer: Any = None
+        self._listener: Any = None
+        self._jumps: Any = None
+        self._errors: ModuleType | None = None  # tf2_ros
+        self._arrivals = 0
+        self._arrived = threading.Condition()
+
+    def configure(self, config: NodeConfig) -> None:
+        """Listen if these settings need it.
+
+        Raises:
+            ValueError: without tf2_ros.
+        """
+        self._tolerance = config.transform_tolerance
+        if not needed(config) or self._buffer is not None:
+            return
+        tf2_ros = import_tf2_ros(config)
+        buffer = tf2_ros.Buffer()
+        # By its own clock tf2 would not see the time of a simulation or a recording go back.
+        self._jumps = self._node.get_clock().create_jump_callback(
+            JumpThreshold(
+                min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
+            ),
+            post_callback=lambda _: buffer.clear(),
+        )
+        self._errors, self._buffer = tf2_ros, buffer
+        self._listener = _listen(tf2_ros, buffer, self._node, self._hear)
+
+    def close(self) -> None:
+        """Stop listening; whoever waits for a transform gets none."""
+        if self._buffer is None:
+            return
+        self._buffer = None
+        self._wake()
+        self._listener.unregister()
+        self._jumps.unregister()
+        self._listener = self._jumps = None
+
+    def _hear(self, transforms: list[Any]) -> None:
+        self._wake()
+        self._heard(transforms)
+
+    def _wake(self) -> None:
+        with self._arrived:
+            self._arrivals += 1
+            self._arrived.notify_all()
+
+    def _wait_for_more(self, seen: int, seconds: float) -> bool:
+        with self._arrived:
+            return self._arrived.wait_for(lambda: self._arrivals != seen, seconds)
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
+        """``target_from_source`` at a time; None: the latest.
+
+        What is not known yet is waited for, ``transform_tolerance`` at most.
+
+        Raises:
+            TransformError: when it does not come.
+        """
+        deadline = time.monotonic() + self._tolerance
+        while True:
+            seen = self._arrivals
+            try:
+                return self.lookup_now(target, source, stamp_ns)
+            except NotYetError:
+                if not self._wait_for_more(seen, deadline - time.monotonic()):
+                    raise
+
+    def lookup_now(self, target: str, source: str, stamp_ns: int | None) -> Transform:
+        """The same, without waiting.
+
+        Raises:
+            NotYetError: when it is known for earlier times.
+            TransformError: when it is not known otherwise.
+        """
+        return read_transform(self._ask(target, source, stamp_ns).transform)
+
+    def moves(self, target: str, source: str) -> bool:
+        """Whether a part of the transform comes with a time.
+
+        Raises:
+            TransformError: when it is not known at all.
+        """
+        return stamp_of(self._ask(target, source, None)) != 0
+
+    def _ask(self, target: str, source: str, stamp_ns: int | None) -> Any:
+        """The geometry_msgs/TransformStamped that tf2 has now."""
+        buffer = self._buffer
+        if buffer is None:
+            raise TransformError("TF is not listened to")
+        if stamp_ns is not None and stamp_ns <= 0:  # which would mean the latest
+            raise TransformError(f"there are no transforms of the time {stamp_ns * 1e-9:.3f} s")
+        try:
+            return buffer.lookup_transform(target, source, Time(nanoseconds=stamp_ns or 0))
+        except self._errors.ExtrapolationException as error:
+            text = _text(error)
+        except self._errors.TransformException as error:
+            raise TransformError(_text(error)) from error
+        latest_ns = self._latest(buffer, target, source)
+        if stamp_ns is not None and latest_ns is not None:
+            if latest_ns < stamp_ns:
+                raise NotYetError(text)
+            if latest_ns - stamp_ns > _MEMORY:
+                # A recording that starts over: tf2 would ignore all that comes from now on.
+                buffer.clear()
+        raise TransformError(text)
+
+    def _latest(self, buffer: Any, target: str, source: str) -> int | None:
+        with contextlib.suppress(self._errors.TransformException):
+            return stamp_of(buffer.lookup_transform(target, source, Time()))
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class AtOnce:
+    """The transforms of a :class:`Tf` as they are known now."""
+
+    tf: Tf
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
+        return self.tf.lookup_now(target, source, stamp_ns)
+
+    def moves(self, target: str, source: str) -> bool:
+        return self.tf.moves(target, source)
+
+
+def _listen(
+    tf2_ros: ModuleType, buffer: Any, node: Node, hear: Callable[[list[Any]], None]
+) -> Any:
+    """A TransformListener that tells of what has come."""
+
+    class Listener(tf2_ros.TransformListener):
+        def callback(self, data: Any) -> None:
+            super().callback(data)
+            hear(data.transforms)
+
+        def static_callback(self, data: Any) -> None:
+            super().static_callback(data)
+            hear(data.transforms)
+
+    return Listener(buffer, node)
+
+
+def _text(error: Exception) -> str:
+    return " ".join(str(error).split())
