@@ -5,7 +5,6 @@ The node and the offline command run this one class, so the same images give the
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,7 +99,7 @@ class MarkerDetector:
             raise ValueError(f"an image must be (h,w) uint8, got {image.dtype} {image.shape}")
         image = np.ascontiguousarray(image)
         seen = [self._seen(finder, image) for finder in self._finders]
-        parts = [part for item in seen for part in self._corners(item)]
+        parts = [self._corners(item) for item in seen]
         boards = []
         for row, board in self._boards:
             rows, pixels = self._board(image, board, seen, stamp_ns)
@@ -143,14 +142,14 @@ class MarkerDetector:
         key = (family.kind, id_)
         return key in self._places or key in self._on_boards
 
-    def _corners(self, seen: Seen) -> Iterable[tuple[IntArray, Array, Array]]:
+    def _corners(self, seen: Seen) -> tuple[IntArray, Array, Array]:
         """Rows, pixels and scores of the single markers."""
-        sides = _sides(seen.quads)
-        for m in np.flatnonzero(seen.known):
-            row = self._places.get((seen.family.kind, int(seen.ids[m])))
-            if row is not None:
-                used = np.flatnonzero(seen.found[m])
-                yield row + used, seen.quads[m, used], np.full(len(used), sides[m])
+        rows = [self._places.get((seen.family.kind, i), -1) for i in seen.ids.tolist()]
+        first = np.array(rows, np.int64)
+        used = seen.found & (seen.known & (first >= 0))[:, None]
+        corners = (first[:, None] + np.arange(4))[used]
+        scores = np.broadcast_to(_sides(seen.quads)[:, None], used.shape)[used]
+        return corners, seen.quads[used], scores
 
     def _board(
         self, image: Gray, board: Chessboard | Charuco, seen: list[Seen], stamp_ns: int

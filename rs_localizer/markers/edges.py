@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.so3 import Array
 
-# Most points along a side, of each round: the first ones only have to get near.
-_POINTS = (10, 12, 40)
+# Most points along a side, of each round: the first only has to get near.
+_POINTS = (12, 32)
 # Half the length of a profile, in cells of the marker (it must stay within the black border and
 # the white rim) and in px (a start may be off by one, and blur needs room; more only adds noise).
 _HALF_CELLS = 0.6
@@ -36,16 +36,9 @@ _MOST_MOVE_CELLS, _MOST_MOVE_PIXELS = 0.7, 2.0
 
 
 @kernel
-def _bilinear(image: NDArray[np.uint8], x: float, y: float) -> float:
-    """The image between its pixels; -1 outside."""
+def _outside(image: NDArray[np.uint8], x: float, y: float) -> bool:
     height, width = image.shape
-    if not (0.0 <= x <= width - 1.0 and 0.0 <= y <= height - 1.0):
-        return -1.0
-    column, row = min(int(x), width - 2), min(int(y), height - 2)
-    fx, fy = x - column, y - row
-    above = (1.0 - fx) * image[row, column] + fx * image[row, column + 1]
-    below = (1.0 - fx) * image[row + 1, column] + fx * image[row + 1, column + 1]
-    return float((1.0 - fy) * above + fy * below)
+    return not (0.0 <= x < width - 1.0 and 0.0 <= y < height - 1.0)
 
 
 @kernel
@@ -54,16 +47,22 @@ def _edge_at(
 ) -> float:
     """How far along the normal, from black to white, the edge is from a point; NaN: none."""
     steps = math.ceil(half / _STEP)
-    start = -steps * _STEP
-    first = _bilinear(image, x + start * nx, y + start * ny)
-    if first < 0.0:
+    reach = steps * _STEP
+    if _outside(image, x - reach * nx, y - reach * ny):
         return math.nan
-    before, weights, moment = first, 0.0, 0.0
-    for k in range(1, 2 * steps + 1):
-        offset = start + k * _STEP
-        value = _bilinear(image, x + offset * nx, y + offset * ny)
-        if value < 0.0:
-            return math.nan
+    if _outside(image, x + reach * nx, y + reach * ny):
+        return math.nan
+    first, before, weights, moment = 0.0, 0.0, 0.0, 0.0
+    for k in range(2 * steps + 1):
+        offset = k * _STEP - reach
+        u, v = x + offset * nx, y + offset * ny
+        column, row = int(u), int(v)
+        fx, fy = u - column, v - row
+        above = (1.0 - fx) * image[row, column] + fx * image[row, column + 1]
+        below = (1.0 - fx) * image[row + 1, column] + fx * image[row + 1, column + 1]
+        value = (1.0 - fy) * above + fy * below
+        if k == 0:
+            first = before = value
         rise = max(0.0, value - before)
         weights += rise * rise
         moment += rise * rise * (offset - 0.5 * _STEP)
