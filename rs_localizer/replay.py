@@ -68,6 +68,11 @@ def _find(bag: BagReader, name: str, given: str | None) -> str:
     )
 
 
+def tf_topics(bag: BagReader) -> list[str]:
+    """Those of /tf_static and /tf that the recording has."""
+    return [topic for topic in ("/tf_static", "/tf") if bag.topics.get(topic) == TF_TYPE]
+
+
 def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> TransformTree:
     """The transforms of the recording that the settings need; an empty tree where they need none.
 
@@ -86,7 +91,7 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     camera = next((m.header.frame_id for _, _, m in bag.messages((topics.camera_info,))), None)
     if not wanted or camera is None:
         return tree
-    found = [t for t in ("/tf_static", "/tf") if bag.topics.get(t) == TF_TYPE]
+    found = tf_topics(bag)
     for topic in found:
         for _, _, message in bag.messages((topic,)):
             tree.add(message, static=topic == "/tf_static")

@@ -22,7 +22,14 @@ from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, open_bag
 from rs_localizer.io.outputs import Frame, messages
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms import TransformError, make_transform
-from rs_localizer.replay import TF_TYPE, Topics, find_topics, find_transforms, replay
+from rs_localizer.replay import (
+    TF_TYPE,
+    Topics,
+    find_topics,
+    find_transforms,
+    replay,
+    tf_topics,
+)
 from rs_localizer.settings import NODE_NAME, build, load_params_file, parse_assignment
 
 # What replay writes into its output directory.
@@ -63,7 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
     graph = parser.add_argument_group("through the ROS graph")
     graph.add_argument(
-        "--ros", action="store_true", help="publish the recording, with /clock, for a live node"
+        "--ros",
+        action="store_true",
+        help="publish the recording, with /clock and its /tf, for a live node",
     )
     graph.add_argument(
         "--rate", type=float, metavar="R", help="times real time, with --ros (default: 1)"
@@ -263,7 +272,7 @@ def _play(bag: BagReader, topics: Topics, rate: float) -> None:
             f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
             "(README.md)"
         ) from error
-    names = (topics.camera_info, topics.correspondences)
+    names = (*_playable_transforms(bag), topics.camera_info, topics.correspondences)
     total = bag.count(names)
     played = play(
         tqdm(bag.messages(names), total=total, unit="message", desc="play", disable=None),
@@ -276,3 +285,15 @@ def _play(bag: BagReader, topics: Topics, rate: float) -> None:
         print(f"{count} poses heard on {topic}")
     if not played.poses:
         print(f"no node {NODE_NAME} was there to publish poses")
+
+
+def _playable_transforms(bag: BagReader) -> list[str]:
+    topics = tf_topics(bag)
+    try:
+        importlib.import_module("tf2_msgs.msg")
+    except ImportError:
+        if topics:
+            missing = "tf2_msgs is not installed (ros-jazzy-tf2-msgs)"
+            print(f"not played: {' and '.join(topics)}, {missing}")
+        return []
+    return topics

@@ -13,7 +13,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
@@ -27,6 +27,11 @@ _SETTLING_TIME = 0.3  # s to be heard by those whom we hear, and the other way r
 _REST_TIME = 0.5  # s to wait for the last answers
 # Reliable publishers are heard by reliable and by best-effort subscribers.
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# As tf2_ros has them; whether anybody listens depends on the node's settings.
+_TF_QOS = {
+    "/tf": QoSProfile(depth=100),
+    "/tf_static": QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+}
 
 
 class PlayerError(ValueError):
@@ -69,12 +74,12 @@ def _play(
     node = rclpy.create_node("rs_localizer_player")
     clock = node.create_publisher(Clock, "/clock", _QOS)
     publishers = {
-        topic: node.create_publisher(message_class(name), topic, _QOS)
+        topic: node.create_publisher(message_class(name), topic, _TF_QOS.get(topic, _QOS))
         for topic, name in types.items()
     }
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    _wait_for_listeners(node, publishers)
+    _wait_for_listeners(node, {t: p for t, p in publishers.items() if t not in _TF_QOS})
     poses = _Poses(node)
     poses.look_round()
     _listen(executor, _SETTLING_TIME)

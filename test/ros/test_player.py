@@ -19,7 +19,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.lab.recording import write_frame
 
 FRAMES = 8
@@ -144,3 +144,29 @@ def test_without_ros_it_says_what_is_missing(recording: Path, tmp_path: Path) ->
     text = "rs_localizer replay: --ros needs ROS 2 (No module named 'rclpy')"
     assert done.stderr.startswith(text)
     assert done.stderr.count("\n") == 1
+
+
+def test_transforms_are_left_out_where_their_type_is_missing(
+    recording: Path, tmp_path: Path, peer: Any
+) -> None:
+    with open_bag(recording) as bag, BagWriter(tmp_path / "with_tf") as copy:
+        copy.write("/tf", make_message("tf2_msgs/msg/TFMessage", transforms=[]), START_NS)
+        for topic, stamp_ns, message in bag.messages(tuple(bag.topics)):
+            copy.write(topic, message, stamp_ns)
+    (tmp_path / "tf2_msgs.py").write_text("raise ImportError")
+    clouds: list[PointCloud2] = []
+    subscribe = peer.node.create_subscription
+    subscribe(PointCloud2, "/correspondences", clouds.append, qos_profile_sensor_data)
+    subscribe(CameraInfo, "/camera_info", lambda _: None, qos_profile_sensor_data)
+    arguments = ["replay", str(tmp_path / "with_tf"), "--ros", "--rate", "2"]
+    player = subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", *arguments],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert peer.spin_until(lambda: player.poll() is not None)
+    output, _ = player.communicate()
+    assert output.startswith("not played: /tf, tf2_msgs is not installed (ros-jazzy-tf2-msgs)\n")
+    assert player.returncode == 0
+    assert clouds
