@@ -141,6 +141,53 @@ class Acceleration:
         _check(self, "acceleration.")
 
 
+class MatchBy(StrEnum):
+    """What keypoints and landmarks are compared by."""
+
+    AUTO = "auto"
+    DESCRIPTOR = "descriptor"
+    ID = "id"
+
+
+@dataclass(frozen=True, slots=True)
+class Matching:
+    """How keypoints are matched with the landmarks of a map."""
+
+    by: str = setting(
+        MatchBy.AUTO.value,
+        "What keypoints and landmarks are compared by; auto: descriptors if both have them, "
+        "otherwise ids",
+        choices=tuple(choice.value for choice in MatchBy),
+    )
+    ratio: float = setting(
+        0.8,
+        "A match by descriptor counts if its distance is below this part of the second-best "
+        "landmark's; 1: always",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    mutual: bool = setting(
+        True, "A match by descriptor counts if no other keypoint is nearer to the landmark"
+    )
+    gate: float = setting(
+        20.0,
+        "While tracking, only landmarks predicted within this distance of a keypoint, in px, are "
+        "compared with it by descriptor (more where the prediction is less certain); 0: all",
+        minimum=0.0,
+        maximum=10000.0,
+    )
+    max_keypoints: int = setting(
+        2000,
+        "Most keypoints of a frame to match by descriptor: those with the best scores, or the "
+        "first ones",
+        minimum=7,
+        maximum=1_000_000,
+    )
+
+    def __post_init__(self) -> None:
+        _check(self, "matching.")
+
+
 @dataclass(frozen=True, slots=True)
 class LocalizerConfig:
     """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
@@ -238,17 +285,26 @@ class NodeConfig(LocalizerConfig):
         minimum=0.0,
         maximum=10.0,
     )
+    map_file: str = setting(
+        "",
+        "Map that keypoints are matched with: a .npz or .ply file or a sparse model of COLMAP; "
+        "empty: none, or the one published on map_points",
+        read_only=True,
+    )
+    map_frame: str = setting("map", "Frame of the points in map_file", read_only=True)
+    matching: Matching = field(default_factory=Matching)
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 
     def __post_init__(self) -> None:
         LocalizerConfig.__post_init__(self)
-        for name in ("base_frame", "odom_frame"):
+        for name in ("base_frame", "odom_frame", "map_frame"):
             if getattr(self, name).startswith("/"):
                 raise ValueError(
                     f"{name} must not start with '/' (TF's names do not), "
                     f"got {getattr(self, name)!r}"
                 )
-        if not self.odom_frame:
-            raise ValueError("odom_frame must not be empty")
+        for name in ("odom_frame", "map_frame"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} must not be empty")
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")

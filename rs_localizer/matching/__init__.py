@@ -1,0 +1,194 @@
+"""Keypoints of an image and landmarks of a map -> correspondences.
+
+By the ids of landmarks, or by descriptors: of the two landmarks with the nearest descriptors the
+first must be clearly nearer (Lowe's ratio test), and no other keypoint may be nearer to it. Where
+the motion is predicted, only landmarks compete that are predicted near the keypoint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.config import MatchBy, Matching
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.prior import Prior
+from rs_localizer.core.sampling import IntArray
+from rs_localizer.core.so3 import Array
+from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.maps import Descriptors, Ids, Map
+from rs_localizer.matching.descriptors import Index, Nearest, make_index
+from rs_localizer.matching.prediction import predict_landmarks
+
+
+class MatchError(ValueError):
+    """Keypoints that cannot be compared with the map; the text says what was found."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Which keypoint shows which landmark, each at most once."""
+
+    keypoints: IntArray  # (k,)
+    landmarks: IntArray  # (k,)
+    scores: Array | None  # (k,) higher is better
+    by: MatchBy  # id or descriptor
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+class Matcher:
+    """A map, ready to be recognized."""
+
+    def __init__(self, landmarks: Map) -> None:
+        self.map = landmarks
+        self._order: IntArray | None = None
+        if landmarks.ids is not None:
+            self._order = np.argsort(landmarks.ids, kind="stable")
+            self._sorted: Ids = landmarks.ids[self._order]
+        self._index: Index | None = None
+        if landmarks.descriptors is not None:
+            self._index = make_index(landmarks.descriptors)
+
+    def match(
+        self,
+        keypoints: Keypoints,
+        settings: Matching,
+        camera: Camera | None = None,
+        prior: Prior | None = None,
+    ) -> Matches:
+        """Match keypoints with the map.
+
+        Args:
+            keypoints: of one image.
+            settings: by what, and how strictly.
+            camera, prior: with a predicted motion, where the landmarks are looked for.
+
+        Raises:
+            MatchError: when keypoints and map have nothing in common to be compared by.
+        """
+        if self._choose(keypoints, settings) == MatchBy.ID:
+            return self._by_id(keypoints)
+        queries = self._comparable(keypoints.descriptors)
+        chosen = _best(keypoints, settings.max_keypoints)
+        queries, pixels = queries[chosen], keypoints.pixels[chosen]
+        if settings.gate > 0.0 and camera is not None and prior is not None:
+            found, mutual = self._predicted(queries, pixels, settings, camera, prior)
+        else:
+            found, mutual = self._anywhere(queries, settings)
+        return _accepted(found, mutual, chosen, settings.ratio)
+
+    # -- steps ------------------------------------------------------------------------------
+
+    def _choose(self, keypoints: Keypoints, settings: Matching) -> MatchBy:
+        """By what they are compared; descriptors say more than the numbers of a tracker."""
+        both = {
+            MatchBy.DESCRIPTOR: self._index is not None and keypoints.descriptors is not None,
+            MatchBy.ID: self._order is not None and keypoints.ids is not None,
+        }
+        wanted = [settings.by] if settings.by != MatchBy.AUTO else list(both)
+        for by in wanted:
+            if both[MatchBy(by)]:
+                return MatchBy(by)
+        raise MatchError(
+            f"keypoints and map cannot be compared by {' or '.join(wanted)}: the keypoints have "
+            f"{_marks(keypoints.ids, keypoints.descriptors)}, the map has "
+            f"{_marks(self.map.ids, self.map.descriptors)}"
+        )
+
+    def _comparable(self, descriptors: Descriptors | None) -> Descriptors:
+        ours = self.map.descriptors
+        assert descriptors is not None
+        assert ours is not None
+        # SIFT is sent in bytes and in floats, which are the same numbers.
+        kinds_fit = descriptors.dtype == ours.dtype or ours.dtype == np.float32
+        if not kinds_fit or descriptors.shape[1] != ours.shape[1]:
+            raise MatchError(f"the keypoints have {_kind(descriptors)}, the map has {_kind(ours)}")
+        if ours.dtype == np.float32:
+            return descriptors.astype(np.float32, copy=False)
+        return descriptors
+
+    def _by_id(self, keypoints: Keypoints) -> Matches:
+        assert keypoints.ids is not None
+        assert self._order is not None
+        places = np.searchsorted(self._sorted, keypoints.ids)
+        places[places == len(self._sorted)] = 0
+        known = np.flatnonzero(self._sorted[places] == keypoints.ids)
+        # An id that comes twice shows the landmark where the score is best, or first.
+        if keypoints.scores is not None:
+            known = known[np.argsort(-keypoints.scores[known], kind="stable")]
+        _, firsts = np.unique(keypoints.ids[known], return_index=True)
+        rows = np.sort(known[firsts])
+        scores = None if keypoints.scores is None else keypoints.scores[rows]
+        return Matches(rows, self._order[places[rows]], scores, MatchBy.ID)
+
+    def _anywhere(self, queries: Descriptors, settings: Matching) -> tuple[Nearest, IntArray]:
+        """The two nearest of all landmarks, and for each query its rival (q,)."""
+        assert self._index is not None
+        assert self.map.descriptors is not None
+        found = self._index.nearest(queries)
+        owners = np.arange(len(queries))
+        if settings.mutual and len(queries):
+            firsts = found.landmarks[:, 0]
+            there = np.flatnonzero(firsts >= 0)
+            back = make_index(queries).nearest(self.map.descriptors[firsts[there]])
+            owners[there] = back.landmarks[:, 0]
+        return found, owners
+
+    def _predicted(
+        self,
+        queries: Descriptors,
+        pixels: Array,
+        settings: Matching,
+        camera: Camera,
+        prior: Prior,
+    ) -> tuple[Nearest, IntArray]:
+        """The same among the landmarks that are predicted near each query."""
+        assert self._index is not None
+        visible = predict_landmarks(camera, prior, self.map.points, settings.gate)
+        found, owners = self._index.nearest_within(queries, pixels, visible)
+        if not settings.mutual:
+            return found, np.arange(len(queries))
+        owner_of = np.full(len(self.map), -1, np.int64)
+        owner_of[visible.landmarks] = owners
+        return found, owner_of[found.landmarks[:, 0]]
+
+
+def _best(keypoints: Keypoints, most: int) -> IntArray:
+    """The best keypoints, in their own order."""
+    count = len(keypoints)
+    if count <= most:
+        return np.arange(count)
+    if keypoints.scores is None:
+        return np.arange(most)
+    return np.sort(np.argsort(-keypoints.scores, kind="stable")[:most])
+
+
+def _accepted(found: Nearest, owners: IntArray, rows: IntArray, ratio: float) -> Matches:
+    """Matches that pass; the score is how much nearer the first landmark is than the second."""
+    first, second = found.distances[:, 0], found.distances[:, 1].copy()
+    rivals = np.isfinite(second)
+    if np.any(rivals):
+        # Where nothing else competes, nearer than others' second ones is near.
+        second[~rivals] = np.median(second[rivals])
+    with np.errstate(invalid="ignore"):  # infinite against infinite: nothing there
+        good = (first < ratio * second) & (owners == np.arange(len(first)))
+    queries = np.flatnonzero(good)
+    # Without the mutual check several may remain for one landmark: the nearest.
+    queries = queries[np.argsort(first[queries], kind="stable")]
+    _, firsts = np.unique(found.landmarks[queries, 0], return_index=True)
+    queries = np.sort(queries[firsts])
+    scores = 1.0 - first[queries] / second[queries]
+    return Matches(rows[queries], found.landmarks[queries, 0], scores, MatchBy.DESCRIPTOR)
+
+
+def _marks(ids: Ids | None, descriptors: Descriptors | None) -> str:
+    names = [] if ids is None else ["ids"]
+    names += [] if descriptors is None else [_kind(descriptors)]
+    return " and ".join(names) or "neither"
+
+
+def _kind(descriptors: Descriptors) -> str:
+    return f"descriptors of {descriptors.shape[1]} x {descriptors.dtype}"

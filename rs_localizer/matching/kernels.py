@@ -1,0 +1,187 @@
+"""Compiled searches for the two landmarks whose descriptors are nearest to each keypoint's.
+
+Binary descriptors come as rows of 64-bit words, four or a multiple of four of them. Results are
+written into distances (q,2), infinite before, and indices (q,2), -1 before.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.so3 import Array
+
+_BLOCK = 256  # landmarks whose words stay in the first cache
+_FAR = 1 << 30
+
+
+def _ctpop(typingctx: Any, word: Any) -> Any:
+    """How many bits of a 64-bit word are set: one instruction, of vectors too."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.int64(types.uint64), generate
+
+
+_count_bits: Any = intrinsic(_ctpop)
+
+
+@kernel
+def _insert(distance: float, index: int, distances: Any, indices: Any) -> None:
+    """Keep the two nearest, the earlier ones at equal distance."""
+    if distance < distances[0]:
+        distances[1], indices[1] = distances[0], indices[0]
+        distances[0], indices[0] = distance, index
+    elif distance < distances[1]:
+        distances[1], indices[1] = distance, index
+
+
+@kernel
+def _hamming(query: Any, columns: Any, start: int, count: int, found: Any) -> None:
+    """Distances of one descriptor (w,) to ``count`` columns of (w,n)."""
+    for word in range(0, len(query), 4):
+        a, b, c, d = query[word], query[word + 1], query[word + 2], query[word + 3]
+        # Slices, not indices into the whole: these loops become vector instructions.
+        one = columns[word, start : start + count]
+        two = columns[word + 1, start : start + count]
+        three = columns[word + 2, start : start + count]
+        four = columns[word + 3, start : start + count]
+        if word == 0:
+            for j in range(count):
+                found[j] = (
+                    _count_bits(a ^ one[j])
+                    + _count_bits(b ^ two[j])
+                    + _count_bits(c ^ three[j])
+                    + _count_bits(d ^ four[j])
+                )
+        else:
+            for j in range(count):
+                found[j] += (
+                    _count_bits(a ^ one[j])
+                    + _count_bits(b ^ two[j])
+                    + _count_bits(c ^ three[j])
+                    + _count_bits(d ^ four[j])
+                )
+
+
+@kernel
+def nearest_binary(queries: Any, columns: Any, distances: Array, indices: Any) -> None:
+    """Among all landmarks (w,n), for queries (q,w)."""
+    found = np.empty(_BLOCK, np.int64)
+    for start in range(0, columns.shape[1], _BLOCK):
+        count = min(columns.shape[1] - start, _BLOCK)
+        for q in range(len(queries)):
+            _hamming(queries[q], columns, start, count, found)
+            nearest = np.int64(_FAR)
+            for j in range(count):
+                nearest = min(nearest, found[j])
+            second = distances[q, 1]
+            if nearest < second:  # seldom, once some blocks have been seen
+                for j in range(count):
+                    if found[j] < second:
+                        _insert(float(found[j]), start + j, distances[q], indices[q])
+                        second = distances[q, 1]
+
+
+@kernel
+def nearest_binary_within(
+    queries: Any,
+    pixels: Array,
+    rows: Any,
+    visible: Any,
+    predicted: Array,
+    gate: float,
+    distances: Array,
+    indices: Any,
+    rivals: Array,
+    owners: Any,
+) -> None:
+    """Among the landmarks ``visible`` (v,) of rows (n,w) that are predicted near the keypoint.
+
+    Args:
+        pixels: (q,2) of the keypoints.
+        predicted: (v,2) pixels of the landmarks, in the order of their second coordinate.
+        gate: px between the two.
+        rivals, owners: (v,) distance and index of the nearest keypoint of each landmark.
+    """
+    lines = predicted[:, 1].copy()
+    for q in range(len(queries)):
+        u, v = pixels[q, 0], pixels[q, 1]
+        for k in range(np.searchsorted(lines, v - gate), len(lines)):
+            if lines[k] > v + gate:
+                break
+            if (predicted[k, 0] - u) ** 2 + (lines[k] - v) ** 2 > gate * gate:
+                continue
+            row = visible[k]
+            bits = 0
+            for word in range(queries.shape[1]):
+                bits += _count_bits(queries[q, word] ^ rows[row, word])
+            _insert(float(bits), row, distances[q], indices[q])
+            if bits < rivals[k]:
+                rivals[k], owners[k] = float(bits), q
+
+
+@kernel
+def nearest_real_within(
+    queries: Any,
+    pixels: Array,
+    rows: Any,
+    visible: Any,
+    predicted: Array,
+    gate: float,
+    distances: Array,
+    indices: Any,
+    rivals: Array,
+    owners: Any,
+) -> None:
+    """As :func:`nearest_binary_within`, by the Euclidean distance of rows of numbers."""
+    lines = predicted[:, 1].copy()
+    for q in range(len(queries)):
+        u, v = pixels[q, 0], pixels[q, 1]
+        for k in range(np.searchsorted(lines, v - gate), len(lines)):
+            if lines[k] > v + gate:
+                break
+            if (predicted[k, 0] - u) ** 2 + (lines[k] - v) ** 2 > gate * gate:
+                continue
+            row = visible[k]
+            squared = 0.0
+            for i in range(queries.shape[1]):
+                squared += (queries[q, i] - rows[row, i]) ** 2
+            distance = np.sqrt(squared)
+            _insert(distance, row, distances[q], indices[q])
+            if distance < rivals[k]:
+                rivals[k], owners[k] = distance, q
+
+
+@kernel
+def in_view(points: Array, state: Array, low: Array, high: Array, depths: Array) -> None:
+    """Depths (n,) of points (n,3) that some row may see; 0 of the others.
+
+    A bearing moves by half its change per readout at most, to first order.
+
+    Args:
+        state: (18,) rotation, translation, angular and linear velocity of a motion.
+        low, high: (2,) bounds of the bearings in the image.
+    """
+    R, t, w, s = state[:9], state[9:12], state[12:15], state[15:]
+    for n in range(len(points)):
+        X, Y, Z = points[n, 0], points[n, 1], points[n, 2]
+        x = R[0] * X + R[1] * Y + R[2] * Z + t[0]
+        y = R[3] * X + R[4] * Y + R[5] * Z + t[1]
+        z = R[6] * X + R[7] * Y + R[8] * Z + t[2]
+        depths[n] = 0.0
+        if z <= 0.0:
+            continue
+        # Velocity of the point in the camera: -omega x p - v.
+        dx = w[2] * y - w[1] * z - s[0]
+        dy = w[0] * z - w[2] * x - s[1]
+        dz = w[1] * x - w[0] * y - s[2]
+        a, b = x / z, y / z
+        side, up = 0.5 * abs((dx - a * dz) / z), 0.5 * abs((dy - b * dz) / z)
+        if low[0] - side < a < high[0] + side and low[1] - up < b < high[1] + up:
+            depths[n] = z

@@ -1,0 +1,233 @@
+"""Matches against plain loops; what passes, what is kept, what is refused."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.config import Matching
+from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.maps import Map
+from rs_localizer.matching import Matcher, MatchError
+from rs_localizer.matching.descriptors import Visible, make_index
+
+
+def make_map(count: int, **fields: Any) -> Map:
+    return Map(np.zeros((count, 3)), fields.get("ids"), fields.get("descriptors"), "map")
+
+
+def keypoints(count: int, **fields: Any) -> Keypoints:
+    pixels = fields.get("pixels", np.zeros((count, 2)))
+    return Keypoints(
+        0, pixels, fields.get("ids"), fields.get("descriptors"), fields.get("scores"), 0
+    )
+
+
+def descriptors(kind: str, count: int, width: int, seed: int) -> Any:
+    rng = np.random.default_rng(seed)
+    if kind == "bits":  # few bits differ, so that many distances are equal
+        return rng.integers(0, 2, (count, width), dtype=np.uint8) * 255
+    return rng.normal(size=(count, width)).astype(np.float32)
+
+
+def distances(one: Any, other: Any) -> Any:
+    """(n,m) by the definition."""
+    if one.dtype == np.uint8:
+        table = [
+            [sum((int(a) ^ int(b)).bit_count() for a, b in zip(x, y, strict=True)) for y in other]
+            for x in one
+        ]
+    else:
+        table = [[np.linalg.norm(x.astype(float) - y.astype(float)) for y in other] for x in one]
+    return np.array(table, dtype=float)
+
+
+@pytest.mark.parametrize("kind", ["bits", "numbers"])
+@pytest.mark.parametrize("width", [1, 32, 61])
+@pytest.mark.parametrize("count", [1, 2, 300])
+def test_the_two_nearest_of_all(kind: str, width: int, count: int) -> None:
+    landmarks, queries = descriptors(kind, count, width, 0), descriptors(kind, 9, width, 1)
+    found = make_index(landmarks).nearest(queries)
+    table = distances(queries, landmarks)
+    order = np.argsort(table, axis=1, kind="stable")[:, :2]
+    expected = np.take_along_axis(table, order, 1)
+    assert np.allclose(found.distances[:, : order.shape[1]], expected, rtol=1e-5)
+    at_found = np.take_along_axis(table, found.landmarks[:, : order.shape[1]], 1)
+    assert np.allclose(at_found, expected, rtol=1e-5)
+    if kind == "bits":  # no rounding: the first ones of equal distance
+        assert found.landmarks[:, : order.shape[1]].tolist() == order.tolist()
+    if count == 1:
+        assert np.all(np.isinf(found.distances[:, 1]))
+        assert np.all(found.landmarks[:, 1] == -1)
+
+
+def test_more_landmarks_than_a_block_holds() -> None:
+    for kind in ("bits", "numbers"):
+        landmarks = descriptors(kind, 5000, 8, 0)
+        if kind == "bits":
+            landmarks = np.random.default_rng(0).integers(0, 256, (5000, 8), dtype=np.uint8)
+        rows = np.array([0, 255, 256, 4095, 4096, 4999])
+        found = make_index(landmarks).nearest(landmarks[rows])
+        assert found.landmarks[:, 0].tolist() == rows.tolist()
+        assert np.all(found.distances[:, 0] == 0.0)
+
+
+@pytest.mark.parametrize("kind", ["bits", "numbers"])
+def test_the_two_nearest_within_the_gate(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    landmarks, queries = descriptors(kind, 200, 32, 0), descriptors(kind, 30, 32, 1)
+    pixels, predicted = rng.uniform(0, 100, (30, 2)), rng.uniform(0, 100, (80, 2))
+    rows = rng.permutation(200)[:80]
+    order = np.argsort(predicted[:, 1])
+    visible = Visible(rows[order], predicted[order], 15.0)
+    found, owners = make_index(landmarks).nearest_within(queries, pixels, visible)
+    table = distances(queries, landmarks[rows])
+    table[np.linalg.norm(pixels[:, None] - predicted[None], axis=2) > 15.0] = np.inf
+    expected = np.sort(table, axis=1)[:, :2]
+    assert np.allclose(found.distances, expected, rtol=1e-5)
+    assert np.any(np.isinf(expected[:, 1]))
+    for q in range(30):
+        for k in range(2):
+            if np.isfinite(expected[q, k]):
+                column = rows.tolist().index(found.landmarks[q, k])
+                assert np.isclose(table[q, column], expected[q, k], rtol=1e-5)
+            else:
+                assert found.landmarks[q, k] == -1
+    table = table[:, order]
+    for column, owner in enumerate(owners):
+        if np.isinf(table[:, column].min()):
+            assert owner == -1
+        else:
+            assert np.isclose(table[owner, column], table[:, column].min(), rtol=1e-5)
+
+
+def test_numbers_beyond_all_bounds_raise_nothing() -> None:
+    huge = np.full((3, 4), 3e38, np.float32)
+    found = Matcher(make_map(3, descriptors=huge)).match(
+        keypoints(2, descriptors=-huge[:2]), Matching()
+    )
+    assert len(found) == 0
+
+
+def matched(matcher: Matcher, points: Keypoints, **settings: Any) -> dict[int, int]:
+    found = matcher.match(points, Matching(**settings))
+    return dict(zip(found.keypoints.tolist(), found.landmarks.tolist(), strict=True))
+
+
+def test_ids() -> None:
+    matcher = Matcher(make_map(4, ids=np.array([70, -5, 0, 33])))
+    given = keypoints(5, ids=np.array([33, 8, -5, 99, 70]))
+    assert matched(matcher, given) == {0: 3, 2: 1, 4: 0}
+    assert matcher.match(given, Matching()).scores is None
+    assert matched(matcher, keypoints(2, ids=np.array([8, 9]))) == {}
+
+
+def test_an_id_that_comes_twice_in_an_image() -> None:
+    matcher = Matcher(make_map(2, ids=np.array([1, 2])))
+    ids = np.array([2, 1, 2, 1])
+    assert matched(matcher, keypoints(4, ids=ids)) == {0: 1, 1: 0}
+    best = matcher.match(keypoints(4, ids=ids, scores=np.array([1.0, 2.0, 3.0, 4.0])), Matching())
+    assert best.keypoints.tolist() == [2, 3]
+    assert best.landmarks.tolist() == [1, 0]
+    assert best.scores is not None
+    assert best.scores.tolist() == [3.0, 4.0]
+
+
+def bits(*counts: int) -> Any:
+    """Descriptors of 4 bytes with so many bits set, the same ones first."""
+    rows = [(2**count - 1).to_bytes(4, "little") for count in counts]
+    return np.array([list(row) for row in rows], np.uint8)
+
+
+def test_the_ratio_test() -> None:
+    matcher = Matcher(make_map(2, descriptors=bits(0, 20)))
+    # Distances to the landmarks: 4 and 16, 9 and 11.
+    given = keypoints(2, descriptors=bits(4, 9))
+    assert matched(matcher, given, mutual=False, ratio=0.8) == {0: 0}
+    assert matched(matcher, given, mutual=False, ratio=0.25) == {}
+    found = matcher.match(given, Matching(ratio=0.8))
+    assert found.scores is not None
+    assert found.scores.tolist() == [1.0 - 4 / 16]
+
+
+def test_the_mutual_check_and_the_best_of_several() -> None:
+    matcher = Matcher(make_map(2, descriptors=bits(0, 30)))
+    # Two keypoints like the first landmark; the second is the nearer one.
+    given = keypoints(3, descriptors=bits(3, 2, 29))
+    assert matched(matcher, given) == {1: 0, 2: 1}
+    assert matched(matcher, given, mutual=False) == {1: 0, 2: 1}
+    # The same distance twice: the first.
+    assert matched(matcher, keypoints(2, descriptors=bits(2, 2))) == {0: 0}
+
+
+def test_a_landmark_without_rivals_is_judged_by_those_of_the_others() -> None:
+    alone = Matcher(make_map(1, descriptors=bits(0)))
+    assert matched(alone, keypoints(1, descriptors=bits(31))) == {0: 0}
+
+
+def test_at_most_so_many_keypoints() -> None:
+    landmarks = np.random.default_rng(0).integers(0, 256, (30, 32), dtype=np.uint8)
+    matcher = Matcher(make_map(30, descriptors=landmarks))
+    first = matched(matcher, keypoints(30, descriptors=landmarks), max_keypoints=10)
+    assert first == {k: k for k in range(10)}
+    scores = np.arange(30.0)
+    best = matched(matcher, keypoints(30, descriptors=landmarks, scores=scores), max_keypoints=10)
+    assert best == {k: k for k in range(20, 30)}
+
+
+def test_by_what() -> None:
+    landmarks = bits(0, 20)
+    matcher = Matcher(make_map(2, ids=np.array([1, 2]), descriptors=landmarks))
+    both = keypoints(2, ids=np.array([2, 1]), descriptors=landmarks)
+    assert matched(matcher, both) == matched(matcher, both, by="descriptor") == {0: 0, 1: 1}
+    assert matched(matcher, both, by="id") == {0: 1, 1: 0}
+    assert matched(matcher, keypoints(2, ids=np.array([2, 1]))) == {0: 1, 1: 0}
+
+
+@pytest.mark.parametrize(
+    ("landmarks", "points", "settings", "text"),
+    [
+        (
+            {"ids": np.arange(2)},
+            {"descriptors": bits(0, 1)},
+            {},
+            "by descriptor or id: the keypoints have descriptors of 4 x uint8, the map has ids",
+        ),
+        ({"ids": np.arange(2)}, {"ids": np.arange(2)}, {"by": "descriptor"}, "by descriptor: "),
+        ({}, {"ids": np.arange(2)}, {}, "the keypoints have ids, the map has neither"),
+        (
+            {"descriptors": bits(0, 1)},
+            {"descriptors": np.zeros((2, 64), np.uint8)},
+            {},
+            "the keypoints have descriptors of 64 x uint8, the map has descriptors of 4 x uint8",
+        ),
+        (
+            {"descriptors": bits(0, 1)},
+            {"descriptors": np.zeros((2, 4), np.float32)},
+            {},
+            "the keypoints have descriptors of 4 x float32, the map has",
+        ),
+    ],
+)
+def test_what_cannot_be_compared(
+    landmarks: dict[str, Any], points: dict[str, Any], settings: dict[str, Any], text: str
+) -> None:
+    matcher = Matcher(make_map(2, **landmarks))
+    with pytest.raises(MatchError, match=re.escape(text)):
+        matcher.match(keypoints(2, **points), Matching(**settings))
+
+
+def test_bytes_are_numbers_where_the_map_has_numbers() -> None:
+    """SIFT comes in bytes or in floats."""
+    rows = np.random.default_rng(0).integers(0, 256, (20, 128), dtype=np.uint8)
+    matcher = Matcher(make_map(20, descriptors=rows.astype(np.float32)))
+    assert matched(matcher, keypoints(5, descriptors=rows[:5])) == {k: k for k in range(5)}
+
+
+def test_no_keypoints() -> None:
+    matcher = Matcher(make_map(2, ids=np.arange(2), descriptors=bits(0, 1)))
+    assert matched(matcher, keypoints(0, descriptors=np.zeros((0, 4), np.uint8))) == {}
+    assert matched(matcher, keypoints(0, ids=np.zeros(0, np.int64))) == {}

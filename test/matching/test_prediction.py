@@ -1,0 +1,111 @@
+"""Predicted landmarks against the exact rolling-shutter projection, for every camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.config import Matching
+from rs_localizer.core import so3
+from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.core.prior import Prior
+from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.io.keypoints import Keypoints
+from rs_localizer.io.maps import Map
+from rs_localizer.lab.scene import room
+from rs_localizer.matching import Matcher
+from rs_localizer.matching.prediction import predict_landmarks
+
+K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERAS: dict[str, dict[str, Any]] = {
+    "ideal": {},
+    "sideways": {"scan_direction": "right_to_left"},
+    "distorted": {"D": np.array([-0.25, 0.05, 1e-3, -1e-3, 0.0])},
+    "fisheye": {"D": np.array([0.05, -0.01, 0.0, 0.0]), "distortion_model": "equidistant"},
+    "part": {"binning": (2, 2), "roi": Roi(100, 60, 400, 300)},
+}
+MOTION = Motion(
+    so3.exp(np.array([0.2, -0.4, 0.1])),
+    np.array([0.3, -0.1, 0.4]),
+    np.array([0.1, -0.2, 0.3]),
+    np.array([0.05, -0.03, 0.1]),
+)
+SURE = Prior(motion=MOTION, covariance=1e-10 * np.eye(12))
+
+
+@pytest.fixture(scope="module")
+def points() -> Any:
+    return room(np.zeros((1, 3)), np.random.default_rng(0), count=20_000)
+
+
+def camera(name: str) -> Camera:
+    return Camera(640, 480, K, readout_time=0.03, **CAMERAS[name])
+
+
+@pytest.mark.parametrize("name", list(CAMERAS))
+def test_all_that_the_image_shows_is_predicted_where_it_is(name: str, points: Any) -> None:
+    view = camera(name)
+    pixels, _ = project_rolling(view, MOTION.at_rows, points)
+    shown = np.flatnonzero(view.inside(pixels))
+    assert len(shown) > 300
+    found = predict_landmarks(view, SURE, points, 20.0)
+    assert found.gate == 20.0
+    assert np.all(np.diff(found.pixels[:, 1]) >= 0.0)
+    place = {row: k for k, row in enumerate(found.landmarks.tolist())}
+    # A lens model folds what is far outside into the image: of those some are not predicted.
+    straight = [row for row in shown.tolist() if is_seen(view, points[row], pixels[row])]
+    assert len(straight) > 300
+    assert set(straight) <= set(place)
+    # The camera turns by 21 degrees while the image is read.
+    errors = np.abs(found.pixels[[place[row] for row in straight]] - pixels[straight]).max(axis=1)
+    assert np.quantile(errors, 0.9) < 0.2
+    assert errors.max() < 2.0
+    # And not much else: not the whole room.
+    assert len(found.landmarks) < 3 * len(shown) < 0.9 * len(points)
+
+
+def is_seen(view: Camera, point: Any, pixel: Any) -> bool:
+    """Whether the pixel's bearing, at its own row, meets the point."""
+    ray = view.rays(pixel[None])[0]
+    rotation, translation = MOTION.at(float(view.row_time(pixel[None])[0]))
+    x, y, z = rotation @ point + translation
+    return bool(z > 0.0 and np.abs(ray - (x / z, y / z)).max() < 1e-3)
+
+
+def test_the_gate_is_as_wide_as_the_prediction_is_uncertain(points: Any) -> None:
+    view = camera("ideal")
+    covariance = np.diag(np.repeat([0.03**2, 1e-8, 1e-8, 1e-8], 3))
+    wide = predict_landmarks(view, Prior(motion=MOTION, covariance=covariance), points, 20.0)
+    assert wide.gate == pytest.approx(3.0 * 0.03 * np.sqrt(400.0 * 410.0), rel=1e-3)
+    lost = predict_landmarks(view, Prior(motion=MOTION, covariance=np.eye(12)), points, 20.0)
+    assert lost.gate == pytest.approx(400.0)  # half the diagonal: everything
+
+
+def test_nothing_in_view() -> None:
+    behind = MOTION.rotation.T @ (np.array([[0.0, 0.0, -5.0]]) - MOTION.translation).T
+    found = predict_landmarks(camera("ideal"), SURE, np.ascontiguousarray(behind.T), 20.0)
+    assert len(found.landmarks) == 0
+    matcher = Matcher(Map(behind.T.copy(), None, np.zeros((1, 32), np.uint8), "map"))
+    given = Keypoints(0, np.zeros((1, 2)), None, np.zeros((1, 32), np.uint8), None, 0)
+    assert len(matcher.match(given, Matching(), camera("ideal"), SURE)) == 0
+    assert len(matcher.match(given, Matching(gate=0.0), camera("ideal"), SURE)) == 1
+
+
+@pytest.mark.parametrize("mutual", [True, False])
+def test_a_prediction_tells_apart_what_looks_the_same(points: Any, mutual: bool) -> None:
+    """Only a hundred kinds of landmarks: by their looks alone none is recognized."""
+    view = camera("ideal")
+    rng = np.random.default_rng(1)
+    descriptors = rng.integers(0, 256, (100, 32), dtype=np.uint8)[rng.integers(0, 100, len(points))]
+    pixels, _ = project_rolling(view, MOTION.at_rows, points)
+    shown = rng.permutation(np.flatnonzero(view.inside(pixels)))[:200]
+    seen = pixels[shown] + rng.normal(0.0, 0.5, (200, 2))
+    given = Keypoints(0, seen, None, descriptors[shown], None, 0)
+    matcher = Matcher(Map(points, None, descriptors, "map"))
+    assert len(matcher.match(given, Matching())) == 0
+    found = matcher.match(given, Matching(gate=5.0, mutual=mutual), view, SURE)
+    assert len(found) > 150
+    assert np.mean(found.landmarks == shown[found.keypoints]) > 0.95
+    assert len(set(found.landmarks.tolist())) == len(found)
