@@ -308,3 +308,54 @@ class NodeConfig(LocalizerConfig):
                 raise ValueError(f"{name} must not be empty")
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")
+
+
+class ImageTransport(StrEnum):
+    """Which image topic the marker detector listens to."""
+
+    AUTO = "auto"
+    RAW = "raw"
+    COMPRESSED = "compressed"
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorConfig:
+    """Settings of the marker detector."""
+
+    marker_map: str = setting(
+        "", "File of the marker map; rs_localizer markers make writes one with the prints"
+    )
+    min_side: float = setting(
+        10.0,
+        "Markers with a shorter side than this, in px, are left out",
+        minimum=0.0,
+        maximum=10000.0,
+    )
+    transport: str = setting(
+        ImageTransport.AUTO.value,
+        "Topic of the images; auto: image if it has a publisher, otherwise image/compressed",
+        choices=tuple(transport.value for transport in ImageTransport),
+        read_only=True,
+    )
+    readout_time: float = setting(
+        0.0,
+        "Only for the debug image: time from the first to the last row, in s, as the localizer's",
+        minimum=0.0,
+        maximum=0.2,
+    )
+    scan_direction: str = setting(
+        ScanDirection.TOP_TO_BOTTOM.value,
+        "Only for the debug image: direction in which the shutter moves, as the localizer's",
+        choices=tuple(direction.value for direction in ScanDirection),
+    )
+    stamp_offset: float = setting(
+        0.0,
+        "Only for the debug image: time from header.stamp to the middle of the exposure of the "
+        "first row, in s, as the localizer's",
+        minimum=-10.0,
+        maximum=10.0,
+    )
+    autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
+
+    def __post_init__(self) -> None:
+        _check(self)

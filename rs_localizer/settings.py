@@ -9,17 +9,24 @@ import contextlib
 import difflib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import yaml
 
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import DetectorConfig, NodeConfig
 
 NODE_NAME = "rs_localizer"
+DETECTOR_NAME = "marker_detector"
+# The settings of each node.
+_NODES: dict[Kind, str] = {NodeConfig: NODE_NAME, DetectorConfig: DETECTOR_NAME}
 # Parameters that every ROS 2 node may have; they say nothing about poses.
 _FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")
+
+
+Kind = type[NodeConfig] | type[DetectorConfig]
+Config = TypeVar("Config", NodeConfig, DetectorConfig)
+_found: dict[Kind, dict[str, Setting]] = {}
 
 
 class SettingsError(ValueError):
@@ -38,10 +45,11 @@ class Setting:
     read_only: bool
 
 
-@lru_cache(maxsize=1)
-def settings() -> dict[str, Setting]:
-    """All settings of the node, by dotted name."""
-    return dict(_walk(NodeConfig(), ""))
+def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:
+    """All settings of a node, by dotted name."""
+    if kind not in _found:
+        _found[kind] = dict(_walk(kind(), ""))
+    return _found[kind]
 
 
 def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
@@ -53,23 +61,27 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
             yield prefix + item.name, Setting(default=value, **item.metadata)
 
 
-def unknown(name: str) -> str | None:
+def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
     """What to say of a name that is no setting; None for settings and what every node may have."""
-    if name in settings() or name.split(".")[0] in _FOREIGN:
+    known = settings(kind)
+    if name in known or name.split(".")[0] in _FOREIGN:
         return None
-    close = difflib.get_close_matches(name, settings(), n=1)
-    hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(settings())}"
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
     return f"{name!r} is no setting; {hint}"
 
 
-def build(values: Mapping[str, Any]) -> NodeConfig:
+@overload
+def build(values: Mapping[str, Any]) -> NodeConfig: ...
+@overload
+def build(values: Mapping[str, Any], kind: type[Config]) -> Config: ...
+def build(values: Mapping[str, Any], kind: Any = NodeConfig) -> Any:
     """Settings from values by dotted name; what is missing has its default.
 
     Raises:
         ValueError: for a wrong value.
     """
-    config: NodeConfig = _build(NodeConfig(), values, "")
-    return config
+    return _build(kind(), values, "")
 
 
 def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
@@ -83,8 +95,12 @@ def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
     return type(config)(**chosen)
 
 
-def load_params_file(path: Path) -> dict[str, Any]:
+def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
     """Values by dotted name of a ROS 2 params file, as far as it is meant for the node.
+
+    Args:
+        path: the file.
+        kind: which node's settings.
 
     Raises:
         SettingsError: for a file that cannot be read, a name that is no setting, or a file
@@ -97,14 +113,15 @@ def load_params_file(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
     values: dict[str, Any] = {}
-    blocks = list(_blocks(tree, ""))
+    node = _NODES[kind]
+    blocks = list(_blocks(tree, "", node))
     for name, parameters in blocks:
         if not isinstance(parameters, dict):
             raise SettingsError(f"{path}: ros__parameters of {name} must be a mapping")
         values.update(_flatten(parameters, ""))
     if not blocks:
-        raise SettingsError(f"{path} has no ros__parameters for /{NODE_NAME} (or /**)")
-    return {name: _checked(name, value, str(path)) for name, value in values.items()}
+        raise SettingsError(f"{path} has no ros__parameters for /{node} (or /**)")
+    return {name: _checked(name, value, str(path), kind) for name, value in values.items()}
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
@@ -117,21 +134,21 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     if not separator or not name:
         raise SettingsError(f"expected name:=value, got {text!r}")
     try:
-        return name, _checked(name, yaml.safe_load(value), text)
+        return name, _checked(name, yaml.safe_load(value), text, NodeConfig)
     except yaml.YAMLError as error:
         raise SettingsError(f"the value of {text!r} cannot be read") from error
 
 
-def _blocks(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
+def _blocks(tree: Any, path: str, node: str) -> Iterator[tuple[str, Any]]:
     """Blocks ``ros__parameters`` whose node name, given as a path or nested, is ours."""
     if not isinstance(tree, dict):
         return
     for key, value in tree.items():
         if key == "ros__parameters":
-            if path.rsplit("/", 1)[-1] in (NODE_NAME, "*", "**"):
+            if path.rsplit("/", 1)[-1] in (node, "*", "**"):
                 yield path, value
         else:
-            yield from _blocks(value, f"{path}/{str(key).strip('/')}")
+            yield from _blocks(value, f"{path}/{str(key).strip('/')}", node)
 
 
 def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
@@ -145,10 +162,10 @@ def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any
             yield name, value
 
 
-def _checked(name: str, value: Any, where: str) -> Any:
-    if name not in settings():
-        raise SettingsError(f"{where}: {unknown(name) or f'{name!r} is no setting'}")
-    if isinstance(value, str) and isinstance(settings()[name].default, float):
+def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
+    if name not in settings(kind):
+        raise SettingsError(f"{where}: {unknown(name, kind) or f'{name!r} is no setting'}")
+    if isinstance(value, str) and isinstance(settings(kind)[name].default, float):
         # ROS reads 1e-3 as a number, PyYAML as text.
         with contextlib.suppress(ValueError):
             return float(value)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rs_localizer.config import NodeConfig, VelocityPrior
+from rs_localizer.config import DetectorConfig, NodeConfig, VelocityPrior
 from rs_localizer.settings import (
     SettingsError,
     build,
@@ -40,6 +40,19 @@ def test_the_shipped_file_names_all_choices() -> None:
         leaf = name.rsplit(".", 1)[-1]
         line = next((line for line in lines if line.startswith(f"{leaf}:")), "")
         assert all(choice in line for choice in setting.choices), name
+
+
+def test_the_detectors_file_holds_exactly_its_defaults_and_choices() -> None:
+    path = SHIPPED.with_name("marker_detector.yaml")
+    values = load_params_file(path, DetectorConfig)
+    known = settings(DetectorConfig)
+    assert values == {name: setting.default for name, setting in known.items()}
+    assert build(values, DetectorConfig) == DetectorConfig()
+    lines = [line.strip() for line in path.read_text().splitlines()]
+    for name, setting in known.items():
+        line = next(line for line in lines if line.startswith(f"{name}:"))
+        assert all(choice in line for choice in setting.choices), name
+        assert setting.description, name
 
 
 def test_names_are_dotted_and_described() -> None:

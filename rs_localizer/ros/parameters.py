@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -15,16 +16,20 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.settings import Setting, build, settings, unknown
+from rs_localizer.settings import Kind, Setting, build, settings, unknown
 
 
-def declare(node: Node) -> NodeConfig:
+def declare(node: Node, kind: Kind = NodeConfig) -> Any:
     """Declare every setting as a parameter and return those that the node was started with.
+
+    Args:
+        node: whose parameters they become.
+        kind: the class of its settings.
 
     Raises:
         ValueError: for a value of a wrong type or out of range, saying what was found.
     """
-    for name, setting in settings().items():
+    for name, setting in settings(kind).items():
         try:
             node.declare_parameter(name, setting.default, _descriptor(setting))
         except InvalidParameterTypeException as error:
@@ -37,32 +42,36 @@ def declare(node: Node) -> NodeConfig:
             ) from error
         except InvalidParameterValueException as error:
             raise ValueError(str(error)) from error
-    return read(node)
+    return read(node, kind=kind)
 
 
-def unknown_names(node: Node) -> list[str]:
+def unknown_names(node: Node, kind: Kind = NodeConfig) -> list[str]:
     """What to say of each parameter that the node was started with and does not have.
 
     No reason to refuse the start: a params file for ``/**`` speaks to several nodes.
     """
-    return [text for name in sorted(node._parameter_overrides) if (text := unknown(name))]
+    names = sorted(node._parameter_overrides)
+    return [text for name in names if (text := unknown(name, kind))]
 
 
-def read(node: Node, changes: list[Parameter] | None = None) -> NodeConfig:
+def read(node: Node, changes: list[Parameter] | None = None, kind: Kind = NodeConfig) -> Any:
     """The settings of the node's parameters, with these changes.
 
     Raises:
         ValueError: for values that the settings refuse.
     """
-    values = {name: node.get_parameter(name).value for name in settings()}
+    values = {name: node.get_parameter(name).value for name in settings(kind)}
     for parameter in changes or ():
         if parameter.name in values:  # there are also use_sim_time and the QoS overrides
             values[parameter.name] = parameter.value
-    return build(values)
+    return build(values, kind)
 
 
 def on_change(
-    node: Node, check: Callable[[NodeConfig], None], apply: Callable[[NodeConfig], None]
+    node: Node,
+    check: Callable[[Any], None],
+    apply: Callable[[Any], None],
+    kind: Kind = NodeConfig,
 ) -> None:
     """Check, then apply, changes of parameters; several set at once are one change.
 
@@ -70,18 +79,19 @@ def on_change(
         node: with declared parameters.
         check: raises ``ValueError`` for settings that are refused: then all stay as they were.
         apply: takes settings that were accepted.
+        kind: the class of the node's settings.
     """
 
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         try:
-            check(read(node, parameters))
+            check(read(node, parameters, kind))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def after_set(parameters: list[Parameter]) -> None:
-        if any(parameter.name in settings() for parameter in parameters):
-            apply(read(node))
+        if any(parameter.name in settings(kind) for parameter in parameters):
+            apply(read(node, kind=kind))
 
     node.add_on_set_parameters_callback(on_set)
     node.add_post_set_parameters_callback(after_set)
