@@ -110,6 +110,11 @@ class FrameLocalizer:
         self._config = config
 
     @property
+    def calibration(self) -> Calibration | None:
+        """What the last usable camera_info said."""
+        return self._calibration
+
+    @property
     def camera_frame(self) -> str:
         """The camera's optical frame; empty as long as it is unknown."""
         return "" if self._calibration is None else self._calibration.frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,12 +15,13 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
     qos_check_compatible,
-    qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from rs_localizer.ros.conversion import type_name
+from rs_localizer.ros.intake import Intake, NotByExecutor
+from rs_localizer.ros.refusals import Refusals
 
 # As qos_profile_sensor_data: best effort, and room for the messages that come while the executor
 # is busy elsewhere; the mailbox keeps the newest of them and counts the others.
@@ -34,7 +36,7 @@ class Topic:
     """An input of a node."""
 
     type: type
-    callback: Callable[[Any], None]  # runs in the executor's thread
+    callback: Callable[[Any], None]  # runs in a thread of the inputs
     qos: Mapping[str, Any] = field(default_factory=lambda: SENSOR_DATA)
 
 
@@ -54,18 +56,22 @@ class Inputs:
 
     Args:
         node: creates them.
-        topics: by name. The executor goes through waiting messages in this order.
-        notice: told of publishers that cannot be heard, by a name and one sentence.
+        topics: by name. Waiting messages are taken in this order.
+        refusals: told of publishers that cannot be heard, and of failing callbacks.
     """
 
-    def __init__(
-        self, node: Node, topics: Mapping[str, Topic], notice: Callable[[str, str], None]
-    ) -> None:
+    def __init__(self, node: Node, topics: Mapping[str, Topic], refusals: Refusals) -> None:
         self._node = node
-        self._notice = notice
+        self._refusals = refusals
+        self._group = NotByExecutor()
         self._created = time.monotonic()
         self._heard: dict[str, float] = {}
         self._subscriptions = {name: self._subscribe(name, topic) for name, topic in topics.items()}
+        self._intake = Intake(
+            node.context,
+            tuple(self._subscriptions.values()),
+            functools.partial(refusals.add, "internal_error"),
+        )
 
     @property
     def topics(self) -> list[str]:
@@ -77,6 +83,8 @@ class Inputs:
         return {name: self._silence(name) for name in self._subscriptions}
 
     def close(self) -> None:
+        """Take no more messages."""
+        self._intake.close()
         for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions = {}
@@ -86,21 +94,14 @@ class Inputs:
             self._heard[name] = time.monotonic()
             topic.callback(message)
 
-        def incompatible(event: Any) -> None:
-            policy = qos_policy_name_from_kind(event.last_policy_kind)
-            full = self._node.resolve_topic_name(name)
-            self._notice(
-                "incompatible_qos",
-                f"a publisher of {full} offers another {policy} than this node asks for, and "
-                "cannot be heard",
-            )
-
         return self._node.create_subscription(
             topic.type,
             name,
             take,
             QoSProfile(**topic.qos),  # a new one each: overrides are written into it
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
+            callback_group=self._group,
+            # Events of a subscription wake the executor with every message; the graph knows more.
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
@@ -111,6 +112,8 @@ class Inputs:
         cause, mismatch = "", False
         if seconds > _LONG:
             cause, mismatch = self._cause(self._subscriptions[name])
+        if mismatch:
+            self._refusals.notice("incompatible_publisher", f"nothing is heard on {topic}: {cause}")
         return Silence(topic, seconds, heard is not None, cause, mismatch)
 
     def _cause(self, subscription: Subscription) -> tuple[str, bool]:

@@ -1,7 +1,7 @@
 """The node ``rs_localizer``: correspondences and camera_info in; pose, twist and inliers out.
 
-The executor's thread runs this file: it takes messages, checks them where that is cheap, and hands
-them to the worker, whose thread localizes and publishes.
+Three threads: the executor's answers services, changes parameters and the life cycle, and publishes
+diagnostics; that of the inputs takes messages; the worker's localizes and publishes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.service import Service
@@ -20,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.frames import FrameLocalizer
-from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.ros import parameters
 from rs_localizer.ros.diagnostics import Diagnostics
@@ -97,7 +96,7 @@ class LocalizerNode(RobustLifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._inputs = Inputs(self, self._topics(), self.refusals.notice)
+        self._inputs = Inputs(self, self._topics(), self.refusals)
         config = parameters.read(self)
         if config.readout_time == 0.0:
             self._warn(
@@ -144,7 +143,7 @@ class LocalizerNode(RobustLifecycleNode):
             self.destroy_service(self._reset_service)
             self._reset_service = None
 
-    # -- inputs -----------------------------------------------------------------------------
+    # -- inputs, in their thread -------------------------------------------------------------
 
     def _topics(self) -> dict[str, Topic]:
         """The inputs; what changes the state comes before the frames."""
@@ -163,8 +162,6 @@ class LocalizerNode(RobustLifecycleNode):
 
         return Topic(PointCloud2, take)
 
-    # -- callbacks --------------------------------------------------------------------------
-
     def _take_camera_info(self, message: CameraInfo) -> None:
         # Read here, not in the worker, where a bad one could take the place of a good one.
         try:
@@ -172,7 +169,8 @@ class LocalizerNode(RobustLifecycleNode):
         except MessageError as error:
             self.refusals.add("bad_camera_info", str(error))
             return
-        self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
+        if calibration != self._localizer.calibration:  # drivers repeat it with every image
+            self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
 
     def _take_config(self, config: NodeConfig) -> None:
         if self._worker is not None:
@@ -198,7 +196,7 @@ class LocalizerNode(RobustLifecycleNode):
 
     # -- in the worker's thread, between two frames ------------------------------------------
 
-    def _calibrate(self, frames: FrameLocalizer, calibration: Any) -> None:
+    def _calibrate(self, frames: FrameLocalizer, calibration: Calibration) -> None:
         try:
             frames.calibrate(calibration)
         except MessageError as error:

@@ -10,8 +10,9 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
+from rs_localizer.ros.errors import describe
 from rs_localizer.ros.localizer_node import LocalizerNode
-from rs_localizer.ros.worker import describe, wait_for_workers
+from rs_localizer.ros.worker import wait_for_workers
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.stopping import StopRequest
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import threading
 import time
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.outputs import Frame
+from rs_localizer.ros.errors import describe
 from rs_localizer.ros.mailbox import Mailbox, Update, Work
 from rs_localizer.ros.statistics import Statistics
 
@@ -109,12 +109,6 @@ class Worker:
                 return
             self._publish(result)
         self._statistics.answered(result, arrival.received)
-
-
-def describe(error: Exception) -> str:
-    """An error that nobody foresaw, in one line: what, and where."""
-    where = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{error!r} in {where.name}, {where.filename}:{where.lineno}"
 
 
 def wait_for_workers(seconds: float) -> bool:
