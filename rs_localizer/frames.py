@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from rs_localizer.config import NodeConfig, PoseTime
+from rs_localizer import matching
+from rs_localizer.config import MatchBy, NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.prior import Prior
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.clouds import (
@@ -23,11 +26,15 @@ from rs_localizer.io.clouds import (
     read_correspondences,
     select_inliers,
 )
+from rs_localizer.io.keypoints import Keypoints, read_keypoints, read_map
+from rs_localizer.io.map_files import read_map_file
+from rs_localizer.io.maps import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transform_tree import TransformTree
 from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.localizer import Localizer
+from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.moments import pose_at, twist_at
 from rs_localizer.mounting import base_pose, base_twist, find_mounting
 from rs_localizer.solvers import find_solver
@@ -57,7 +64,9 @@ class Refusal:
     """A frame without a pose; false in a condition.
 
     Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud``, ``bad_cloud``
-    (a message that cannot be read) and ``no_transform`` (from the camera to ``base_frame``).
+    (a message that cannot be read) and ``no_transform`` (from the camera to ``base_frame``); of
+    keypoints ``no_map``, ``bad_keypoints`` (that cannot be read, or not be compared with the map)
+    and ``no_matches``.
     """
 
     reason: str
@@ -68,7 +77,7 @@ class Refusal:
 
 
 class FrameLocalizer:
-    """Localizes correspondence messages with the latest camera and the latest settings.
+    """Localizes correspondences, or keypoints by a map, with the latest camera and settings.
 
     With ``tracking``, a readout time and a rolling-shutter solver it remembers the previous frame;
     new settings, a new camera, another map and a time before the last one start it afresh.
@@ -76,7 +85,9 @@ class FrameLocalizer:
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.
         notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
-            (a recording that starts over) and ``map_changed``. The frame is localized all the same.
+            (a recording that starts over), ``map_changed`` (another frame of the points),
+            ``map_replaced``, ``map_incomplete`` and ``too_many_keypoints``. Frames are localized
+            all the same.
         transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
 
@@ -94,6 +105,8 @@ class FrameLocalizer:
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
         self._last: tuple[int, str] | None = None  # stamp and map of the last cloud
         self._calibration: Calibration | None = None
+        self._matcher: Matcher | None = None
+        self._lacks_map = False
         self._config = config
         self._camera, self._localizer, self._tracker = _build(_ANY_CALIBRATION, config)
 
@@ -122,7 +135,13 @@ class FrameLocalizer:
     @property
     def missing(self) -> tuple[str, ...]:
         """What has to come before a frame can be localized, in words of users."""
-        return ("camera_info",) if self._calibration is None else ()
+        camera = ("camera_info",) if self._calibration is None else ()
+        return (*camera, "a map") if self._lacks_map else camera
+
+    @property
+    def map(self) -> Map | None:
+        """The map that keypoints are matched with."""
+        return None if self._matcher is None else self._matcher.map
 
     def reset(self) -> None:
         """Forget the previous frames."""
@@ -136,6 +155,7 @@ class FrameLocalizer:
         so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
         twist_at(_STILL, 0.5, 1.0)
         so3.log(np.eye(3))
+        matching.warm_up()
 
     def take_camera_info(self, message: Any) -> None:
         """Use this sensor_msgs/CameraInfo from the next frame on.
@@ -155,6 +175,52 @@ class FrameLocalizer:
             self._camera, self._localizer, self._tracker = _build(calibration, self._config)
             self._calibration = calibration
 
+    def load_map(self) -> None:
+        """Use the map of the setting ``map_file``, if there is one.
+
+        Raises:
+            MapError: for a file that holds no map that keypoints can be matched with.
+            OSError: for a file that is not there or cannot be read.
+        """
+        if not self._config.map_file:
+            return
+        path = Path(self._config.map_file).expanduser()
+        landmarks = read_map_file(path, self._config.map_frame)
+        if landmarks.ids is None and landmarks.descriptors is None:
+            raise MapError(
+                f"{path}: keypoints cannot be matched with a map that has neither ids nor "
+                "descriptors"
+            )
+        self.use_map(landmarks)
+
+    def take_map(self, message: Any) -> None:
+        """Use this sensor_msgs/PointCloud2 of landmarks from the next frame on.
+
+        Raises:
+            MessageError: for one that cannot be used, saying what was found; the previous stays.
+        """
+        self.use_map(read_map(message))
+
+    def use_map(self, landmarks: Map) -> None:
+        """Match keypoints with this map from the next frame on."""
+        previous = self.map
+        if previous is not None and landmarks.equals(previous):
+            return  # published again
+        if landmarks.dropped:
+            self._notice(
+                "map_incomplete",
+                f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
+                "descriptor",
+            )
+        if previous is not None:
+            self._notice(
+                "map_replaced",
+                f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
+                f"one of {len(previous)} in frame {previous.frame!r}",
+            )
+        self._matcher = Matcher(landmarks)
+        self._lacks_map = False
+
     def localize(self, message: Any) -> Frame | Refusal:
         """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
         try:
@@ -164,6 +230,58 @@ class FrameLocalizer:
         except MessageError as error:
             return Refusal("bad_cloud", str(error))
         self._follow(cloud.stamp_ns, cloud.frame)
+        return self._localize(cloud)
+
+    def localize_keypoints(self, message: Any) -> Frame | Refusal:
+        """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
+
+        Tracked, landmarks are first looked for where the motion predicts them only, then, if that
+        gives no pose, all over the map.
+        """
+        try:
+            keypoints = read_keypoints(message)
+        except EmptyCloudError as error:
+            return Refusal("empty_cloud", str(error))
+        except MessageError as error:
+            return Refusal("bad_keypoints", str(error))
+        if self._matcher is None:
+            self._lacks_map = True
+            return Refusal("no_map", "no usable map has come yet, on map_points or as map_file")
+        self._follow(keypoints.stamp_ns, self._matcher.map.frame)
+        try:
+            by = self._matcher.choose(keypoints, self._config.matching)
+        except MatchError as error:
+            return Refusal("bad_keypoints", str(error))
+        if by == MatchBy.DESCRIPTOR:
+            self._say_if_too_many(keypoints)
+            if self._tracker is not None and self._config.matching.gate > 0.0:
+                prior = self._tracker.prediction(self._middle_row_ns(keypoints.stamp_ns))
+                if prior is not None and (result := self._match(keypoints, prior)):
+                    return result
+        return self._match(keypoints, None)
+
+    def _say_if_too_many(self, keypoints: Keypoints) -> None:
+        most = self._config.matching.max_keypoints
+        if len(keypoints) > most:
+            self._notice(
+                "too_many_keypoints",
+                f"{len(keypoints)} keypoints have come, matching.max_keypoints of them, {most}, "
+                "are matched",
+            )
+
+    def _match(self, keypoints: Keypoints, prior: Prior | None) -> Frame | Refusal:
+        assert self._matcher is not None
+        settings = self._config.matching
+        matches = self._matcher.match(keypoints, settings, self._camera, prior)
+        if len(matches) == 0:
+            return Refusal(
+                "no_matches",
+                f"none of {len(keypoints)} keypoints matches one of {len(self._matcher.map)} "
+                f"landmarks by {matches.by}",
+            )
+        return self._localize(matching.correspondences(matches, keypoints, self._matcher.map))
+
+    def _localize(self, cloud: Correspondences) -> Frame | Refusal:
         if self._calibration is None:
             return Refusal("no_camera_info", "no usable camera_info has come yet")
         given = (cloud.points, cloud.pixels, cloud.scores)

@@ -17,6 +17,8 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 _ID_TYPES = (np.dtype("<u4"), np.dtype("<i4"))
 # Beyond this, float32 pixels and poses say nothing (m).
 _FARTHEST = 1e9
+# Single precision is 1 mm coarse there (m).
+_FARTHEST_SINGLE = 1e4
 
 
 class MapError(ValueError):
@@ -33,7 +35,8 @@ class Map:
         descriptors: (n,d) uint8, binary ones that are compared bit by bit, or float32, compared
             by their Euclidean distance; or None.
         frame: in which the points are given.
-        dropped: landmarks that were left out because they held NaN or infinity.
+        dropped: landmarks that were left out because they held NaN or infinity, or because no
+            descriptor of theirs is known.
 
     Raises:
         MapError: for anything else, saying what was found.
@@ -65,6 +68,20 @@ class Map:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def equals(self, other: Map) -> bool:
+        """Whether both are the same to the last bit, in the same frame."""
+        return (
+            self.frame == other.frame
+            and np.array_equal(self.points, other.points)
+            and _equal(self.ids, other.ids)
+            and _equal(self.descriptors, other.descriptors)
+        )
+
+    @property
+    def point_type(self) -> str:
+        """The type of a PointField for coordinates: FLOAT32, which RViz shows, if it is exact."""
+        return "<f4" if np.abs(self.points).max() < _FARTHEST_SINGLE else "<f8"
 
     @property
     def id_type(self) -> np.dtype[Any]:
@@ -113,6 +130,12 @@ def make_map(
         ids = None if ids is None else ids[finite]
         descriptors = None if descriptors is None else descriptors[finite]
     return Map(points, ids, descriptors, frame, dropped)
+
+
+def _equal(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return one.dtype == other.dtype and np.array_equal(one, other)
 
 
 def _check_ids(ids: Ids, count: int) -> None:

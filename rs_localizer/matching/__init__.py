@@ -8,6 +8,7 @@ the motion is predicted, only landmarks compete that are predicted near the keyp
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from rs_localizer.config import MatchBy, Matching
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.prior import Prior
 from rs_localizer.core.sampling import IntArray
+from rs_localizer.core.shutter import Motion
 from rs_localizer.core.so3 import Array
+from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps import Descriptors, Ids, Map
 from rs_localizer.matching.descriptors import Index, Nearest, make_index
@@ -50,7 +53,8 @@ class Matcher:
             self._sorted: Ids = landmarks.ids[self._order]
         self._index: Index | None = None
         if landmarks.descriptors is not None:
-            self._index = make_index(landmarks.descriptors)
+            binary = landmarks.descriptors.dtype == np.uint8
+            self._index = make_index(landmarks.descriptors, binary=binary)
 
     def match(
         self,
@@ -69,9 +73,10 @@ class Matcher:
         Raises:
             MatchError: when keypoints and map have nothing in common to be compared by.
         """
-        if self._choose(keypoints, settings) == MatchBy.ID:
+        if self.choose(keypoints, settings) == MatchBy.ID:
             return self._by_id(keypoints)
-        queries = self._comparable(keypoints.descriptors)
+        assert keypoints.descriptors is not None
+        queries = keypoints.descriptors
         chosen = _best(keypoints, settings.max_keypoints)
         queries, pixels = queries[chosen], keypoints.pixels[chosen]
         if settings.gate > 0.0 and camera is not None and prior is not None:
@@ -80,25 +85,29 @@ class Matcher:
             found, mutual = self._anywhere(queries, settings)
         return _accepted(found, mutual, chosen, settings.ratio)
 
-    # -- steps ------------------------------------------------------------------------------
+    def choose(self, keypoints: Keypoints, settings: Matching) -> MatchBy:
+        """By what they are compared; descriptors say more than the numbers of a tracker.
 
-    def _choose(self, keypoints: Keypoints, settings: Matching) -> MatchBy:
-        """By what they are compared; descriptors say more than the numbers of a tracker."""
+        Raises:
+            MatchError: when keypoints and map have nothing in common to be compared by.
+        """
         both = {
             MatchBy.DESCRIPTOR: self._index is not None and keypoints.descriptors is not None,
             MatchBy.ID: self._order is not None and keypoints.ids is not None,
         }
         wanted = [settings.by] if settings.by != MatchBy.AUTO else list(both)
-        for by in wanted:
-            if both[MatchBy(by)]:
-                return MatchBy(by)
-        raise MatchError(
-            f"keypoints and map cannot be compared by {' or '.join(wanted)}: the keypoints have "
-            f"{_marks(keypoints.ids, keypoints.descriptors)}, the map has "
-            f"{_marks(self.map.ids, self.map.descriptors)}"
-        )
+        by = next((MatchBy(by) for by in wanted if both[MatchBy(by)]), None)
+        if by is None:
+            raise MatchError(
+                f"keypoints and map cannot be compared by {' or '.join(wanted)}: the keypoints "
+                f"have {_marks(keypoints.ids, keypoints.descriptors)}, the map has "
+                f"{_marks(self.map.ids, self.map.descriptors)}"
+            )
+        if by == MatchBy.DESCRIPTOR:
+            self._check(keypoints.descriptors)
+        return by
 
-    def _comparable(self, descriptors: Descriptors | None) -> Descriptors:
+    def _check(self, descriptors: Descriptors | None) -> None:
         ours = self.map.descriptors
         assert descriptors is not None
         assert ours is not None
@@ -106,9 +115,8 @@ class Matcher:
         kinds_fit = descriptors.dtype == ours.dtype or ours.dtype == np.float32
         if not kinds_fit or descriptors.shape[1] != ours.shape[1]:
             raise MatchError(f"the keypoints have {_kind(descriptors)}, the map has {_kind(ours)}")
-        if ours.dtype == np.float32:
-            return descriptors.astype(np.float32, copy=False)
-        return descriptors
+
+    # -- steps ------------------------------------------------------------------------------
 
     def _by_id(self, keypoints: Keypoints) -> Matches:
         assert keypoints.ids is not None
@@ -133,7 +141,9 @@ class Matcher:
         if settings.mutual and len(queries):
             firsts = found.landmarks[:, 0]
             there = np.flatnonzero(firsts >= 0)
-            back = make_index(queries).nearest(self.map.descriptors[firsts[there]])
+            # As the map's: its bytes are bits, those of keypoints may stand for numbers.
+            index = make_index(queries, binary=self.map.descriptors.dtype == np.uint8)
+            back = index.nearest(self.map.descriptors[firsts[there]])
             owners[there] = back.landmarks[:, 0]
         return found, owners
 
@@ -154,6 +164,46 @@ class Matcher:
         owner_of = np.full(len(self.map), -1, np.int64)
         owner_of[visible.landmarks] = owners
         return found, owner_of[found.landmarks[:, 0]]
+
+
+def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> Correspondences:
+    """The matches as a cloud of correspondences would give them, landmark's id included."""
+    points, pixels = landmarks.points[matches.landmarks], keypoints.pixels[matches.keypoints]
+    kinds: list[tuple[str, Any]] = [(name, landmarks.point_type) for name in "xyz"]
+    kinds += [("u", "<f4"), ("v", "<f4")]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if matches.scores is not None:
+        kinds.append(("score", "<f4"))
+    table = np.empty(len(matches), kinds)
+    for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
+        table[name] = column
+    if landmarks.ids is not None:
+        table["id"] = landmarks.ids[matches.landmarks]
+    if matches.scores is not None:
+        with np.errstate(over="ignore"):
+            table["score"] = matches.scores
+    return Correspondences(
+        stamp_ns=keypoints.stamp_ns,
+        frame=landmarks.frame,
+        points=points,
+        pixels=pixels,
+        scores=matches.scores,
+        dropped=keypoints.dropped,
+        table=table,
+    )
+
+
+def warm_up() -> None:
+    """Compile all kernels of matching."""
+    camera = Camera(width=2, height=2, K=np.eye(3))
+    motion = Motion(np.eye(3), np.array([0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+    prior = Prior(motion=motion, covariance=np.eye(12))
+    for descriptors in (np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.float32)):
+        matcher = Matcher(Map(np.zeros((1, 3)), None, descriptors, "map"))
+        keypoints = Keypoints(0, np.zeros((1, 2)), None, descriptors, None, 0)
+        for known in (None, prior):
+            matcher.match(keypoints, Matching(), camera, known)
 
 
 def _best(keypoints: Keypoints, most: int) -> IntArray:

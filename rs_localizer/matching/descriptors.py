@@ -119,20 +119,9 @@ class RealIndex:
         return _within(nearest_real_within, self._rows, rows, pixels, visible)
 
 
-def make_index(descriptors: Descriptors) -> Index:
-    """The search for descriptors (n,d): uint8 are bits, float32 numbers."""
-    return BinaryIndex(descriptors) if descriptors.dtype == np.uint8 else RealIndex(descriptors)
-
-
-def warm_up() -> None:
-    """Compile all searches."""
-    pixels = np.zeros((1, 2))
-    visible = Visible(np.zeros(1, np.int64), pixels, 1.0)
-    for kind in (np.uint8, np.float32):
-        descriptors: Any = np.zeros((1, 1), kind)
-        index = make_index(descriptors)
-        index.nearest(descriptors)
-        index.nearest_within(descriptors, pixels, visible)
+def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
+    """The search for descriptors (n,d) that are bits or numbers."""
+    return BinaryIndex(descriptors) if binary else RealIndex(descriptors)
 
 
 def _within(

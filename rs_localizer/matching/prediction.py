@@ -39,9 +39,9 @@ def predict_landmarks(camera: Camera, prior: Prior, points: Array, least_gate: f
     in_view(points, state_in(prior.motion, np.zeros(3)), low - slack, high + slack, depths)
     near = np.flatnonzero(depths)
     if len(near) == 0:
-        return Visible(near, np.zeros((0, 2)), least_gate)
+        return Visible(near, np.zeros((0, 2)), float(least_gate))
     deviation = focal * _bearing_deviation(prior.covariance, float(np.median(depths[near])))
-    gate = min(max(least_gate, _DEVIATIONS * deviation), widest)
+    gate = float(min(max(least_gate, _DEVIATIONS * deviation), widest))
     pixels = _project(camera, prior.motion, points[near])
     limit = np.array(camera.size) - 0.5 + gate
     inside = np.flatnonzero(np.all((pixels > -0.5 - gate) & (pixels < limit), axis=1))

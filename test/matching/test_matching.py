@@ -50,7 +50,7 @@ def distances(one: Any, other: Any) -> Any:
 @pytest.mark.parametrize("count", [1, 2, 300])
 def test_the_two_nearest_of_all(kind: str, width: int, count: int) -> None:
     landmarks, queries = descriptors(kind, count, width, 0), descriptors(kind, 9, width, 1)
-    found = make_index(landmarks).nearest(queries)
+    found = make_index(landmarks, binary=kind == "bits").nearest(queries)
     table = distances(queries, landmarks)
     order = np.argsort(table, axis=1, kind="stable")[:, :2]
     expected = np.take_along_axis(table, order, 1)
@@ -70,7 +70,7 @@ def test_more_landmarks_than_a_block_holds() -> None:
         if kind == "bits":
             landmarks = np.random.default_rng(0).integers(0, 256, (5000, 8), dtype=np.uint8)
         rows = np.array([0, 255, 256, 4095, 4096, 4999])
-        found = make_index(landmarks).nearest(landmarks[rows])
+        found = make_index(landmarks, binary=kind == "bits").nearest(landmarks[rows])
         assert found.landmarks[:, 0].tolist() == rows.tolist()
         assert np.all(found.distances[:, 0] == 0.0)
 
@@ -83,7 +83,9 @@ def test_the_two_nearest_within_the_gate(kind: str) -> None:
     rows = rng.permutation(200)[:80]
     order = np.argsort(predicted[:, 1])
     visible = Visible(rows[order], predicted[order], 15.0)
-    found, owners = make_index(landmarks).nearest_within(queries, pixels, visible)
+    found, owners = make_index(landmarks, binary=kind == "bits").nearest_within(
+        queries, pixels, visible
+    )
     table = distances(queries, landmarks[rows])
     table[np.linalg.norm(pixels[:, None] - predicted[None], axis=2) > 15.0] = np.inf
     expected = np.sort(table, axis=1)[:, :2]

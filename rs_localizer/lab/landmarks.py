@@ -1,0 +1,65 @@
+"""Simulated descriptors: landmarks with random ones, keypoints with noisy copies of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.io.maps import Map
+from rs_localizer.lab.simulation import SimulatedFrame
+
+# Share of the bits that differ between two views of a landmark; ORB's median is about this.
+BIT_ERRORS = 0.1
+
+
+def random_descriptors(count: int, rng: np.random.Generator, width: int = 32) -> NDArray[np.uint8]:
+    """Binary descriptors (count,width) without anything in common."""
+    return rng.integers(0, 256, (count, width), dtype=np.uint8)
+
+
+def seen_descriptors(
+    descriptors: NDArray[np.uint8], rng: np.random.Generator, errors: float = BIT_ERRORS
+) -> NDArray[np.uint8]:
+    """Descriptors (n,width) as another image has them: each bit differs with this probability."""
+    count, width = descriptors.shape
+    return descriptors ^ np.packbits(rng.random((count, 8 * width)) < errors, axis=1)
+
+
+def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generator) -> NDArray[Any]:
+    """Rows (n,) of a cloud of keypoints: pixels, and what the map's landmarks are known by.
+
+    Outliers of the frame have the mark of a landmark and the pixel of something else, as wrong
+    matches do.
+    """
+    kinds: list[tuple[Any, ...]] = [("u", "<f4"), ("v", "<f4")]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if landmarks.descriptors is not None:
+        kinds.append(("descriptor", "u1", landmarks.descriptors.shape[1:]))
+    rows = np.empty(len(frame.ids), kinds)
+    rows["u"], rows["v"] = frame.pixels.T
+    if landmarks.ids is not None:
+        rows["id"] = landmarks.ids[frame.ids]
+    if landmarks.descriptors is not None:
+        shown = landmarks.descriptors[frame.ids].astype(np.uint8, copy=False)
+        rows["descriptor"] = seen_descriptors(shown, rng)
+    return rows
+
+
+def map_rows(landmarks: Map) -> NDArray[Any]:
+    """Rows (n,) of a cloud of landmarks."""
+    kinds: list[tuple[Any, ...]] = [(name, "<f8") for name in "xyz"]
+    if landmarks.ids is not None:
+        kinds.append(("id", landmarks.id_type))
+    if landmarks.descriptors is not None:
+        kinds.append(("descriptor", landmarks.descriptors.dtype, landmarks.descriptors.shape[1:]))
+    rows = np.empty(len(landmarks), kinds)
+    for name, column in zip("xyz", landmarks.points.T, strict=True):
+        rows[name] = column
+    if landmarks.ids is not None:
+        rows["id"] = landmarks.ids
+    if landmarks.descriptors is not None:
+        rows["descriptor"] = landmarks.descriptors
+    return rows
