@@ -84,6 +84,10 @@ class MarkerDetector:
         self._chessboard: Array | None = None
         self._chessboard_ns = 0
 
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), np.full(1, 6))
+
     def detect(self, image: Gray, stamp_ns: int = 0) -> Detections:
         """All corners of the map that an image shows.
 

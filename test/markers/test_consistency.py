@@ -1,0 +1,123 @@
+"""Maps that cannot be true are recognized, alone or by what an image shows; true ones are not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.markers.consistency import MapCheck, problems
+from rs_localizer.markers.detection import Detections
+from rs_localizer.markers.families import family
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
+
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z of the print along -y of the map
+SIDEWAYS = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # z of the print along x of the map
+
+
+def corner() -> MarkerMap:
+    """Two walls at a right angle."""
+    back = wall("4x4_50", 3, 2, 0.3, 0.1, pose=Pose(np.array([0.6, 2.0, 0]), UPRIGHT))
+    left = wall(
+        "4x4_50", 3, 2, 0.3, 0.1, first_id=20, pose=Pose(np.array([-0.2, 1.2, 0]), SIDEWAYS)
+    )
+    return MarkerMap((*back, *left))
+
+
+def seen(marker_map: MarkerMap, noise: float = 0.3) -> Detections:
+    """What a camera at the origin, looking along y, sees of a map."""
+    rng = np.random.default_rng(0)
+    turn = Rotation.from_euler("xyz", [3, -4, 8], degrees=True).as_matrix()
+    camera = turn @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    local = (marker_map.points - np.array([0.5, -0.3, 0.1])) @ camera.T
+    assert local[:, 2].min() > 0.2
+    pixels = local[:, :2] / local[:, 2:] * 400.0 + [320, 240]
+    # A shutter that shears the image.
+    pixels[:, 0] += 0.05 * pixels[:, 1]
+    pixels += rng.normal(0.0, noise, pixels.shape)
+    ids = np.arange(len(pixels))
+    return Detections(ids, marker_map.points, pixels, np.ones(len(ids)), (), (), (), ())
+
+
+def shown(told: MarkerMap, true: MarkerMap) -> str | None:
+    """The fault of a map of which the image shows another one."""
+    image = seen(true)
+    found = Detections(image.ids, told.points, image.pixels, image.scores, (), (), (), ())
+    return MapCheck(told).fault(found)
+
+
+def changed(marker_map: MarkerMap, change: Any) -> MarkerMap:
+    return MarkerMap(tuple(Marker(m.family, m.id, change(m.corners)) for m in marker_map.markers))
+
+
+def test_true_maps_have_no_fault() -> None:
+    for true in (corner(), MarkerMap(corner().markers[:6]), MarkerMap(corner().markers[:1])):
+        assert problems(true) == []
+        assert shown(true, true) is None
+
+
+def test_mirrored_corners_show_in_an_image() -> None:
+    true = corner()
+    told = changed(true, lambda corners: corners[[1, 0, 3, 2]])
+    assert "the map is mirrored: marker 4x4_50 0, " in str(shown(told, true))
+
+
+def test_a_mirrored_room_shows_in_an_image() -> None:
+    # Each wall by itself is the true one turned, but no room has both.
+    true = corner()
+    told = changed(true, lambda corners: corners * [-1.0, 1.0, 1.0])
+    assert "the map is mirrored: only a left-handed room" in str(shown(told, true))
+
+
+def test_a_marker_at_another_place_shows_in_an_image() -> None:
+    true = corner()
+    moved = [*true.markers]
+    moved[2] = Marker(moved[2].family, moved[2].id, moved[2].corners + np.array([0, 0, 0.4]))
+    assert "does not fit the image" in str(shown(MarkerMap(tuple(moved)), true))
+
+
+def test_corners_that_were_not_found_say_nothing() -> None:
+    true = corner()
+    image = seen(true)
+    some = image.ids % 4 != 2
+    told = changed(true, lambda corners: corners[[1, 0, 3, 2]])
+    found = Detections(
+        image.ids[some], told.points[some], image.pixels[some], image.scores[some], (), (), (), ()
+    )
+    assert MapCheck(told).fault(found) is None
+
+
+def marker(id_: int, x: float, size: float = 0.1, rotation: Any = None) -> Marker:
+    place = Pose(np.array([x, 0.0, 0.0]), np.eye(3) if rotation is None else rotation)
+    return Marker.at("4x4_50", id_, size, place)
+
+
+BEHIND = np.diag([-1.0, 1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("markers", "boards", "text"),
+    [
+        ([marker(0, 0), marker(1, 0.09)], [], "0 and marker 4x4_50 1 overlap by 0.01 m"),
+        ([marker(0, 0), marker(1, 0.105)], [], "are 0.005 m apart: each needs a white rim"),
+        ([marker(0, 0), marker(1, 0.2, rotation=BEHIND)], [], "face opposite ways: one of them"),
+        ([marker(k, 0.5 * k) for k in range(3)] + [marker(3, 9.0, 4.0)], [], "another unit"),
+        ([marker(0, 0)], [Chessboard(6, 4, 0.03)], "and chessboard 6x4 overlap by"),
+        ([marker(0, 0)], [Charuco(5, 7, 0.03, 0.02, family("5x5_50"))], "5x5_50 overlap by"),
+    ],
+)
+def test_problems_of_a_map(markers: Any, boards: Any, text: str) -> None:
+    (found,) = problems(MarkerMap(tuple(markers), tuple(boards)))
+    assert text in found
+
+
+def test_prints_in_different_planes_do_not_overlap() -> None:
+    tilted = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    assert problems(MarkerMap((marker(0, 0), marker(1, 0.05, rotation=tilted)))) == []
+    above = Marker.at("4x4_50", 1, 0.1, Pose(np.array([0, 0, 0.1]), np.eye(3)))
+    assert problems(MarkerMap((marker(0, 0), above))) == []
+    turned = Rotation.from_euler("z", 45, degrees=True).as_matrix()
+    assert problems(MarkerMap((marker(0, 0), marker(1, 0.15, rotation=turned)))) == []
