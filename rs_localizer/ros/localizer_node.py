@@ -21,7 +21,8 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.messages import MessageError
-from rs_localizer.ros import parameters
+from rs_localizer.ros import parameters, transforms
+from rs_localizer.ros.broadcaster import Broadcaster
 from rs_localizer.ros.diagnostics import Diagnostics
 from rs_localizer.ros.health import Condition, Health, diagnose
 from rs_localizer.ros.inputs import Inputs, Topic
@@ -54,10 +55,10 @@ class LocalizerNode(RobustLifecycleNode):
         super().__init__(NODE_NAME, **kwargs)
         self._compiling = compiling
         config = parameters.declare(self)
-        FrameLocalizer(config)  # refuses what it cannot do
+        _check(config)
         for text in parameters.unknown_names(self):
             self._warn(f"a parameter is ignored: {text}")
-        parameters.on_change(self, check=FrameLocalizer, apply=self._take_config)
+        parameters.on_change(self, check=_check, apply=self._take_config)
         self.autostart = config.autostart
         self.refusals = Refusals(self._warn)
         self._statistics = Statistics(self.refusals, lambda: self.get_clock().now().nanoseconds)
@@ -66,6 +67,7 @@ class LocalizerNode(RobustLifecycleNode):
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._worker: Worker | None = None
         self._outputs: Outputs | None = None
+        self._broadcaster = Broadcaster(self, self.refusals.notice)
         self._reset_service: Service | None = None
         # From activating to deactivating.
         self._inputs: Inputs | None = None
@@ -75,16 +77,20 @@ class LocalizerNode(RobustLifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            frames = FrameLocalizer(parameters.read(self), self.refusals.notice)
+            config = parameters.read(self)
+            frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
             self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
             self._diagnostics.publish()
             with self._compiling():
                 seconds = _warm_up(frames)
             self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
+            self._broadcaster.configure(config)
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
-        self._outputs = Outputs(self)
+        self._outputs = Outputs(
+            self, afterwards=lambda frame: self._broadcaster.publish(frame, frames.config)
+        )
         self._localizer = frames
         self._worker = Worker(
             frames,
@@ -131,11 +137,13 @@ class LocalizerNode(RobustLifecycleNode):
             self._inputs = None
         if self._worker is not None:
             self._worker.pause()
+        self._broadcaster.forget()
 
     def _close_outputs(self) -> None:
         if self._worker is not None:
             self._worker.close()
             self._worker = self._localizer = None
+        self._broadcaster.close()
         if self._outputs is not None:
             self._outputs.close()
             self._outputs = None
@@ -174,6 +182,7 @@ class LocalizerNode(RobustLifecycleNode):
 
     def _take_config(self, config: NodeConfig) -> None:
         if self._worker is not None:
+            self._broadcaster.configure(config)
             self._worker.update("settings", lambda frames: self._change(frames, config))
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -214,6 +223,12 @@ class LocalizerNode(RobustLifecycleNode):
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
+
+
+def _check(config: NodeConfig) -> None:
+    """Raise ``ValueError`` for settings that this machine or the localizer cannot do."""
+    FrameLocalizer(config)
+    transforms.check(config)
 
 
 def _warm_up(frames: FrameLocalizer) -> float:
