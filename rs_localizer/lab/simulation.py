@@ -6,7 +6,7 @@ added to the raw pixels, so that they disturb the row time too, as in a real ima
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,6 +98,21 @@ def middle_stamp(camera: Camera, stamp_ns: int) -> int:
     return stamp_ns + round(-camera.first_row_time * camera.readout_time * 1e9)
 
 
+def true_poses_at(
+    camera: Camera, motion: TrueMotion, middle_ns: int
+) -> Callable[[Array], tuple[Array, Array]]:
+    """Row times (n,) to poses camera_from_map along a motion, for ``project_rolling``."""
+
+    def poses_at(tau: Array) -> tuple[Array, Array]:
+        # The search for the row may stray, or end as NaN: no such row is ever inside the image.
+        near = np.clip(np.nan_to_num(tau), -_FARTHEST_ROW, _FARTHEST_ROW)
+        state = motion.state(middle_ns, near * camera.readout_time)
+        rotations = np.swapaxes(state.rotations, 1, 2)
+        return rotations, -np.einsum("nij,nj->ni", rotations, state.positions)
+
+    return poses_at
+
+
 def simulate_frames(
     camera: Camera,
     motion: TrueMotion,
@@ -161,13 +176,7 @@ def _visible(
 ) -> tuple[NDArray[np.int64], Array]:
     """A random choice of the points that some row sees: their ids (n,) and true pixels (n,2)."""
 
-    def poses_at(tau: Array) -> tuple[Array, Array]:
-        # The search for the row may stray, or end as NaN: no such row is ever inside the image.
-        near = np.clip(np.nan_to_num(tau), -_FARTHEST_ROW, _FARTHEST_ROW)
-        state = motion.state(middle_ns, near * camera.readout_time)
-        rotations = np.swapaxes(state.rotations, 1, 2)
-        return rotations, -np.einsum("nij,nj->ni", rotations, state.positions)
-
+    poses_at = true_poses_at(camera, motion, middle_ns)
     size = np.array(camera.size)
     rotations, translations = poses_at(np.zeros(1))
     rough = camera.project(map_points @ rotations[0].T + translations)

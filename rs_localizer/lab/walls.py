@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from rs_localizer.core.so3 import Array
 from rs_localizer.lab.planes import TexturedPlane
 from rs_localizer.lab.textures import collage
 from rs_localizer.lab.true_motion import TrueState
-from rs_localizer.lab.video import Image
-from rs_localizer.markers.families import Family, family
+from rs_localizer.markers.dictionaries import pattern
+from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.prints import Marker, Pose
 
@@ -139,7 +138,7 @@ def _marker_plane(
     texture = np.full((rows * pitch, columns * pitch), paper, np.uint8)
     for index in range(columns * rows):
         row, column = (margin + pitch * place for place in divmod(index, columns))
-        white = _bitmap(drawn, first_id + index) > 0
+        white = pattern(drawn, first_id + index)
         cells = np.where(white, paper, ink).astype(np.uint8)
         texture[row : row + side, column : column + side] = cells.repeat(
             _CELL_TEXELS, axis=0
@@ -148,15 +147,6 @@ def _marker_plane(
     right, up, _ = pose.rotation.T
     corner = pose.position + 0.5 * texel * pitch * (rows * up - columns * right)
     return TexturedPlane(corner, right, -up, texel, texture)
-
-
-def _bitmap(drawn: Family, marker_id: int) -> Image:
-    """A marker with a pixel per cell, its black border included."""
-    aruco = cv2.aruco
-    dictionary = aruco.getPredefinedDictionary(getattr(aruco, drawn.constant))
-    # OpenCV 4.6 and before call it otherwise.
-    name = "generateImageMarker" if hasattr(aruco, "generateImageMarker") else "drawMarker"
-    return np.asarray(getattr(aruco, name)(dictionary, marker_id, drawn.cells), np.uint8)
 
 
 def _picture(

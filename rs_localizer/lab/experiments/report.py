@@ -21,6 +21,8 @@ def write_result(folder: Path, result: Result) -> None:
         _write_table(folder / f"{name}.csv", table)
     for name, figure in result.figures.items():
         figure.savefig(folder / f"{name}.png")
+    for name, data in result.files.items():
+        (folder / name).write_bytes(data)
 
 
 def write_summary(
@@ -80,6 +82,8 @@ def _section(name: str, result: Result, seconds: float) -> list[str]:
         lines += ["```", note, "```", ""] if "\n" in note else [note, ""]
     for figure in result.figures:
         lines += [f"![{figure}]({figure}.png)", ""]
+    for file in result.files:
+        lines += [f"![{file}]({file})", ""]
     tables = ", ".join(f"[{table}.csv]({table}.csv)" for table in result.tables)
     return [*lines, f"Data: {tables}", ""]
 

@@ -57,7 +57,10 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """All that an experiment found; the keys of tables and figures become file names."""
+    """All that an experiment found; the keys of tables and figures become file names.
+
+    ``files`` are animated pictures, by their names, already encoded.
+    """
 
     title: str
     setting: str  # a paragraph: what was done
@@ -65,6 +68,7 @@ class Result:
     tables: Mapping[str, Table]
     figures: Mapping[str, Figure] = field(default_factory=dict)
     notes: Sequence[str] = ()  # further paragraphs
+    files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 class Track(Protocol):

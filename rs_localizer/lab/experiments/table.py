@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rs_localizer.lab.experiments import (
+    augmented_reality,
     bound,
     convergence,
     linearisation,
@@ -33,4 +34,5 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "robustness": robustness.run,
     "timings": timings.run,
     "real": real.run,
+    "augmented-reality": augmented_reality.run,
 }

@@ -71,6 +71,11 @@ HELD = {
     "robustness.scores_right",
     "robustness.scores_random",
     "robustness.scores_reversed",
+    "augmented-reality.plain",
+    "augmented-reality.localizer",
+    "augmented-reality.position",
+    "augmented-reality.reprojection",
+    "augmented-reality.cube",
 }
 NOT_HELD = {
     "motion.r9p_ahead_noisy",
@@ -78,6 +83,7 @@ NOT_HELD = {
     "noise.all_alike",
     "convergence.flat_after_eight",
     "real.r9p_hardest",
+    "augmented-reality.r9p_published",
 }
 OPEN = {
     "motion.r9p_gauge",
@@ -92,6 +98,8 @@ OPEN = {
     "robustness.object_uniform",
     "robustness.points_20",
     "robustness.none_wrong",
+    "augmented-reality.localized",
+    "augmented-reality.time",
 }
 
 
