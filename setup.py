@@ -12,6 +12,7 @@ requirements = [
     "numba",
     "numpy>=1.26",
     "opencv-python-headless>=4.6",
+    "Pillow>=9.1",
     "PyYAML",
     "rosbags",
     "scipy",
