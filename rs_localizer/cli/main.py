@@ -50,6 +50,11 @@ COMMANDS = {
         "errors of estimated poses and twists against the truth, as tables and plots",
         "rs_localizer evaluate flight_poses flight",
     ),
+    "map": Command(
+        "rs_localizer.cli.map",
+        "what a map of landmarks holds; one file from another: COLMAP, PLY, NPZ",
+        "rs_localizer map convert sparse/0 map.npz",
+    ),
     "experiments": Command(
         "rs_localizer.cli.experiments",
         "the experiments of the literature and ours: curves, figures, a verdict on every claim",
