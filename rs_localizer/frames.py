@@ -179,17 +179,19 @@ class FrameLocalizer:
         """Use the map of the setting ``map_file``, if there is one.
 
         Raises:
-            MapError: for a file that holds no map that keypoints can be matched with.
-            OSError: for a file that is not there or cannot be read.
+            MapError: for a file that cannot be read or holds no map to match keypoints with.
         """
         if not self._config.map_file:
             return
         path = Path(self._config.map_file).expanduser()
-        landmarks = read_map_file(path, self._config.map_frame)
+        try:
+            landmarks = read_map_file(path, self._config.map_frame)
+        except (MapError, OSError) as error:
+            raise MapError(f"map_file: {error}") from error
         if landmarks.ids is None and landmarks.descriptors is None:
             raise MapError(
-                f"{path}: keypoints cannot be matched with a map that has neither ids nor "
-                "descriptors"
+                f"map_file: {path}: keypoints cannot be matched with a map that has neither ids "
+                "nor descriptors"
             )
         self.use_map(landmarks)
 

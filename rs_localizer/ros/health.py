@@ -47,6 +47,25 @@ class Health:
     values: dict[str, str]
 
 
+def of_interest(
+    silence: Mapping[str, Silence], frame_topics: Sequence[str], missing: Sequence[str]
+) -> dict[str, Silence]:
+    """Without the topics that nobody publishes and nothing waits for.
+
+    Frames come as correspondences or as keypoints; only keypoints need a map.
+    """
+    coming = any(silence[name].heard for name in frame_topics if name in silence)
+
+    def counts(name: str, item: Silence) -> bool:
+        if item.heard or item.mismatch:
+            return True
+        if name in frame_topics:
+            return not coming
+        return name != "map_points" or "a map" in missing
+
+    return {name: item for name, item in silence.items() if counts(name, item)}
+
+
 def diagnose(condition: Condition, summary: Summary) -> Health:
     """Judge the node.
 
@@ -79,7 +98,7 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
 
 def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
     """What to say where no frames come; None where they do."""
-    silences = [condition.silence[name] for name in condition.frame_topics]
+    silences = [item for name in condition.frame_topics if (item := condition.silence.get(name))]
     if not silences or any(item.heard and not item.cause for item in silences):
         return None
     causes = [f"{item.topic}: {item.cause}" for item in silences if item.cause]

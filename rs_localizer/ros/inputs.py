@@ -38,6 +38,7 @@ class Topic:
     type: type
     callback: Callable[[Any], None]  # runs in a thread of the inputs
     qos: Mapping[str, Any] = field(default_factory=lambda: SENSOR_DATA)
+    lasting: bool = False  # one message is enough
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ class Inputs:
         self._group = NotByExecutor()
         self._created = time.monotonic()
         self._heard: dict[str, float] = {}
+        self._lasting = {name for name, topic in topics.items() if topic.lasting}
         self._subscriptions = {name: self._subscribe(name, topic) for name, topic in topics.items()}
         self._intake = Intake(
             node.context,
@@ -110,7 +112,7 @@ class Inputs:
         heard = self._heard.get(name)
         seconds = time.monotonic() - (self._created if heard is None else heard)
         cause, mismatch = "", False
-        if seconds > _LONG:
+        if seconds > _LONG and not (heard is not None and name in self._lasting):
             cause, mismatch = self._cause(self._subscriptions[name])
         if mismatch:
             self._refusals.notice("incompatible_publisher", f"nothing is heard on {topic}: {cause}")

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.service import Service
 from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_srvs.srv import Trigger
@@ -20,11 +21,13 @@ from std_srvs.srv import Trigger
 from rs_localizer.config import NodeConfig
 from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.io.keypoints import read_map
+from rs_localizer.io.maps import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.ros import parameters, transforms
 from rs_localizer.ros.broadcaster import Broadcaster
 from rs_localizer.ros.diagnostics import Diagnostics
-from rs_localizer.ros.health import Condition, Health, diagnose
+from rs_localizer.ros.health import Condition, Health, diagnose, of_interest
 from rs_localizer.ros.inputs import Inputs, Topic
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.outputs import Outputs
@@ -36,7 +39,13 @@ from rs_localizer.settings import NODE_NAME
 # A change of settings that takes longer (s) has compiled kernels, and says so.
 _LONG_CHANGE = 0.5
 # Inputs that are localized; the others say with what.
-_FRAME_TOPICS = ("correspondences",)
+_FRAME_TOPICS = ("correspondences", "keypoints")
+# Latched: also of a map that was published before the node started.
+_MAP_QOS = {
+    "depth": 1,
+    "reliability": ReliabilityPolicy.RELIABLE,
+    "durability": DurabilityPolicy.TRANSIENT_LOCAL,
+}
 
 
 class LocalizerNode(RobustLifecycleNode):
@@ -81,10 +90,15 @@ class LocalizerNode(RobustLifecycleNode):
             frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
             self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
             self._diagnostics.publish()
+            frames.load_map()
+            self._say_map(frames)
             with self._compiling():
                 seconds = _warm_up(frames)
             self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
             self._broadcaster.configure(config)
+        except MapError as error:
+            self.get_logger().error(f"not configured: {error}")
+            return TransitionCallbackReturn.FAILURE
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
@@ -157,8 +171,12 @@ class LocalizerNode(RobustLifecycleNode):
         """The inputs; what changes the state comes before the frames."""
         return {
             "camera_info": Topic(CameraInfo, self._take_camera_info),
+            "map_points": Topic(PointCloud2, self._take_map, _MAP_QOS, lasting=True),
             "correspondences": self._frames(
                 "correspondences", lambda frames, message: frames.localize(message)
+            ),
+            "keypoints": self._frames(
+                "keypoints", lambda frames, message: frames.localize_keypoints(message)
             ),
         }
 
@@ -180,6 +198,15 @@ class LocalizerNode(RobustLifecycleNode):
         if calibration != self._localizer.calibration:  # drivers repeat it with every image
             self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
 
+    def _take_map(self, message: PointCloud2) -> None:
+        # Read here for the same reason; meanwhile frames are localized by the previous one.
+        try:
+            landmarks = read_map(message)
+        except MessageError as error:
+            self.refusals.add("bad_map", str(error))
+            return
+        self._worker.update("map", lambda frames: self._use_map(frames, landmarks))
+
     def _take_config(self, config: NodeConfig) -> None:
         if self._worker is not None:
             self._broadcaster.configure(config)
@@ -193,12 +220,14 @@ class LocalizerNode(RobustLifecycleNode):
     def _examine(self) -> tuple[Health, str]:
         """For the diagnostics: how the node is, and its camera."""
         frames = self._localizer
+        missing = () if frames is None else frames.missing
+        silence = {} if self._inputs is None else self._inputs.silence()
         condition = Condition(
             life_cycle=self._state_machine.current_state[1],
             changing=self._changing,
-            missing=() if frames is None else frames.missing,
+            missing=missing,
             frame_topics=_FRAME_TOPICS,
-            silence={} if self._inputs is None else self._inputs.silence(),
+            silence=of_interest(silence, _FRAME_TOPICS, missing),
         )
         health = diagnose(condition, self._statistics.summary())
         return health, "" if frames is None else frames.camera_frame
@@ -211,6 +240,11 @@ class LocalizerNode(RobustLifecycleNode):
         except MessageError as error:
             self.refusals.add("bad_camera_info", str(error))
 
+    def _use_map(self, frames: FrameLocalizer, landmarks: Map) -> None:
+        if frames.map is None or not landmarks.equals(frames.map):
+            frames.use_map(landmarks)
+            self._say_map(frames)
+
     def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
         self._changing = True
         try:
@@ -220,6 +254,12 @@ class LocalizerNode(RobustLifecycleNode):
             self._changing = False
         if seconds > _LONG_CHANGE:
             self.get_logger().info(f"kernels for the new settings are ready after {seconds:.1f} s")
+
+    def _say_map(self, frames: FrameLocalizer) -> None:
+        if frames.map is not None:
+            self.get_logger().info(
+                f"the map has {len(frames.map)} landmarks in frame {frames.map.frame!r}"
+            )
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.frames import Refusal
-from rs_localizer.ros.health import Condition, Level, diagnose
+from rs_localizer.ros.health import Condition, Level, diagnose, of_interest
 from rs_localizer.ros.inputs import Silence
 from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.statistics import Statistics
@@ -214,3 +214,18 @@ def test_a_frame_that_takes_long(world: World) -> None:
     assert health.message == "a frame has been worked on for 3.0 s"
     world.statistics.ended()
     assert world.diagnose().state == "waiting for frames"
+
+
+def test_topics_that_nothing_waits_for_are_left_out() -> None:
+    nobody = replace(COMES, seconds=9.0, heard=False, cause="it has no publisher")
+    deaf = replace(nobody, cause="the QoS of /x does not fit", mismatch=True)
+    kinds = ("correspondences", "keypoints")
+
+    def names(missing: tuple[str, ...] = (), **silence: Silence) -> set[str]:
+        return set(of_interest(silence, kinds, missing))
+
+    assert names(correspondences=nobody, keypoints=nobody) == set(kinds)
+    assert names(correspondences=COMES, keypoints=nobody) == {"correspondences"}
+    assert names(correspondences=COMES, keypoints=deaf) == set(kinds)
+    assert names(keypoints=COMES, map_points=nobody) == {"keypoints"}
+    assert names(("a map",), keypoints=COMES, map_points=nobody) == {"keypoints", "map_points"}
