@@ -41,6 +41,16 @@ class Detected:
         return True
 
 
+def read(message: Any) -> Image | Refusal:
+    """A sensor_msgs/Image or CompressedImage; ``bad_image`` if it cannot be read."""
+    try:
+        if hasattr(message, "format"):
+            return read_compressed_image(message)
+        return read_image(message)
+    except MessageError as error:
+        return Refusal("bad_image", str(error))
+
+
 def correspondences(detected: Detected, make: Make) -> Any:
     """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
     found = detected.detections
@@ -86,17 +96,9 @@ class FrameDetector:
         self._detector.warm_up()
 
     def take(self, message: Any) -> Detected | Refusal:
-        """Look for markers in a sensor_msgs/Image or CompressedImage.
-
-        A message that cannot be read is a refusal: ``bad_image``.
-        """
-        try:
-            compressed = hasattr(message, "format")
-            return self.detect(
-                read_compressed_image(message) if compressed else read_image(message)
-            )
-        except MessageError as error:
-            return Refusal("bad_image", str(error))
+        """Look for markers in a sensor_msgs/Image or CompressedImage."""
+        image = read(message)
+        return image if isinstance(image, Refusal) else self.detect(image)
 
     def detect(self, image: Image) -> Detected:
         """Look for markers in an image."""

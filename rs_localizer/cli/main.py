@@ -45,6 +45,12 @@ COMMANDS = {
         "write a recording with ground truth: a scene, a motion, a rolling-shutter camera",
         "rs_localizer simulate flight --trajectory poses.txt --duration 30 --noise 1",
     ),
+    "detect": Command(
+        "rs_localizer.cli.detect",
+        "find markers or a board in a video, a bag or a folder of images; writes a recording",
+        "rs_localizer detect video.mp4 --map wall.yaml --calibration camera.yaml --rate 30 "
+        "--out seen",
+    ),
     "evaluate": Command(
         "rs_localizer.cli.evaluate",
         "errors of estimated poses and twists against the truth, as tables and plots",

@@ -57,7 +57,7 @@ def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame) -> No
 
 def write_rendered(bag: BagWriter, camera: Camera, frame: RenderedFrame) -> None:
     """Camera info, image, and the truth at the first and at the middle row."""
-    bag.write(CAMERA_INFO_TOPIC, _camera_info(camera, frame.stamp_ns), frame.stamp_ns)
+    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
     write_image(bag, RAW_IMAGE_TOPIC, frame.stamp_ns, frame.format, frame.data)
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
@@ -77,7 +77,7 @@ def write_frame(
     for column, name in enumerate("xyz"):
         rows[name] = points[:, column]
     rows["u"], rows["v"], rows["id"] = pixels[:, 0], pixels[:, 1], ids
-    bag.write(CAMERA_INFO_TOPIC, _camera_info(camera, stamp_ns), stamp_ns)
+    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
     cloud = make_cloud(make_message, stamp_ns, MAP_FRAME, rows)
     bag.write(CORRESPONDENCES_TOPIC, cloud, stamp_ns)
 
@@ -129,7 +129,8 @@ def _vector(vector: Array) -> Any:
     return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def _camera_info(camera: Camera, stamp_ns: int) -> Any:
+def make_camera_info(camera: Camera, stamp_ns: int) -> Any:
+    """The sensor_msgs/CameraInfo of a camera."""
     roi = camera.roi
     return make_message(
         "sensor_msgs/msg/CameraInfo",
