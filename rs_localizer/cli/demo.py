@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from rs_localizer import data
+from rs_localizer.cli.demo_cube import CUBE, CubeScene
 from rs_localizer.config import SOLVER_NAMES, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
@@ -83,10 +84,13 @@ def run(args: argparse.Namespace) -> None:
         print("starting them; the first time on a machine, this compiles the solvers", flush=True)
         webcam = load_recording(data.path(data.WEBCAM), most)
         flight = load_recording(_fly(Path(directory), most))
+        scene = CubeScene()
+        cube = load_recording(scene.record(Path(directory) / "cube", most))
         acts = []
         for title, recording, readout_time in (
             ("Webcam over a board", webcam, _webcam_readout_time()),
             ("Simulated hand-held flight", flight, _FLIGHT_CAMERA.readout_time),
+            ("Rendered walls of markers", cube, scene.readout_time),
         ):
             total = len(recording.clouds)
             with tqdm(total=total, unit="frame", desc=title, disable=None) as bar:
@@ -94,8 +98,10 @@ def run(args: argparse.Namespace) -> None:
             results = {_NAMES[name]: compare(answers[name], recording.truth) for name in methods}
             acts.append(Act(recording, readout_time, results))
             print(f"\n{table(title, recording, results)}", flush=True)
-        print()
-        for name, figure in _pictures(*acts).items():
+        by_us, by_p3p = _NAMES[_ROLLING], _NAMES[_GLOBAL]
+        print(scene.draw(cube, acts[2].results, by_us, by_p3p, args.out / CUBE))
+        print(f"\n{args.out / CUBE}")
+        for name, figure in _pictures(*acts[:2]).items():
             if figure is not None:
                 plots.save(figure, args.out / name)
                 print(args.out / name)

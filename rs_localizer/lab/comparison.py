@@ -43,7 +43,7 @@ class Recording:
 
 
 def load_recording(path: Path, most_frames: int | None = None) -> Recording:
-    """Read a recording made by ``simulate`` or ``board_video``, or its first frames.
+    """Read a recording made by ``simulate`` or ``detect``, or its first frames.
 
     Raises:
         BagError: when it cannot be read.
@@ -79,6 +79,17 @@ class Answer:
     angular: Array | None  # (3,) rad/s
     linear: Array | None  # (3,) m/s
     residuals: Array  # (k,) px, of the inliers
+
+    def motion(self, readout_time: float) -> Motion:
+        """The motion that an answer for the middle row tells of; still without a twist."""
+        rotation = Rotation.from_quat(self.quaternion).as_matrix().T
+        still = np.zeros(3)
+        return Motion(
+            rotation,
+            -rotation @ self.position,
+            still if self.angular is None else readout_time * self.angular,
+            still if self.linear is None else readout_time * self.linear,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,12 +176,4 @@ def predicted_pixels(camera: Camera, answer: Answer, points: Array) -> Array:
 
     Without a twist the camera stands still.
     """
-    rotation = Rotation.from_quat(answer.quaternion).as_matrix().T
-    still = np.zeros(3)
-    motion = Motion(
-        rotation,
-        -rotation @ answer.position,
-        still if answer.angular is None else camera.readout_time * answer.angular,
-        still if answer.linear is None else camera.readout_time * answer.linear,
-    )
-    return project_rolling(camera, motion.at_rows, points)[0]
+    return project_rolling(camera, answer.motion(camera.readout_time).at_rows, points)[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import time
 from pathlib import Path
 
 import cv2
+import PIL.Image
 import pytest
 
 DEMO = [sys.executable, "-m", "rs_localizer", "demo", "--quick"]
@@ -32,18 +34,24 @@ def test_quick_demo(tmp_path: Path) -> None:
         [*DEMO, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=280
     )
     assert demo.returncode == 0, demo.stderr
-    assert figures(demo.stdout, "frames") == [[12.0, 12.0], [12.0, 12.0]]
+    assert figures(demo.stdout, "frames") == [[12.0, 12.0], [12.0, 12.0], [22.0, 22.0]]
     # Global shutter may miss a frame or two; rolling shutter must not.
-    assert [counts[0] for counts in figures(demo.stdout, "localized")] == [12.0, 12.0]
-    (webcam, flight) = figures(demo.stdout, "residual of the inliers")
+    assert [counts[0] for counts in figures(demo.stdout, "localized")] == [12.0, 12.0, 22.0]
+    (webcam, flight, cube) = figures(demo.stdout, "residual of the inliers")
     assert webcam[0] < webcam[1] < 0.2
     assert flight[0] < 2.0
-    ((rolling, static),) = figures(demo.stdout, "position error")
-    assert rolling < 0.5 * static
+    assert cube[0] < 0.5
+    for rolling, static in figures(demo.stdout, "position error"):
+        assert rolling < 0.5 * static
     assert figures(demo.stdout, "angular velocity error")[0][0] < 40.0
+    said = re.search(r"cube's farthest corner is off by (\S+) px .* by (\S+) px", demo.stdout)
+    assert said is not None
+    assert float(said[1]) < 1.0 < float(said[2])
+    with PIL.Image.open(tmp_path / "out" / "cube.gif") as animation:
+        assert animation.n_frames == 6
     for name in PICTURES:
         assert cv2.imread(str(tmp_path / "out" / name)).std() > 5.0
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(PICTURES)
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {*PICTURES, "cube.gif"}
 
 
 def children(pid: int) -> list[int]:

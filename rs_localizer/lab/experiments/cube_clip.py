@@ -25,18 +25,23 @@ from rs_localizer.tracking import Tracker
 
 # Of the bundled motion: the hand turns the camera to and fro about all axes, up to 200 deg/s, and
 # this marker is in view nearly all the time.
-START, DURATION, MARKER = 21.7, 3.2, 121
+_START, _DURATION, _MARKER = 21.7, 3.2, 121
 # Images before these, in which the tracking finds its feet; a camera in use has run for long.
-_RUN_UP = 10
+RUN_UP = 10
 _FRAMES_PER_TRIAL = 0.05
 _SAMPLES = 100
 # A picture for people, who do not need every second image, nor noise in it.
-_SENSOR = ImageSettings(exposure=0.002)
+CLIP_SENSOR = ImageSettings(exposure=0.002)
 _EVERY = 2
+# Pictures per second: slower than it was, for the eye to follow.
+_SHOWN_RATE = 10.0
 _WIDTH = 360
-# Of the picture: orange and blue differ for everyone, and in lightness.
-COLORS = {"p3p": (36, 138, 240), "localizer": (190, 84, 10)}
-CAPTIONS = {"p3p": "P3P: one pose per image", "localizer": "ours: a pose for every row"}
+# The two methods. Orange and blue differ for everyone, and in lightness.
+P3P, OURS = "p3p", "localizer"
+_COLORS = {P3P: (36, 138, 240), OURS: (190, 84, 10)}
+_CAPTIONS = {P3P: "P3P: one pose per image", OURS: "ours: a pose for every row"}
+
+Motions = Mapping[str, Motion | None]  # by method; None: no pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,39 +52,61 @@ class Clip:
     errors: Mapping[str, Array]  # method -> (images,) px, of the cube's farthest corner
 
 
+def clip_stamps(walls: MarkerWalls, most: int | None = None) -> list[int]:
+    """The images of the clip, or its first ones, after RUN_UP that are not shown."""
+    stamps = walls.stamps()
+    start_ns = stamps[0] + round(_START * 1e9)
+    first = next(k for k, stamp in enumerate(stamps) if stamp >= start_ns)
+    whole = round(_DURATION * RATE)
+    return stamps[first - RUN_UP : first + (whole if most is None else min(most, whole))]
+
+
+def clip_cube(walls: MarkerWalls) -> Cube:
+    """The cube of the clip."""
+    return cube_on(walls.markers[_MARKER])
+
+
 def cube_clip(trajectory: Trajectory, trials: int, seed: int, track: Track) -> Clip:
-    """Localize every image of the clip by both methods and draw the cube by their poses.
+    """Localize every image of the clip by both methods and draw the cube by their poses."""
+    walls = MarkerWalls(trajectory, seed, CLIP_SENSOR)
+    stamps = clip_stamps(walls, max(8, round(_FRAMES_PER_TRIAL * trials)))
+    p3p = Localizer(CAMERA, solver="p3p", max_iterations=_SAMPLES)
+    ours = Tracker(Localizer(CAMERA, max_iterations=_SAMPLES), Acceleration())
+    middles, images, motions = [], [], []
+    for frame, image in track(walls.frames(stamps), len(stamps)):
+        found = {
+            P3P: p3p.localize(frame.points, frame.pixels),
+            OURS: ours.localize(frame.middle_ns, frame.points, frame.pixels),
+        }
+        middles.append(frame.middle_ns)
+        images.append(image)
+        motions.append({name: motion or None for name, motion in found.items()})
+    return draw_clip(walls, middles[RUN_UP:], images[RUN_UP:], motions[RUN_UP:])
+
+
+def draw_clip(
+    walls: MarkerWalls,
+    middles_ns: Sequence[int],
+    images: Sequence[Image],
+    motions: Sequence[Motions],
+) -> Clip:
+    """The cube in all images by the motions of both methods.
 
     Images in which the cube is cut off are shown, but not counted.
     """
-    walls = MarkerWalls(trajectory, seed, _SENSOR)
-    stamps = walls.stamps()
-    start_ns = stamps[0] + round(START * 1e9)
-    most = min(round(DURATION * RATE), max(8, round(_FRAMES_PER_TRIAL * trials)))
-    first = next(k for k, stamp in enumerate(stamps) if stamp >= start_ns)
-    chosen = stamps[first - _RUN_UP : first + most]
-    cube = cube_on(walls.markers[MARKER])
-    p3p = Localizer(CAMERA, solver="p3p", max_iterations=_SAMPLES)
-    ours = Tracker(Localizer(CAMERA, max_iterations=_SAMPLES), Acceleration())
+    cube = clip_cube(walls)
     pictures: list[Image] = []
-    errors: dict[str, list[float]] = {"p3p": [], "localizer": []}
-    for index, (frame, image) in enumerate(track(walls.frames(chosen), len(chosen))):
-        found = {
-            "p3p": p3p.localize(frame.points, frame.pixels),
-            "localizer": ours.localize(frame.middle_ns, frame.points, frame.pixels),
-        }
-        if index < _RUN_UP:
-            continue
-        motions = {name: motion or None for name, motion in found.items()}
-        off = cube_errors(walls.motion, frame.middle_ns, cube, motions)
-        pictures.append(cube_picture(image, cube, motions, off))
+    errors: dict[str, list[float]] = {P3P: [], OURS: []}
+    for middle_ns, image, found in zip(middles_ns, images, motions, strict=True):
+        off = cube_errors(walls.motion, middle_ns, cube, found)
+        pictures.append(_picture(image, cube, found, off))
         for name, value in off.items():
             errors[name].append(value)
     return Clip(gif(pictures[::_EVERY], RATE / _EVERY), {k: np.array(v) for k, v in errors.items()})
 
 
 def cube_errors(
-    motion: TrueMotion, middle_ns: int, cube: Cube, motions: Mapping[str, Motion | None]
+    motion: TrueMotion, middle_ns: int, cube: Cube, motions: Motions
 ) -> dict[str, float]:
     """How far the cube's farthest corner is off in the image, px, for each method.
 
@@ -98,10 +125,10 @@ def cube_errors(
     return errors
 
 
-def cube_picture(
+def _picture(
     image: Image,
     cube: Cube,
-    motions: Mapping[str, Motion | None],
+    motions: Motions,
     off: Mapping[str, float],
 ) -> Image:
     """The image once for each method, with its cube and what it is off by."""
@@ -110,10 +137,10 @@ def cube_picture(
     for name, motion in motions.items():
         picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
         if motion is not None:
-            draw_cube(picture, CAMERA, motion.at_rows, cube, COLORS[name])
+            draw_cube(picture, CAMERA, motion.at_rows, cube, _COLORS[name])
         pictures.append(picture)
         error = "no pose" if motion is None else ""
         if motion is not None and name in off:
             error = f"off by {off[name]:.0f} px" if off[name] >= 1.0 else "off by less than 1 px"
-        captions.append((CAPTIONS[name], error))
-    return side_by_side(pictures, captions, [COLORS[name] for name in motions], _WIDTH)
+        captions.append((_CAPTIONS[name], error))
+    return side_by_side(pictures, captions, [_COLORS[name] for name in motions], _WIDTH)
