@@ -31,7 +31,7 @@ RUN_UP = 10
 _FRAMES_PER_TRIAL = 0.05
 _SAMPLES = 100
 # A picture for people, who do not need every second image, nor noise in it.
-CLIP_SENSOR = ImageSettings(exposure=0.002)
+CLIP_SENSOR = ImageSettings(exposure=0.001)
 _EVERY = 2
 # Pictures per second: slower than it was, for the eye to follow.
 _SHOWN_RATE = 10.0
