@@ -15,22 +15,43 @@ from rs_localizer.io.transforms import TransformError
 
 _INPUTS = {
     "correspondences": "sensor_msgs/msg/PointCloud2",
+    "keypoints": "sensor_msgs/msg/PointCloud2",
+    "map_points": "sensor_msgs/msg/PointCloud2",
     "camera_info": "sensor_msgs/msg/CameraInfo",
 }
+# Reasons of messages that are no frames.
+NO_FRAMES = ("bad_camera_info", "bad_map")
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """Where a recording has the inputs of the node."""
+    """Where a recording has the inputs of the node: frames are correspondences or keypoints."""
 
-    correspondences: str
     camera_info: str
+    correspondences: str | None
+    keypoints: str | None = None
+    map_points: str | None = None
+
+    @property
+    def frames(self) -> str:
+        """The topic whose messages are localized."""
+        return self.correspondences or self.keypoints or ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All of them."""
+        all_of_them = (self.camera_info, self.map_points, self.correspondences, self.keypoints)
+        return tuple(name for name in all_of_them if name is not None)
 
 
 def find_topics(
-    bag: BagReader, correspondences: str | None = None, camera_info: str | None = None
+    bag: BagReader,
+    correspondences: str | None = None,
+    camera_info: str | None = None,
+    keypoints: str | None = None,
+    map_points: str | None = None,
 ) -> Topics:
     """The topics of the inputs, given or found.
 
@@ -39,8 +60,28 @@ def find_topics(
     Raises:
         BagError: when a given topic is not there, or none or several could be meant.
     """
-    return Topics(
-        _find(bag, "correspondences", correspondences), _find(bag, "camera_info", camera_info)
+    camera = _find(bag, "camera_info", camera_info)
+    if correspondences is None and keypoints is None:
+        found = [name for name in ("correspondences", "keypoints") if _named(bag, name)]
+        if len(found) == 2:
+            raise BagError(
+                f"{bag.path} has correspondences and keypoints; choose with --correspondences or "
+                "--keypoints"
+            )
+        if found == ["keypoints"]:
+            keypoints = _find(bag, "keypoints", None)
+    if keypoints is None:
+        return Topics(camera, _find(bag, "correspondences", correspondences))
+    if map_points is not None or _named(bag, "map_points"):
+        map_points = _find(bag, "map_points", map_points)
+    return Topics(camera, None, _find(bag, "keypoints", keypoints), map_points)
+
+
+def _named(bag: BagReader, name: str) -> list[str]:
+    """Topics of the type of an input that end in its name."""
+    kind = _INPUTS[name]
+    return sorted(
+        topic for topic in bag.topics if bag.topics[topic] == kind and topic.split("/")[-1] == name
     )
 
 
@@ -54,7 +95,7 @@ def _find(bag: BagReader, name: str, given: str | None) -> str:
         raise BagError(
             f"{bag.path}: topic {given} {found}; topics of type {type_name}: {_list(of_type)}"
         )
-    for candidates in ([t for t in of_type if t.rsplit("/", 1)[-1] == name], of_type):
+    for candidates in (_named(bag, name), of_type):
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
@@ -120,18 +161,25 @@ def _connected(tree: TransformTree, target: str, source: str) -> bool:
 def replay(
     bag: BagReader, topics: Topics, localizer: FrameLocalizer
 ) -> Iterator[tuple[int, Frame | Refusal]]:
-    """Time of recording (ns) and result of every cloud, as the node would have answered.
+    """Time of recording (ns) and result of every frame, as the node would have answered.
 
-    A CameraInfo that cannot be used gives a Refusal ``bad_camera_info`` of its own.
+    A CameraInfo or a map that cannot be used gives a Refusal of its own, for a reason of
+    :data:`NO_FRAMES`.
     """
-    for topic, recorded_ns, message in bag.messages((topics.camera_info, topics.correspondences)):
+    for topic, recorded_ns, message in bag.messages(topics.names):
         if topic == topics.correspondences:
             yield recorded_ns, localizer.localize(message)
-            continue
-        try:
-            localizer.take_camera_info(message)
-        except MessageError as error:
-            yield recorded_ns, Refusal("bad_camera_info", str(error))
+        elif topic == topics.keypoints:
+            yield recorded_ns, localizer.localize_keypoints(message)
+        else:
+            kind = "camera_info" if topic == topics.camera_info else "map"
+            try:
+                if kind == "map":
+                    localizer.take_map(message)
+                else:
+                    localizer.take_camera_info(message)
+            except MessageError as error:
+                yield recorded_ns, Refusal(f"bad_{kind}", str(error))
 
 
 def _list(topics: list[str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import shlex
 import shutil
 import time
@@ -23,6 +24,7 @@ from rs_localizer.io.outputs import Frame, messages
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.replay import (
+    NO_FRAMES,
     TF_TYPE,
     Topics,
     find_topics,
@@ -34,6 +36,8 @@ from rs_localizer.settings import NODE_NAME, build, load_params_file, parse_assi
 
 # What replay writes into its output directory.
 POSES, TWISTS, RESULT = "poses.txt", "twists.txt", "result"
+# Notices of a frame that could not follow the one before.
+_RESTARTS = ("time_went_back", "map_changed")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
     topics.add_argument("--correspondences", metavar="TOPIC")
     topics.add_argument("--camera-info", metavar="TOPIC")
+    topics.add_argument("--keypoints", metavar="TOPIC", help="instead of correspondences")
+    topics.add_argument("--map-points", metavar="TOPIC", help="the map of the keypoints")
     offline = parser.add_argument_group(
         "offline (default): at full speed, no ROS needed",
         "With the settings base_frame and publish_tf, transforms come from the recording's "
@@ -67,6 +73,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME:=VALUE",
         help="one setting, as after --ros-args; may be repeated",
     )
+    offline.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="the map of the keypoints: as -p map_file:=FILE",
+    )
     offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
     graph = parser.add_argument_group("through the ROS graph")
     graph.add_argument(
@@ -83,30 +95,44 @@ def run(args: argparse.Namespace) -> None:
     _check_usage(args)
     if args.ros:
         with open_bag(args.bag) as bag:
-            _play(bag, find_topics(bag, args.correspondences, args.camera_info), args.rate or 1.0)
+            _play(bag, _find_topics(bag, args), args.rate or 1.0)
         return
-    config = _config(args.params, args.assignments)
+    given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
+    config = _config(args.params, args.assignments + given)
     notices: Counter[str] = Counter()
     with open_bag(args.bag) as bag:
-        topics = find_topics(bag, args.correspondences, args.camera_info)
+        topics = _find_topics(bag, args)
+        if topics.keypoints and not topics.map_points and not config.map_file:
+            raise ValueError(
+                f"{args.bag} has keypoints and no map on map_points; give one with --map"
+            )
         transforms = find_transforms(bag, topics, config)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
+        localizer.load_map()
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         _prepare(out, args.overwrite)
         _hint(args.bag, args.params)
         _replay(bag, topics, localizer, notices, out, args.storage)
 
 
+def _find_topics(bag: BagReader, args: argparse.Namespace) -> Topics:
+    return find_topics(
+        bag, args.correspondences, args.camera_info, args.keypoints, args.map_points
+    )
+
+
 def _check_usage(args: argparse.Namespace) -> None:
+    if args.correspondences is not None and args.keypoints is not None:
+        raise UsageError("give --correspondences or --keypoints, not both")
     if not args.ros:
         if args.rate is not None:
             raise UsageError("--rate goes with --ros; offline replay runs at full speed")
         return
-    given = (args.out, args.params, args.assignments, args.overwrite)
+    given = (args.out, args.params, args.assignments, args.map, args.overwrite)
     if any(given):
         raise UsageError(
-            "--out, --overwrite, --params and -p are for offline replay; with --ros the running "
-            "node has the settings and publishes the result"
+            "--out, --overwrite, --params, --map and -p are for offline replay; with --ros the "
+            "running node has the settings and publishes the result"
         )
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
@@ -165,7 +191,7 @@ def _replay(
     last = "nothing came"
     refused: Counter[str] = Counter()
     not_sent = 0
-    total = bag.count([topics.correspondences])
+    total = bag.count([topics.frames])
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
@@ -181,7 +207,7 @@ def _replay(
             else:
                 refused[result.reason] += 1
                 last = f"{result.reason}: {result.detail}"
-            bar.update(1 if result or result.reason != "bad_camera_info" else 0)
+            bar.update(1 if result or result.reason not in NO_FRAMES else 0)
     seconds = time.perf_counter() - start
     repeated = _write_texts(out, frames)
     _print_summary(total, frames, refused, notices, repeated, not_sent, seconds)
@@ -248,7 +274,8 @@ def _print_summary(
 ) -> None:
     rows = [("frames", total), ("localized", len(frames))]
     rows += [(f"  refused: {reason}", count) for reason, count in refused.most_common()]
-    rows += [(f"started afresh: {name}", count) for name, count in notices.most_common()]
+    for name, count in notices.most_common():
+        rows.append((f"{'started afresh' if name in _RESTARTS else 'noticed'}: {name}", count))
     dropped = sum(frame.dropped for frame in frames)
     rows += [("rows dropped (not finite)", dropped)] if dropped else []
     rows += [("stamps repeated, not in the text files", repeated)] if repeated else []
@@ -272,14 +299,15 @@ def _play(bag: BagReader, topics: Topics, rate: float) -> None:
             f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
             "(README.md)"
         ) from error
-    names = (*_playable_transforms(bag), topics.camera_info, topics.correspondences)
+    names = (*_playable_transforms(bag), *topics.names)
     total = bag.count(names)
     played = play(
         tqdm(bag.messages(names), total=total, unit="message", desc="play", disable=None),
         {name: bag.topics[name] for name in names},
         rate,
+        latched=() if topics.map_points is None else (topics.map_points,),
     )
-    frames = bag.count([topics.correspondences])
+    frames = bag.count([topics.frames])
     print(f"{frames} frames published in {played.seconds:.1f} s")
     for topic, count in played.poses.items():
         print(f"{count} poses heard on {topic}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,9 @@ _SETTLING_TIME = 0.3  # s to be heard by those whom we hear, and the other way r
 _REST_TIME = 0.5  # s to wait for the last answers
 # Reliable publishers are heard by reliable and by best-effort subscribers.
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+_LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 # As tf2_ros has them; whether anybody listens depends on the node's settings.
 _TF_QOS = {
     "/tf": QoSProfile(depth=100),
@@ -47,7 +50,10 @@ class Played:
 
 
 def play(
-    messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], rate: float = 1.0
+    messages: Iterable[tuple[str, int, Any]],
+    types: Mapping[str, str],
+    rate: float = 1.0,
+    latched: Collection[str] = (),
 ) -> Played:
     """Publish messages at the pace of their recording.
 
@@ -55,6 +61,7 @@ def play(
         messages: topic, time of recording in ns, message of rosbags; in the order of time.
         types: type name of each topic.
         rate: times real time.
+        latched: topics of which who comes late hears the last message, too.
 
     Raises:
         PlayerError: when nobody listens to any of the topics.
@@ -63,18 +70,22 @@ def play(
         # rclpy's own handlers end the context from a thread while the player still uses it.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         try:
-            return _play(messages, types, rate)
+            return _play(messages, types, rate, latched)
         finally:
             rclpy.try_shutdown()
 
 
 def _play(
-    messages: Iterable[tuple[str, int, Any]], types: Mapping[str, str], rate: float
+    messages: Iterable[tuple[str, int, Any]],
+    types: Mapping[str, str],
+    rate: float,
+    latched: Collection[str],
 ) -> Played:
     node = rclpy.create_node("rs_localizer_player")
     clock = node.create_publisher(Clock, "/clock", _QOS)
+    qos = _TF_QOS | dict.fromkeys(latched, _LATCHED)
     publishers = {
-        topic: node.create_publisher(message_class(name), topic, _TF_QOS.get(topic, _QOS))
+        topic: node.create_publisher(message_class(name), topic, qos.get(topic, _QOS))
         for topic, name in types.items()
     }
     executor = SingleThreadedExecutor()

@@ -14,7 +14,9 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.map_files import write_map_file
@@ -183,7 +185,20 @@ def test_a_map_file(
     node = start_node("-p", f"readout_time:={READOUT_TIME}", *given)
     talk = Talk(peer, info)
     talk.connect()
-    assert talk.localize(frames[0]).header.frame_id == "hall"
+    # What replay says of the same messages, to the last bit.
+    replay = FrameLocalizer(
+        NodeConfig(readout_time=READOUT_TIME, map_file=str(path), map_frame="hall")
+    )
+    replay.load_map()
+    replay.take_camera_info(info)
+    for frame in frames[:6]:
+        found = talk.localize(frame)
+        assert found.header.frame_id == "hall"
+        expected = replay.localize_keypoints(talk.keypoints(frame))
+        assert expected
+        position = [getattr(found.pose.position, name) for name in "xyz"]
+        assert position == expected.pose.position.tolist()
+        assert expected.estimate.tracked == (frame is not frames[0])
     node.wait_for_log("the map has 8000 landmarks in frame 'hall'")
     assert node.stop() == 0
     os.truncate(path, 1000)

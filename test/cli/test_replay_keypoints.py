@@ -1,0 +1,149 @@
+"""Replay of keypoints: with a map in the recording and with a map file, and what is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.map_files import write_map_file
+from rs_localizer.io.maps import Map
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.lab.landmarks import keypoint_rows, map_rows, random_descriptors
+from rs_localizer.lab.recording import write_simulated
+from rs_localizer.lab.scene import room
+from rs_localizer.lab.simulation import FrameSettings, simulate_frames
+from rs_localizer.lab.true_motion import ConstantVelocity
+
+READOUT_TIME = 0.03
+SHUTTER = ["-p", f"readout_time:={READOUT_TIME}"]
+FRAMES = 8
+POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=6000)
+LANDMARKS = Map(
+    POINTS, np.arange(6000) + 7, random_descriptors(6000, np.random.default_rng(1)), "map"
+)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings of one flight: with correspondences, keypoints, and a map, as asked for."""
+    folder = tmp_path_factory.mktemp("bags")
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
+    motion = ConstantVelocity(
+        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4, start_ns=10**9
+    )
+    seen = FrameSettings(points=80, noise=0.5, outliers=0.2)
+    with BagWriter(folder / "all") as bag:
+        for frame in list(simulate_frames(camera, motion, POINTS, seen))[:FRAMES]:
+            write_simulated(bag, camera, frame)
+            rows = keypoint_rows(frame, LANDMARKS, np.random.default_rng(frame.stamp_ns))
+            for topic, names in (
+                ("/cam/keypoints", ("u", "v", "descriptor")),
+                ("/ids", ("u", "v", "id")),
+            ):
+                part = np.empty(len(rows), [(name, rows.dtype[name]) for name in names])
+                for name in names:
+                    part[name] = rows[name]
+                message = make_cloud(make_message, frame.stamp_ns, "camera", part)
+                bag.write(topic, message, frame.stamp_ns)
+            if frame.stamp_ns == 10**9 + 66_666_667:  # late: with the third frame
+                message = make_cloud(make_message, 0, "map", map_rows(LANDMARKS))
+                bag.write("/cam/map_points", message, frame.stamp_ns - 1)
+    for name, topics in {
+        "keypoints": ("/camera_info", "/cam/keypoints"),
+        "with_map": ("/camera_info", "/cam/keypoints", "/cam/map_points"),
+    }.items():
+        with open_bag(folder / "all") as source, BagWriter(folder / name) as bag:
+            for topic, stamp_ns, message in source.messages((*topics, "/truth/pose")):
+                bag.write(topic, message, stamp_ns)
+    write_map_file(folder / "map.npz", LANDMARKS)
+    return folder
+
+
+def errors(out: Path, truth: Path) -> Any:
+    """Distances (m) of the poses to the true ones."""
+    found = read_tum(out / "poses.txt")
+    with open_bag(truth) as bag:
+        poses = {
+            m.header.stamp.sec * 10**9 + m.header.stamp.nanosec: m.pose.position
+            for _, _, m in bag.messages(("/truth/pose",))
+        }
+    true = np.array([[poses[s].x, poses[s].y, poses[s].z] for s in found.stamps_ns.tolist()])
+    return np.linalg.norm(found.positions - true, axis=1)
+
+
+def test_a_map_in_the_recording(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["replay", str(flight / "with_map"), "--out", str(out), *SHUTTER]) == 0
+    said = capsys.readouterr().out
+    assert [line.split()[-1] for line in said.splitlines() if "no_map" in line] == ["2"]
+    found = errors(out, flight / "with_map")
+    assert len(found) == FRAMES - 2
+    assert found.max() < 0.02
+
+
+@pytest.mark.parametrize("how", ["--map", "-p"])
+def test_a_map_file(flight: Path, tmp_path: Path, how: str) -> None:
+    file = str(flight / "map.npz")
+    given = ["--map", file] if how == "--map" else ["-p", f"map_file:={file}"]
+    out = tmp_path / "out"
+    assert main(["replay", str(flight / "keypoints"), "--out", str(out), *SHUTTER, *given]) == 0
+    found = errors(out, flight / "keypoints")
+    assert len(found) == FRAMES
+    assert found.max() < 0.02
+
+
+def test_a_recording_of_everything(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["replay", str(flight / "all"), *SHUTTER]
+    assert main(words) == 1
+    assert "choose with --correspondences or --keypoints" in capsys.readouterr().err
+    for name, given in {
+        "clouds": ["--correspondences", "/correspondences"],
+        "ids": ["--keypoints", "/ids", "--map-points", "/cam/map_points"],
+    }.items():
+        assert main([*words, *given, "--out", str(tmp_path / name)]) == 0
+    assert "map_replaced" not in capsys.readouterr().out
+    # By the id or by the points themselves: the frames since the map came are the same.
+    one, other = (
+        read_tum(tmp_path / "ids" / "poses.txt"),
+        read_tum(tmp_path / "clouds" / "poses.txt"),
+    )
+    assert len(one) == len(other) - 2
+    assert np.allclose(one.positions, other.positions[2:], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["keypoints"], 1, "has keypoints and no map on map_points; give one with --map"),
+        (["keypoints", "--map", "nowhere.npz"], 1, "map_file: [Errno 2] No such file"),
+        (["keypoints", "--map", "x.npz", "--ros"], 2, "--map and -p are for offline replay"),
+        (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),
+        (["all", "--keypoints", "/nowhere"], 1, "topic /nowhere does not exist"),
+        (["all", "--keypoints", "/ids", "--map-points", "/x"], 1, "topic /x does not exist"),
+    ],
+)
+def test_what_is_refused(
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    code: int,
+    text: str,
+) -> None:
+    bag, *more = words
+    out = [] if "--ros" in more else ["--out", str(tmp_path / "out")]
+    assert main(["replay", str(flight / bag), *more, *out]) == code
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
