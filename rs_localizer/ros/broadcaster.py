@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections import deque
@@ -34,7 +35,8 @@ class _Pending:
 class Broadcaster:
     """TF's side of the outputs.
 
-    :meth:`publish` may be called from any thread, all else belongs to the executor's.
+    :meth:`publish` may be called from any thread; transforms are heard in one of their own, and all
+    else belongs to the executor's.
 
     Args:
         node: sends, and listens for the odometry.
@@ -42,7 +44,7 @@ class Broadcaster:
     """
 
     def __init__(self, node: Node, notice: Callable[[str, str], None]) -> None:
-        self.tf = Tf(node, self._hear)
+        self.tf = Tf(node, self._hear, functools.partial(notice, "internal_error"))
         self._node = node
         self._notice = notice
         self._broadcaster: Any = None
