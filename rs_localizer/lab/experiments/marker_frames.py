@@ -88,13 +88,13 @@ class MarkerWalls:
     def _visible(self, middle_ns: int) -> int:
         poses_at = true_poses_at(CAMERA, self.motion, middle_ns)
         quads = project_rolling(CAMERA, poses_at, self._corners)[0].reshape(-1, 4, 2)
-        return int(np.count_nonzero(visible(quads)))
+        return int(np.count_nonzero(visible(quads, CAMERA.size)))
 
 
-def visible(quads: Array) -> NDArray[np.bool_]:
-    """Which markers (m,) can be seen that have their corners at these pixels (m,4,2)."""
+def visible(quads: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which markers (m,) can be seen that have their corners at these raw pixels (m,4,2)."""
     with np.errstate(invalid="ignore"):  # NaN, behind the camera, compares false
-        inside = (quads > _MARGIN) & (quads < np.array(CAMERA.size) - 1.0 - _MARGIN)
+        inside = (quads > _MARGIN) & (quads < np.array(size) - 1.0 - _MARGIN)
         sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2)
         one, other = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
         # Twice the area; negative when seen from behind.
