@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "markers": {"core", "io"},
     "lab": {
         *("core", "config", "solvers", "localizer", "tracking"),
-        *("io", "markers", "settings", "arguments"),
+        *("io", "markers", "matching", "frames", "settings", "arguments"),
     },
 }
 ABOVE = {"ros", "cli"}

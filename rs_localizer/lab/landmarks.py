@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.io.maps import Map
+from rs_localizer.io.maps import Descriptors, Map
 from rs_localizer.lab.simulation import SimulatedFrame
 
 # Share of the bits that differ between two views of a landmark; ORB's median is about this.
 BIT_ERRORS = 0.1
+# Of each number of a descriptor whose numbers have the deviation 1.
+DEVIATION = 0.3
 
 
 def random_descriptors(count: int, rng: np.random.Generator, width: int = 32) -> NDArray[np.uint8]:
@@ -19,12 +21,13 @@ def random_descriptors(count: int, rng: np.random.Generator, width: int = 32) ->
     return rng.integers(0, 256, (count, width), dtype=np.uint8)
 
 
-def seen_descriptors(
-    descriptors: NDArray[np.uint8], rng: np.random.Generator, errors: float = BIT_ERRORS
-) -> NDArray[np.uint8]:
-    """Descriptors (n,width) as another image has them: each bit differs with this probability."""
+def seen_descriptors(descriptors: Descriptors, rng: np.random.Generator) -> Descriptors:
+    """Descriptors (n,width) as another image has them."""
     count, width = descriptors.shape
-    return descriptors ^ np.packbits(rng.random((count, 8 * width)) < errors, axis=1)
+    if descriptors.dtype == np.uint8:
+        flips: NDArray[np.uint8] = np.packbits(rng.random((count, 8 * width)) < BIT_ERRORS, axis=1)
+        return descriptors.astype(np.uint8) ^ flips
+    return (descriptors + rng.normal(0.0, DEVIATION, (count, width))).astype(np.float32)
 
 
 def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generator) -> NDArray[Any]:
@@ -37,14 +40,14 @@ def keypoint_rows(frame: SimulatedFrame, landmarks: Map, rng: np.random.Generato
     if landmarks.ids is not None:
         kinds.append(("id", landmarks.id_type))
     if landmarks.descriptors is not None:
-        kinds.append(("descriptor", "u1", landmarks.descriptors.shape[1:]))
+        descriptors = landmarks.descriptors
+        kinds.append(("descriptor", descriptors.dtype, descriptors.shape[1:]))
     rows = np.empty(len(frame.ids), kinds)
     rows["u"], rows["v"] = frame.pixels.T
     if landmarks.ids is not None:
         rows["id"] = landmarks.ids[frame.ids]
     if landmarks.descriptors is not None:
-        shown = landmarks.descriptors[frame.ids].astype(np.uint8, copy=False)
-        rows["descriptor"] = seen_descriptors(shown, rng)
+        rows["descriptor"] = seen_descriptors(landmarks.descriptors[frame.ids], rng)
     return rows
 
 

@@ -9,6 +9,7 @@ from rs_localizer.lab.experiments import (
     bound,
     convergence,
     linearisation,
+    matching,
     motion,
     noise,
     p3p_initialisation,
@@ -33,6 +34,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "tracking": tracking.run,
     "robustness": robustness.run,
     "timings": timings.run,
+    "matching": matching.run,
     "real": real.run,
     "augmented-reality": augmented_reality.run,
 }

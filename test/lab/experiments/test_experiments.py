@@ -98,6 +98,7 @@ OPEN = {
     "robustness.object_uniform",
     "robustness.points_20",
     "robustness.none_wrong",
+    *(f"matching.{case}_rate" for case in ("id", "whole", "predicted")),
     "augmented-reality.localized",
     "augmented-reality.time",
 }
