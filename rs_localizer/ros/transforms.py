@@ -211,7 +211,7 @@ class AtOnce:
 class _WithoutExecutor:
     """What the TransformListener takes for its node: its messages are left to an Intake.
 
-    A robot sends some hundred messages a second on /tf, and the executor takes 0.6 ms for each.
+    A robot sends some hundred messages a second on /tf, and the executor takes 0.4 ms for each.
     """
 
     def __init__(self, node: Node) -> None:
