@@ -65,6 +65,12 @@ def read_camera_info(message: Any) -> Calibration:
         raise MessageError(f"K must have 9 values, found {len(K)}")
     if K[0] == 0.0:
         raise MessageError("the camera is not calibrated: K[0] is 0")
+    binning = (int(message.binning_x) or 1, int(message.binning_y) or 1)
+    if binning[0] > width or binning[1] > height:
+        raise MessageError(
+            f"binning of {binning[0]} x {binning[1]} leaves nothing of an image of "
+            f"{width} x {height}"
+        )
     return Calibration(
         frame=frame,
         width=width,
@@ -72,7 +78,7 @@ def read_camera_info(message: Any) -> Calibration:
         K=K,
         D=D,
         distortion_model=_distortion_model(str(message.distortion_model), D),
-        binning=(int(message.binning_x) or 1, int(message.binning_y) or 1),
+        binning=binning,
         roi=_roi(message.roi, width, height),
     )
 

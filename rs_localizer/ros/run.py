@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -20,20 +23,34 @@ from rs_localizer.stopping import StopRequest
 _SIGNAL_LATENCY = 0.1
 # How long the end waits for the frame that is worked on, in s.
 _LAST_FRAME_TIMEOUT = 0.5
+# How long a thread waits for the GIL before it asks for it, in s.
+_SWITCH_INTERVAL = 0.001
 
 
-def run(stop: StopRequest, args: list[str] | None = None) -> int:
-    """Run the node until ``stop`` is requested; the exit code."""
+def run(
+    stop: StopRequest,
+    args: list[str] | None = None,
+    make: Callable[..., Any] = LocalizerNode,
+    name: str = NODE_NAME,
+) -> int:
+    """Run a node until ``stop`` is requested; the exit code.
+
+    Args:
+        stop: asks for the end.
+        args: of the command line.
+        make: the node's class, called with what to enter while kernels are compiled.
+        name: of the node.
+    """
     try:
         # rclpy's own handlers end the context from a thread while the node still uses it.
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = LocalizerNode(compiling=stop.at_once)
+        node = make(compiling=stop.at_once)
     except (ValueError, RuntimeError) as error:
-        rclpy.logging.get_logger(NODE_NAME).fatal(" ".join(str(error).split()))
+        rclpy.logging.get_logger(name).fatal(" ".join(str(error).split()))
         rclpy.try_shutdown()
         return 1
     try:
-        code = _run(node, stop)
+        code = _start(node) or spin(node, lambda: stop.requested)
     except ExternalShutdownException:
         code = 0
     finally:
@@ -47,14 +64,25 @@ def run(stop: StopRequest, args: list[str] | None = None) -> int:
     return code
 
 
-def _run(node: LocalizerNode, stop: StopRequest) -> int:
+def _start(node: Any) -> int:
+    """Configure and activate the node if it is to do so itself; the exit code if that failed."""
     if node.autostart:
         for transition in (node.trigger_configure, node.trigger_activate):
             if transition() != TransitionCallbackReturn.SUCCESS:
                 return 1
-    executor = SingleThreadedExecutor()
+    # What has been compiled stays; to look through it for garbage would take a tenth of a second.
+    gc.collect()
+    gc.freeze()
+    # Other threads than the worker have little to do and give the GIL back soon.
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+    return 0
+
+
+def spin(node: Any, stopped: Callable[[], bool]) -> int:
+    """Run the callbacks of the node's executor, which no error of theirs ends; the exit code."""
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    while not stop.requested:
+    while not stopped():
         try:
             executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
         except ExternalShutdownException:
