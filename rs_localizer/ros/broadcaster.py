@@ -6,7 +6,6 @@ import functools
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.ros.conversion import make_message
+from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.transforms import AtOnce, NotYetError, Tf, import_tf2_ros
 
 # Frames that wait for odometry, which mostly comes later than they do.
@@ -40,13 +40,13 @@ class Broadcaster:
 
     Args:
         node: sends, and listens for the odometry.
-        notice: told of what was not sent, by a name and one sentence.
+        refusals: told of what was not sent, and of errors that nobody foresaw.
     """
 
-    def __init__(self, node: Node, notice: Callable[[str, str], None]) -> None:
-        self.tf = Tf(node, self._hear, functools.partial(notice, "internal_error"))
+    def __init__(self, node: Node, refusals: Refusals) -> None:
+        self.tf = Tf(node, self._hear, functools.partial(refusals.add, "internal_error"))
         self._node = node
-        self._notice = notice
+        self._refusals = refusals
         self._broadcaster: Any = None
         self._pending: deque[_Pending] = deque(maxlen=_MOST_PENDING)
         self._sending = threading.Lock()
@@ -106,9 +106,9 @@ class Broadcaster:
                     if time.monotonic() < item.deadline:
                         self._pending.append(item)
                     else:
-                        self._notice("not_broadcast", str(error))
+                        self._refusals.notice("not_broadcast", str(error))
                 except TransformError as error:
-                    self._notice("not_broadcast", str(error))
+                    self._refusals.notice("not_broadcast", str(error))
 
     def _send(self, item: Broadcast | None) -> None:
         if item is None or self._broadcaster is None:

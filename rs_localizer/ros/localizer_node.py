@@ -76,7 +76,7 @@ class LocalizerNode(RobustLifecycleNode):
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._worker: Worker | None = None
         self._outputs: Outputs | None = None
-        self._broadcaster = Broadcaster(self, self.refusals.notice)
+        self._broadcaster = Broadcaster(self, self.refusals)
         self._reset_service: Service | None = None
         # From activating to deactivating.
         self._inputs: Inputs | None = None

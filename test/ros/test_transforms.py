@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.util
 import sys
@@ -69,7 +70,11 @@ def made(peer: Any, robot: Any) -> Iterator[Callable[..., Any]]:
 
     def make(**settings: Any) -> SimpleNamespace:
         notes: Notes = []
-        broadcaster = Broadcaster(peer.node, lambda *words: notes.append(words))
+
+        def keep(*words: str) -> None:
+            notes.append(words)
+
+        broadcaster = Broadcaster(peer.node, SimpleNamespace(notice=keep, add=keep))
         config = NodeConfig(**settings)
         broadcaster.configure(config)
         parts.append(broadcaster)
@@ -134,8 +139,7 @@ def test_static_transforms_hold_for_all_times(made: Any, robot: Any, peer: Any) 
     assert not node.tf.moves("camera", "base_link")
     # Calibrated anew.
     robot.send("base_link", "camera", 3.0)
-    moved = lambda: node.tf.lookup("base_link", "camera", 5).translation[0] == 3.0  # noqa: E731
-    assert peer.spin_until(moved)
+    assert peer.spin_until(lambda: node.tf.lookup("base_link", "camera", 5).translation[0] == 3.0)
     with pytest.raises(TransformError, match=r"no transforms of the time -0\.010 s"):
         node.tf.lookup("base_link", "camera", -10_000_000)
 
@@ -147,14 +151,14 @@ def test_what_is_not_known_yet_is_waited_for(made: Any, robot: Any, peer: Any) -
     robot.send("base_link", "camera", 2.0, 6 * second)
     assert known(node, peer, "base_link", "camera", 5_500_000_000).translation[0] == 1.5
     assert node.tf.moves("camera", "base_link")
-    ask = lambda: node.tf.lookup("base_link", "camera", 7 * second)  # noqa: E731
+    ask = functools.partial(node.tf.lookup, "base_link", "camera", 7 * second)
     with pytest.raises(NotYetError, match="extrapolation into the future"):
         node.tf.lookup_now("base_link", "camera", 7 * second)
     found = answer(ask, peer, lambda: robot.send("base_link", "camera", 6.0, 8 * second))
     assert found.translation[0] == 4.0
     # Whoever waits while the node ends gets an answer at once.
     started = time.monotonic()
-    ask = lambda: node.tf.lookup("base_link", "camera", 9 * second)  # noqa: E731
+    ask = functools.partial(node.tf.lookup, "base_link", "camera", 9 * second)
     refused = answer(ask, peer, node.broadcaster.close)
     assert str(refused) == "TF is not listened to"
     assert time.monotonic() - started < 5.0
