@@ -34,8 +34,8 @@ _LANDMARKS = 100_000
 _SEEN = FrameSettings(points=500, noise=0.5, outliers=0.3, rate=30.0)
 _READOUT_TIME = 0.03
 _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-_FRAMES_PER_TRIAL = 0.05
-_FEWEST, _MOST = 12, 100
+_FRAMES_PER_TRIAL = 0.03
+_FEWEST, _MOST = 10, 100
 # So many landmarks look the same where nothing is recognized by its looks alone.
 _ALIKE = 50
 _FLOATS = 128

@@ -76,6 +76,8 @@ HELD = {
     "augmented-reality.position",
     "augmented-reality.reprojection",
     "augmented-reality.cube",
+    "matching.localized",
+    "matching.alike",
 }
 NOT_HELD = {
     "motion.r9p_ahead_noisy",
