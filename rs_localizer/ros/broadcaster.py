@@ -106,9 +106,12 @@ class Broadcaster:
                     if time.monotonic() < item.deadline:
                         self._pending.append(item)
                     else:
-                        self._refusals.notice("not_broadcast", str(error))
+                        self._say(item, error)
                 except TransformError as error:
-                    self._refusals.notice("not_broadcast", str(error))
+                    self._say(item, error)
+
+    def _say(self, item: _Pending, error: TransformError) -> None:
+        self._refusals.notice("not_broadcast", f"publish_tf {item.config.publish_tf}: {error}")
 
     def _send(self, item: Broadcast | None) -> None:
         if item is None or self._broadcaster is None:
