@@ -23,6 +23,7 @@ _INPUTS = {
 NO_FRAMES = ("bad_camera_info", "bad_map")
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
+_OLD_TF_TYPE = "tf/msg/tfMessage"  # of ROS 1 before tf2
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +110,9 @@ def _find(bag: BagReader, name: str, given: str | None) -> str:
     )
 
 
-def tf_topics(bag: BagReader) -> list[str]:
-    """Those of /tf_static and /tf that the recording has."""
-    return [topic for topic in ("/tf_static", "/tf") if bag.topics.get(topic) == TF_TYPE]
+def tf_topics(bag: BagReader, *types: str) -> list[str]:
+    """Those of /tf_static and /tf that the recording has, as one of these types."""
+    return [topic for topic in ("/tf_static", "/tf") if bag.topics.get(topic) in types]
 
 
 def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> TransformTree:
@@ -132,7 +133,7 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     camera = next((m.header.frame_id for _, _, m in bag.messages((topics.camera_info,))), None)
     if not wanted or camera is None:
         return tree
-    found = tf_topics(bag)
+    found = tf_topics(bag, TF_TYPE, _OLD_TF_TYPE)
     for topic in found:
         for _, _, message in bag.messages((topic,)):
             tree.add(message, static=topic == "/tf_static")

@@ -316,7 +316,7 @@ def _play(bag: BagReader, topics: Topics, rate: float) -> None:
 
 
 def _playable_transforms(bag: BagReader) -> list[str]:
-    topics = tf_topics(bag)
+    topics = tf_topics(bag, TF_TYPE)
     try:
         importlib.import_module("tf2_msgs.msg")
     except ImportError:

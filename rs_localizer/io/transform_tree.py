@@ -77,7 +77,10 @@ class _Track:
 
 
 class TransformTree:
-    """Transforms by the names of frames (see :class:`rs_localizer.io.transforms.Transforms`)."""
+    """Transforms by the names of frames (see :class:`rs_localizer.io.transforms.Transforms`).
+
+    A slash before a name, as ROS 1 has it, says nothing.
+    """
 
     def __init__(self) -> None:
         self._tracks: dict[str, _Track] = {}  # by child
@@ -110,6 +113,7 @@ class TransformTree:
         Raises:
             TransformError: when it is not known for that time.
         """
+        target, source = target.removeprefix("/"), source.removeprefix("/")
         if target == source:
             return from_numbers((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         if stamp_ns is None:
@@ -137,6 +141,7 @@ class TransformTree:
         Raises:
             TransformError: when they are not connected.
         """
+        target, source = target.removeprefix("/"), source.removeprefix("/")
         return target != source and self._latest(target, source) is not None
 
     def _latest(self, target: str, source: str) -> int | None:
@@ -160,9 +165,9 @@ class TransformTree:
         names = [name]
         while name in self._tracks:
             name = self._tracks[name].at(None).parent
-            if name in names:
-                raise TransformError(f"the frames above {names[0]!r} are a loop")
             names.append(name)
+            if len(names) > _MOST_LINKS:
+                raise TransformError(f"the frames above {names[0]!r} are a loop")
         return names
 
     def _climb(

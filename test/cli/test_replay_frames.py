@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
@@ -172,3 +174,45 @@ def test_a_mounting_that_the_recording_does_not_have(
     where = "does not say where the camera 'camera_optical_frame' is in base_frame 'base_link': "
     assert f"{bag} {where}{text.replace('{camera!r}', repr(CAMERA))}" in error
     assert not (tmp_path / "out").exists()
+
+
+def test_an_old_recording(record: Any, tmp_path: Path) -> None:
+    # ROS 1 before tf2: another type, slashes before the names, and the mounting on /tf.
+    store = get_typestore(Stores.ROS1_NOETIC)
+    definition = "geometry_msgs/TransformStamped[] transforms"
+    store.register(get_types_from_msg(definition, "tf/msg/tfMessage"))
+
+    def old(message: Any) -> Any:
+        if isinstance(message, list):
+            return [old(item) for item in message]
+        if not hasattr(message, "__msgtype__"):
+            return message
+        kind = message.__msgtype__.replace("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+        names = {"d": "D", "k": "K", "r": "R", "p": "P"} if kind.endswith("CameraInfo") else {}
+        fields = {
+            names.get(name, name): old(getattr(message, name))
+            for name in message.__dataclass_fields__
+            if name != "__msgtype__" and not name.isupper()
+        }
+        if kind == "std_msgs/msg/Header":
+            fields["seq"] = 0
+        return store.types[kind](**fields)
+
+    with open_bag(record(STATIC)) as bag, Ros1Writer(tmp_path / "old.bag") as writer:
+        connections: dict[str, Any] = {}
+        messages = list(bag.messages(("/camera_info", "/correspondences")))
+        first = messages[0][1]
+        for stamp_ns in (first - 10**9, first + 10**9):
+            message = tf("/base_link", f"/{CAMERA}", LEVER, TURN, stamp_ns)
+            messages.append(("/tf", stamp_ns, message))
+        for topic, stamp_ns, message in messages:
+            converted = old(message)
+            kind = converted.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            data = store.serialize_ros1(converted, kind)
+            writer.write(connections[topic], stamp_ns, data)
+    settings = ("-p", "base_frame:=base_link")
+    new = replayed(record(STATIC), tmp_path / "new", *settings)
+    for a, b in zip(replayed(tmp_path / "old.bag", tmp_path / "out", *settings), new, strict=True):
+        assert all(np.allclose(*pair, atol=1e-6) for pair in zip(a, b, strict=True))

@@ -108,7 +108,9 @@ def test_there_and_back(tree: TransformTree) -> None:
     back = tree.lookup("camera", "lidar", 1_020_000_000)
     assert np.allclose((there @ back).rotation, np.eye(3), atol=1e-12)
     assert np.allclose((there @ back).translation, 0.0, atol=1e-12)
-    nothing = tree.lookup("camera", "camera", 7)
+    with_slashes = tree.lookup("/lidar", "/camera", 1_020_000_000)
+    assert np.array_equal(with_slashes.rotation, there.rotation)
+    nothing = tree.lookup("camera", "/camera", 7)
     assert np.array_equal(nothing.rotation, np.eye(3))
 
 
