@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.acceptance import determines_motion, refusal
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.inputs import checked
+from rs_localizer.core.inputs import checked, median_point
 from rs_localizer.core.posterior import (
     WIDEST_GATE,
     Posterior,
@@ -138,7 +138,7 @@ class Localizer:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         rays = self.camera.rays(pixels)
         seen = np.isfinite(rays[:, 0])
-        centre = np.median(points[seen], axis=0) if np.any(seen) else np.zeros(3)
+        centre = median_point(points, seen)
         with np.errstate(over="ignore"):
             within = np.abs(points - centre).max(axis=1, initial=0.0) < _FARTHEST_POINT
         usable = np.flatnonzero(seen & within)

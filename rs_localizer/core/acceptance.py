@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
+from rs_localizer.core.jit import kernel
 from rs_localizer.core.posterior import Posterior
 from rs_localizer.core.ransac import Observations
 from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import Failure, Reason
+from rs_localizer.core.types import BoolArray, Failure, Reason
 
 # Of the information matrix scaled to a unit diagonal.
 _LEAST_EIGENVALUE = 1e-11
@@ -72,7 +73,7 @@ def refusal(
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
             "too small for the noise",
         )
-    pace = float(np.median(observations.row_paces(state)[posterior.inliers]))
+    pace = _median(observations.row_paces(state), posterior.inliers)
     if pace < _LEAST_PACE:
         return Failure(
             Reason.IMPLAUSIBLE,
@@ -84,7 +85,7 @@ def refusal(
             Reason.IMPLAUSIBLE,
             f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
         )
-    depth = _median_depth(observations.points[posterior.inliers], state)
+    depth = _median(observations.points @ state[6:9] + state[11], posterior.inliers)
     travel = float(np.linalg.norm(state[15:18]))
     if travel > depth:
         return Failure(
@@ -95,5 +96,7 @@ def refusal(
     return None
 
 
-def _median_depth(points: Array, state: Array) -> float:
-    return float(np.median(points @ state[6:9] + state[11]))
+@kernel
+def _median(values: Array, chosen: BoolArray) -> float:
+    median: float = np.median(values[chosen])
+    return median

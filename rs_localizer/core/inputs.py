@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_localizer.core.jit import kernel
 from rs_localizer.core.so3 import Array
+from rs_localizer.core.types import BoolArray
 
 
 def checked(
@@ -35,3 +37,13 @@ def checked(
         if not np.all(np.isfinite(array)):
             raise ValueError(f"{name} must be finite, found NaN or infinity")
     return points, pixels, scores
+
+
+@kernel
+def median_point(points: Array, chosen: BoolArray) -> Array:
+    """Median (3,) of each coordinate over some of the points (n,3); zero if there are none."""
+    median = np.zeros(3)
+    if np.any(chosen):
+        for k in range(3):
+            median[k] = np.median(points[:, k][chosen])
+    return median

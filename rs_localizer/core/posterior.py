@@ -17,9 +17,10 @@ from rs_localizer.core.refine import (
     solve_positive,
     step_between,
 )
-from rs_localizer.core.residuals import PARAMETERS, set_weights, squared_errors
+from rs_localizer.core.residuals import set_weights, squared_errors
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray
+from rs_localizer.core.view import PARAMETERS
 
 # Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
 # distributed errors); the threshold is widened for them at most twofold.
@@ -112,7 +113,7 @@ def _rounds(
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
         set_weights(data, weights)
         state, information, _, _ = refine(
-            data, state, gradient, _NO_SCALE, 0.0, prior, noise, _ITERATIONS, _TOLERANCE
+            data, state, gradient, _NO_SCALE, 0.0, prior, noise, 2, _ITERATIONS, _TOLERANCE
         )
         errors = squared_errors(data, count, state, gradient)
         freedom = 12.0
@@ -204,6 +205,7 @@ def _fit(
         0.0,
         prior,
         noise,
+        2,
         _ITERATIONS,
         _TOLERANCE,
     )

@@ -10,8 +10,9 @@ import numpy as np
 
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms, add_prior
-from rs_localizer.core.residuals import PARAMETERS, STATE_SIZE, normal_equations
+from rs_localizer.core.residuals import normal_equations
 from rs_localizer.core.so3 import Array, exp, log
+from rs_localizer.core.view import PARAMETERS, STATE_SIZE
 
 _MOST_DAMPING = 1e8
 
@@ -88,11 +89,12 @@ def _posterior(
     softness: float,
     prior: PriorTerms,
     noise: float,
+    looks: int,
     information: Array,
     slope: Array,
 ) -> float:
     """Normal equations and cost with the prior, in squared pixels."""
-    cost = normal_equations(data, state, gradient, scale, softness, information, slope)
+    cost = normal_equations(data, state, gradient, scale, softness, looks, information, slope)
     return cost + add_prior(
         prior.informations,
         prior.references,
@@ -113,6 +115,7 @@ def refine(
     softness: float,
     prior: PriorTerms,
     noise: float,
+    looks: int,
     iterations: int,
     tolerance: float,
 ) -> tuple[Array, Array, float, bool]:
@@ -125,6 +128,7 @@ def refine(
         scale, softness: of the robust loss, see :mod:`rs_localizer.core.residuals`.
         prior: see :mod:`rs_localizer.core.prior`.
         noise: standard deviation of the pixels, against which the prior is weighed.
+        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.core.view.View`).
         iterations: most steps.
         tolerance: a step that gains less than this, in noise variances, is the last one.
 
@@ -137,7 +141,9 @@ def refine(
     slope = np.empty(PARAMETERS)
     next_information = np.empty((PARAMETERS, PARAMETERS))
     next_slope = np.empty(PARAMETERS)
-    cost = _posterior(data, state, gradient, scale, softness, prior, noise, information, slope)
+    cost = _posterior(
+        data, state, gradient, scale, softness, prior, noise, looks, information, slope
+    )
     damping = 0.0
     converged = False
     for _ in range(iterations):
@@ -151,8 +157,9 @@ def refine(
                 gain -= step[i] * slope[i]
             trial = apply_step(state, step)
             trial_cost = _posterior(
-                data, trial, gradient, scale, softness, prior, noise, next_information, next_slope
-            )
+                data, trial, gradient, scale, softness, prior, noise, looks,
+                next_information, next_slope,
+            )  # fmt: skip
             if trial_cost <= cost:
                 state, cost = trial, trial_cost
                 information, next_information = next_information, information
@@ -171,19 +178,25 @@ def refine(
     return state, information, cost, converged
 
 
+@kernel
 def invert_information(information: Array) -> tuple[Array, float]:
     """Inverse of an information matrix and the smallest eigenvalue of its scaled form.
 
     The scaled form has a unit diagonal, so that units do not matter; where it is singular, or not
     finite, the inverse is NaN.
     """
+    size = len(information)
+    nothing = np.full((size, size), np.nan)
     diagonal = np.diag(information)
     if not np.all(np.isfinite(information)) or not np.all(diagonal > 0.0):
-        return np.full(information.shape, np.nan), 0.0
+        return nothing, 0.0
     scale = 1.0 / np.sqrt(diagonal)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    smallest = float(values[0])
+    smallest = values[0]
     if not smallest > 0.0:
-        return np.full(information.shape, np.nan), smallest
-    half = scale[:, None] * vectors / np.sqrt(values)
+        return nothing, smallest
+    half = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            half[i, j] = scale[i] * vectors[i, j] / np.sqrt(values[j])
     return half @ half.T, smallest

@@ -7,8 +7,9 @@ import numpy as np
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms
 from rs_localizer.core.refine import refine
-from rs_localizer.core.residuals import STATE_SIZE, robust_cost
+from rs_localizer.core.residuals import truncated_cost
 from rs_localizer.core.so3 import Array
+from rs_localizer.core.view import STATE_SIZE
 
 # Local optimisation tightens Tukey's loss from the first scale to the last in this many steps.
 _MOST_ANNEALING_STEPS = 5
@@ -49,7 +50,7 @@ def best_models(
                 continue
             state = state_of_model(models[s, :, h])
             limit = min(costs[keep - 1], bar)
-            cost = robust_cost(data, state, gradient, scale, 0.0, limit)
+            cost = truncated_cost(data, state, gradient, scale, limit)
             if cost < limit:
                 place = keep - 1
                 while place > 0 and cost < costs[place - 1]:
@@ -89,10 +90,11 @@ def optimize(
         scale = first_scale
         for _ in range(steps):
             state, _, _, _ = refine(
-                data, state, gradient, scale, 1.0, prior, noise, _ITERATIONS_PER_SCALE, _TOLERANCE
-            )
+                data, state, gradient, scale, 1.0, prior, noise, 1, _ITERATIONS_PER_SCALE,
+                _TOLERANCE,
+            )  # fmt: skip
             scale *= ratio
-        cost = robust_cost(data, state, gradient, last_scale, 0.0, best_cost)
+        cost = truncated_cost(data, state, gradient, last_scale, best_cost)
         if cost < best_cost:
             best, best_cost = state, cost
     return best, best_cost

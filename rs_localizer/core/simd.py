@@ -174,6 +174,72 @@ def traced(body: Callable[[list[Lanes]], Sequence[Number]], *inputs: int) -> Any
     return one_source if len(inputs) == 1 else two_sources
 
 
+def traced_sums(
+    inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Number]], int]
+) -> Any:
+    """Make a Numba-callable ``function(source, blocks, target)`` of sums over points.
+
+    Args:
+        inputs: how many values a block of the source holds.
+        bodies: each takes a list of lanes and returns terms, as in :func:`traced`, and how many it
+            returns. It goes through all blocks on its own, with its sums in registers, so it should
+            not return more than 20.
+
+    Returns:
+        a function for use inside kernels: the target gets one number for each term of each body,
+        its sum over all lanes of the first ``blocks`` blocks.
+    """
+
+    @intrinsic
+    def sums(typingctx: Any, source: Any, blocks: Any, target: Any) -> Any:
+        def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            arrays = [
+                context.make_array(signature.args[i])(context, builder, args[i]).data for i in (0, 2)
+            ]
+            first = builder.bitcast(arrays[0], _VECTOR.as_pointer())
+            place = 0
+            for body, count in bodies:
+                totals = [cgutils.alloca_once(builder, _VECTOR) for _ in range(count)]
+                for total in totals:
+                    builder.store(_operand(0.0), total)
+                with cgutils.for_range(builder, args[1]) as loop:
+                    offset = builder.mul(loop.index, ir.Constant(loop.index.type, inputs))
+                    base = builder.gep(first, [offset])
+                    lanes = [
+                        Lanes(
+                            builder,
+                            builder.load(
+                                builder.gep(base, [ir.Constant(ir.IntType(64), i)]), align=8
+                            ),
+                        )
+                        for i in range(inputs)
+                    ]
+                    for total, term in zip(totals, body(lanes), strict=True):
+                        so_far = Lanes(builder, builder.load(total))
+                        builder.store(_operand(so_far + term), total)
+                for total in totals:
+                    scalar = _across_lanes(builder, builder.load(total))
+                    builder.store(
+                        scalar, builder.gep(arrays[1], [ir.Constant(ir.IntType(64), place)])
+                    )
+                    place += 1
+            return context.get_dummy_value()
+
+        return types.void(source, blocks, target), compile_call
+
+    return sums
+
+
+def _across_lanes(builder: Any, vector: Any) -> Any:
+    double = ir.DoubleType()
+    function = _get_or_insert_function(
+        builder.module,
+        ir.FunctionType(double, [double, _VECTOR]),
+        f"llvm.vector.reduce.fadd.v{LANES}f64",
+    )
+    return builder.call(function, [ir.Constant(double, 0.0), vector], fastmath=("reassoc",))
+
+
 # -- small fixed-size linear algebra on lanes (or on anything with the same operators) ---------
 
 Vector = list[Any]

@@ -44,7 +44,7 @@ def test_the_truth_is_found_from_a_global_shutter_start(scene):
     start = apply_step(start, 0.05 * np.random.default_rng(0).normal(size=12))
     state, _, cost, converged = refine(
         scene.pack(camera, points, true), start, camera.row_time_gradient, 1e3, 0.0, NO_PRIOR,
-        1e-3, 30, 1e-6,
+        1e-3, 2, 30, 1e-6,
     )  # fmt: skip
     assert converged
     assert cost < 1e-9
@@ -59,7 +59,7 @@ def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
     previous = np.inf
     for iterations in (0, 1, 2, 5, 20):
         state, information, cost, _ = refine(
-            data, start, gradient, 4.0, 1.0, NO_PRIOR, 0.5, iterations, 1e-6
+            data, start, gradient, 4.0, 1.0, NO_PRIOR, 0.5, 2, iterations, 1e-6
         )
         assert cost <= previous
         previous = cost
@@ -71,11 +71,11 @@ def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
 def test_the_noise_decides_between_prior_and_data(scene):
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
     data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
-    held = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, held_terms(), 1.0, 30, 1e-6)[0]
+    held = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, held_terms(), 1.0, 2, 30, 1e-6)[0]
     np.testing.assert_allclose(held[12:], 0.0, atol=1e-9)
     prior = velocity_terms(0.1, 0.1)
     free, weak, strong = (
-        refine(data, scene.state_of(motion), gradient, 1e3, 0.0, p, noise, 30, 1e-6)[0][12:]
+        refine(data, scene.state_of(motion), gradient, 1e3, 0.0, p, noise, 2, 30, 1e-6)[0][12:]
         for p, noise in ((NO_PRIOR, 1.0), (prior, 0.5), (prior, 50.0))
     )
     assert np.linalg.norm(weak) < np.linalg.norm(free)
@@ -84,18 +84,18 @@ def test_the_noise_decides_between_prior_and_data(scene):
 
 def test_the_minimum_has_no_slope_of_the_posterior(scene):
     """The gradient of cost plus prior vanishes, by finite differences of the cost itself."""
-    from rs_localizer.core.residuals import robust_cost
+    from rs_localizer.core.residuals import truncated_cost
 
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
     # Without the row's part the cost is exactly that of the residuals.
     data, gradient = scene.pack(camera, points, measured), np.zeros(2)
     prior, noise, h = velocity_terms(0.2, 0.1), 0.5, 1e-6
     precisions = np.repeat([25.0, 100.0], 3)
-    state = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, prior, noise, 50, 1e-6)[0]
+    state = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, prior, noise, 2, 50, 1e-6)[0]
 
     def posterior(s):
         velocities = s[12:]
-        return robust_cost(data, s, gradient, 1e3, 0.0, np.inf) + noise**2 * velocities @ (
+        return truncated_cost(data, s, gradient, 1e3, np.inf) + noise**2 * velocities @ (
             precisions * velocities
         )
 

@@ -41,7 +41,7 @@ def test_the_jacobian_is_the_finite_difference_of_the_forward_projection(scene, 
     information, slope = np.empty((12, 12)), np.empty(12)
     residuals.normal_equations(
         scene.pack(camera, points, true), state, camera.row_time_gradient, 100.0, 0.0,
-        information, slope,
+        2, information, slope,
     )  # fmt: skip
     expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
     scale = np.sqrt(np.diag(expected))
@@ -51,7 +51,7 @@ def test_the_jacobian_is_the_finite_difference_of_the_forward_projection(scene, 
     shift = np.array([0.01, -0.02])  # a small error, so that the slope is not zero
     residuals.normal_equations(
         scene.pack(camera, points, true + shift), state, camera.row_time_gradient, 100.0, 0.0,
-        information, slope,
+        2, information, slope,
     )  # fmt: skip
     np.testing.assert_allclose(
         slope / scale, np.einsum("nci,c->i", jacobian, -shift) / scale, atol=1e-3
@@ -79,7 +79,7 @@ def test_the_derivative_by_the_angular_velocity_is_that_of_the_exponential(scene
     )
     information, slope = np.empty((12, 12)), np.empty(12)
     residuals.normal_equations(scene.pack(camera, points, true), state, gradient, 100.0, 0.0,
-                               information, slope)  # fmt: skip
+                               2, information, slope)  # fmt: skip
     expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
@@ -93,21 +93,21 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
     data, gradient = scene.pack(camera, points, measured), np.zeros(2)
     state, scale, h = scene.state_of(motion), 3.0, 1e-6
     information, slope = np.empty((12, 12)), np.empty(12)
-    cost = residuals.normal_equations(data, state, gradient, scale, softness, information, slope)
-    assert cost == pytest.approx(
-        residuals.robust_cost(data, state, gradient, scale, softness, np.inf)
-    )
-    for k in range(12):
-        ahead, behind = (
-            residuals.robust_cost(
-                data, apply_step(state, sign * h * np.eye(12)[k]), gradient, scale, softness, np.inf
-            )
-            for sign in (1, -1)
+
+    def cost_of(s):
+        return residuals.normal_equations(
+            data, s, gradient, scale, softness, 2, information, slope
         )
-        assert (ahead - behind) / (2 * h) == pytest.approx(2 * slope[k], rel=1e-3, abs=1.0)
+
+    steps = [sign * h * np.eye(12)[k] for k in range(12) for sign in (1, -1)]
+    around = [cost_of(apply_step(state, step)) for step in steps]
+    cost_of(state)
+    for k in range(12):
+        derivative = (around[2 * k] - around[2 * k + 1]) / (2 * h)
+        assert derivative == pytest.approx(2 * slope[k], rel=1e-3, abs=1.0)
 
 
-def test_robust_costs_are_those_of_the_formulas(scene):
+def test_truncated_costs_are_those_of_the_formulas(scene):
     camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5)
     data, state, gradient = (
         scene.pack(camera, points, measured),
@@ -117,13 +117,15 @@ def test_robust_costs_are_those_of_the_formulas(scene):
     squared, c2 = residuals.squared_errors(data, len(points), state, gradient), 9.0
     assert (squared > c2).any()
     assert (squared < c2).any()
-    truncated = residuals.robust_cost(data, state, gradient, 3.0, 0.0, np.inf)
+    truncated = residuals.truncated_cost(data, state, gradient, 3.0, np.inf)
     assert truncated == pytest.approx(np.minimum(squared, c2).sum())
+    information, slope = np.empty((12, 12)), np.empty(12)
     tukey = c2 / 3 * (1 - (1 - np.minimum(squared / c2, 1)) ** 3)
-    assert residuals.robust_cost(data, state, gradient, 3.0, 1.0, np.inf) == pytest.approx(
-        tukey.sum()
-    )
-    bounded = residuals.robust_cost(data, state, gradient, 3.0, 0.0, 0.1 * truncated)
+    for softness, expected in ((0.0, truncated), (1.0, tukey.sum())):
+        assert residuals.normal_equations(
+            data, state, gradient, 3.0, softness, 2, information, slope
+        ) == pytest.approx(expected)
+    bounded = residuals.truncated_cost(data, state, gradient, 3.0, 0.1 * truncated)
     assert 0.1 * truncated <= bounded < truncated
 
 
@@ -139,9 +141,9 @@ def test_points_behind_the_camera_are_outliers_and_disturb_nothing(scene):
     assert squared[1:].max() < 1e-6
     information, slope = np.empty((12, 12)), np.empty(12)
     without = np.empty((12, 12))
-    residuals.normal_equations(data, state, gradient, 3.0, 0.0, information, slope)
+    residuals.normal_equations(data, state, gradient, 3.0, 0.0, 2, information, slope)
     residuals.normal_equations(
-        scene.pack(camera, points[1:], measured[1:]), state, gradient, 3.0, 0.0, without, slope
+        scene.pack(camera, points[1:], measured[1:]), state, gradient, 3.0, 0.0, 2, without, slope
     )
     np.testing.assert_allclose(information, without, rtol=1e-9, atol=1e-6)
 
@@ -151,7 +153,7 @@ def test_weights_choose_the_points(scene):
     state, gradient = scene.state_of(motion), camera.row_time_gradient
     data = scene.pack(camera, points, measured)
     residuals.set_weights(data, (np.arange(len(points)) < 13).astype(float))
-    expected = residuals.robust_cost(
-        scene.pack(camera, points[:13], measured[:13]), state, gradient, 1e3, 0.0, np.inf
+    expected = residuals.truncated_cost(
+        scene.pack(camera, points[:13], measured[:13]), state, gradient, 1e3, np.inf
     )
-    assert residuals.robust_cost(data, state, gradient, 1e3, 0.0, np.inf) == pytest.approx(expected)
+    assert residuals.truncated_cost(data, state, gradient, 1e3, np.inf) == pytest.approx(expected)

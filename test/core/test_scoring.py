@@ -1,7 +1,7 @@
 import numpy as np
 
 from rs_localizer.core.prior import velocity_terms
-from rs_localizer.core.residuals import robust_cost
+from rs_localizer.core.residuals import truncated_cost
 from rs_localizer.core.scoring import best_models, optimize, state_of_model
 from rs_localizer.core.shutter import from_model_a
 
@@ -35,10 +35,10 @@ def test_the_best_models_are_those_of_a_full_sort(scene):
     models, flat = models_near(motion, 40, np.random.default_rng(1))
     states, costs = best_models(models, data, gradient, 8.0, 4, np.inf)
     alive = [state_of_model(column) for column in flat.T if np.isfinite(column).all()]
-    expected = sorted(robust_cost(data, s, gradient, 8.0, 0.0, np.inf) for s in alive)[:4]
+    expected = sorted(truncated_cost(data, s, gradient, 8.0, np.inf) for s in alive)[:4]
     np.testing.assert_allclose(costs, expected, rtol=1e-12)
     for state, cost in zip(states, costs, strict=True):
-        assert robust_cost(data, state, gradient, 8.0, 0.0, np.inf) == cost
+        assert truncated_cost(data, state, gradient, 8.0, np.inf) == cost
 
 
 def test_models_above_the_bar_are_left_out(scene):
@@ -68,8 +68,8 @@ def test_optimisation_reaches_all_inliers_from_a_poor_state(scene):
     data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
     start = scene.state_of(motion)
     start[9:] += 0.02 * rng.normal(size=9)
-    before = robust_cost(data, start, gradient, 2.0, 0.0, np.inf)
+    before = truncated_cost(data, start, gradient, 2.0, np.inf)
     state, cost = optimize(start[None], np.zeros(1), data, gradient, 32.0, 2.0, FREE, 1.0)
-    truth = robust_cost(data, scene.state_of(motion), gradient, 2.0, 0.0, np.inf)
-    assert cost == robust_cost(data, state, gradient, 2.0, 0.0, np.inf)
+    truth = truncated_cost(data, scene.state_of(motion), gradient, 2.0, np.inf)
+    assert cost == truncated_cost(data, state, gradient, 2.0, np.inf)
     assert cost <= truth < before

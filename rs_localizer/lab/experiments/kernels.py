@@ -12,7 +12,7 @@ from rs_localizer.core.residuals import (
     STATE_SIZE,
     normal_equations,
     pack,
-    robust_cost,
+    truncated_cost,
     set_weights,
     squared_errors,
 )
@@ -38,7 +38,7 @@ def best_solutions(
             if np.isnan(models[i, s, 0]):
                 continue
             state = state_of_model(models[i, s])
-            cost = robust_cost(data, state, gradient, scale, 0.0, least)
+            cost = truncated_cost(data, state, gradient, scale, least)
             if cost < least:
                 least = cost
                 chosen[i] = models[i, s]
@@ -66,7 +66,7 @@ def refine_frames(
         errors = squared_errors(data, points.shape[1], state, gradient)
         gate = 4.0 * threshold * threshold
         set_weights(data, np.where(errors < gate, 1.0, 0.0))
-        state, _, _, _ = refine(data, state, gradient, 1e6, 0.0, prior, noise, 10, 1e-6)
+        state, _, _, _ = refine(data, state, gradient, 1e6, 0.0, prior, noise, 2, 10, 1e-6)
         states[i] = state
     return states
 
@@ -92,5 +92,5 @@ def informations(
     slope = np.empty(PARAMETERS)
     for i in range(len(states)):
         data = pack(points[i], rays[i], tau[i], by_ray)
-        normal_equations(data, states[i], gradient, 1e6, 0.0, found[i], slope)
+        normal_equations(data, states[i], gradient, 1e6, 0.0, 2, found[i], slope)
     return found
