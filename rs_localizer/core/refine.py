@@ -15,6 +15,10 @@ from rs_localizer.core.so3 import Array, exp, log
 from rs_localizer.core.view import PARAMETERS, STATE_SIZE
 
 _MOST_DAMPING = 1e8
+# More damping does not get along the flat valleys of planes that turn fast, less loses planes that
+# face the camera.
+_ANNEALING_DAMPING = 1e-4
+_ANNEALING_RATIO = 0.6
 
 
 @kernel
@@ -176,6 +180,36 @@ def refine(
         if damping > _MOST_DAMPING:
             break
     return state, information, cost, converged
+
+
+@kernel
+def anneal(
+    data: Array,
+    start: Array,
+    gradient: Array,
+    first_scale: float,
+    last_scale: float,
+    prior: PriorTerms,
+    noise: float,
+) -> Array:
+    """State after one Gauss-Newton step at each scale of Tukey's loss, from the first to the last.
+
+    No step is tried twice: the next scale judges the points anew (graduated non-convexity).
+    """
+    state = start
+    information = np.empty((PARAMETERS, PARAMETERS))
+    slope = np.empty(PARAMETERS)
+    scale = first_scale
+    while scale > last_scale:
+        _posterior(data, state, gradient, scale, 1.0, prior, noise, 1, information, slope)
+        for i in range(PARAMETERS):
+            information[i, i] *= 1.0 + _ANNEALING_DAMPING
+        step, solved = solve_positive(information, -slope)
+        if not solved:
+            break
+        state = apply_step(state, step)
+        scale *= _ANNEALING_RATIO
+    return state
 
 
 @kernel

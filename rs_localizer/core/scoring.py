@@ -6,15 +6,14 @@ import numpy as np
 
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms
-from rs_localizer.core.refine import refine
+from rs_localizer.core.refine import anneal, refine
 from rs_localizer.core.residuals import truncated_cost
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.view import STATE_SIZE
 
-# Local optimisation tightens Tukey's loss from the first scale to the last in this many steps.
-_MOST_ANNEALING_STEPS = 5
-_ITERATIONS_PER_SCALE = 3
-# Gain, in noise variances, below which the next scale is worth more than another step.
+# Of local optimisation, at the last scale.
+_ITERATIONS = 3
+# Gain, in noise variances, below which another step is not worth its time.
 _TOLERANCE = 1.0
 
 
@@ -80,20 +79,13 @@ def optimize(
     """
     best = np.zeros(STATE_SIZE)
     best_cost = np.inf
-    # About a halving from step to step.
-    steps = min(max(int(np.log2(first_scale / last_scale) + 0.5) + 1, 2), _MOST_ANNEALING_STEPS)
-    ratio = (last_scale / first_scale) ** (1.0 / (steps - 1))
     for i in range(len(states)):
         if not np.isfinite(costs[i]):
             continue
-        state = states[i]
-        scale = first_scale
-        for _ in range(steps):
-            state, _, _, _ = refine(
-                data, state, gradient, scale, 1.0, prior, noise, 1, _ITERATIONS_PER_SCALE,
-                _TOLERANCE,
-            )  # fmt: skip
-            scale *= ratio
+        state = anneal(data, states[i], gradient, first_scale, last_scale, prior, noise)
+        state, _, _, _ = refine(
+            data, state, gradient, last_scale, 1.0, prior, noise, 1, _ITERATIONS, _TOLERANCE
+        )
         cost = truncated_cost(data, state, gradient, last_scale, best_cost)
         if cost < best_cost:
             best, best_cost = state, cost
