@@ -15,7 +15,8 @@ MAY_IMPORT = {
     "arguments": set(),
     "config": {"core"},
     "solvers": {"core"},
-    "localizer": {"core", "config", "solvers"},
+    "searching": {"core", "config", "solvers"},
+    "localizer": {"core", "config", "solvers", "searching"},
     "io": {"core"},
     "markers": {"core", "io"},
     "lab": {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -118,6 +119,7 @@ def velocity_terms(angular: float, linear: float) -> PriorTerms:
     return _single(np.diag(np.concatenate([np.zeros(6), np.repeat(precisions, 3)])), _STILL)
 
 
+@cache
 def held_terms() -> PriorTerms:
     """A global shutter: velocities are zero."""
     return _single(np.diag(np.concatenate([np.zeros(6), np.full(6, _HOLDING)])), _STILL)

@@ -32,6 +32,7 @@ class Observations:
     points: Array  # (n,3) m, in a frame near them
     rays: Array  # (n,2)
     tau: Array  # (n,)
+    row_range: float  # of tau
     row_time_gradient: Array  # (2,) per pixel
     packed: Array
 
@@ -40,7 +41,8 @@ class Observations:
         cls, points: Array, rays: Array, tau: Array, by_ray: Array, row_time_gradient: Array
     ) -> Observations:
         """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2)."""
-        return cls(points, rays, tau, row_time_gradient, pack(points, rays, tau, by_ray))
+        packed = pack(points, rays, tau, by_ray)
+        return cls(points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -111,20 +113,14 @@ def search(
     usable = [pool for pool in pools if len(pool.points) >= hypotheses.sample_size]
     best = start
     inliers = _inliers(observations, best, hypotheses.final_scale)
-    drawn = np.zeros(len(usable), dtype=np.int64)
-    row_range = float(np.ptp(observations.tau))
+    drawn, blocks = [0] * len(usable), 0
     no_fit, best_gain = len(observations) * hypotheses.score_scale**2, 0.0
-    while usable and drawn.sum() < max_samples:
-        block = int(min(hypotheses.block, max_samples - drawn.sum()))
-        samples = np.empty((block, hypotheses.sample_size), dtype=np.int64)
-        for index, (pool, part) in enumerate(
-            zip(usable, np.array_split(samples, len(usable)), strict=True)
-        ):
-            prefixes = pool.prefix_sizes(int(drawn[index]), len(part), hypotheses.sample_size)
-            draw(pool.points, prefixes, observations.tau, row_range, random, part)
-            drawn[index] += len(part)
-        models = np.empty((hypotheses.solutions, MODEL_SIZE, block))
-        rotation = rotations[int(drawn.sum() // hypotheses.block) % len(rotations)]
+    while usable and (left := max_samples - sum(drawn)) > 0:
+        samples = np.empty((min(hypotheses.block, left), hypotheses.sample_size), dtype=np.int64)
+        _draw(observations, usable, drawn, random, samples)
+        models = np.empty((hypotheses.solutions, MODEL_SIZE, len(samples)))
+        blocks += 1
+        rotation = rotations[blocks % len(rotations)]
         hypotheses.solve(
             observations.points, observations.rays, observations.tau, samples,
             rotation[None], models,
@@ -144,7 +140,25 @@ def search(
             inliers = _inliers(observations, best, hypotheses.final_scale)
         if _missed(inliers, usable, drawn, hypotheses.sample_size) < 1.0 - confidence:
             break
-    return Candidate(best.state, best.cost, start.samples + int(drawn.sum()))
+    return Candidate(best.state, best.cost, start.samples + sum(drawn))
+
+
+def _draw(
+    observations: Observations,
+    pools: Sequence[Pool],
+    drawn: list[int],
+    random: Random,
+    samples: IntArray,
+) -> None:
+    """Fill the samples from all pools in equal parts, and count what each has given."""
+    count, size = samples.shape
+    first = 0
+    for index, pool in enumerate(pools):
+        part = samples[first : (index + 1) * count // len(pools)]
+        prefixes = pool.prefix_sizes(drawn[index], len(part), size)
+        draw(pool.points, prefixes, observations.tau, observations.row_range, random, part)
+        drawn[index] += len(part)
+        first += len(part)
 
 
 def _inliers(observations: Observations, candidate: Candidate, scale: float) -> BoolArray:
@@ -154,7 +168,7 @@ def _inliers(observations: Observations, candidate: Candidate, scale: float) -> 
     return inliers
 
 
-def _missed(inliers: BoolArray, pools: Sequence[Pool], drawn: IntArray, size: int) -> float:
+def _missed(inliers: BoolArray, pools: Sequence[Pool], drawn: Sequence[int], size: int) -> float:
     """Chance that none of the samples drawn from the pools held inliers alone."""
     missed = 1.0
     for pool, count in zip(pools, drawn, strict=True):

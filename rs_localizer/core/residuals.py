@@ -14,7 +14,14 @@ import numpy as np
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES, Lanes, Vector, traced, traced_sums
 from rs_localizer.core.so3 import Array
-from rs_localizer.core.view import PARAMETERS, POINT_SIZE, STATE_SIZE, UNIFORM_SIZE, View, still_cost
+from rs_localizer.core.view import (
+    PARAMETERS,
+    POINT_SIZE,
+    STATE_SIZE,
+    UNIFORM_SIZE,
+    View,
+    still_cost,
+)
 
 # What a point gives to the normal equations: two rows of the weighted Jacobian, each with its
 # weighted error as the last column, and the cost.
@@ -23,7 +30,7 @@ _ROWS_SIZE = 2 * _COLUMNS + 1
 # So many blocks at a time stay in the fast caches.
 _CHUNK = 32
 # The products of all pairs of columns, in tiles whose sums fit the registers.
-_GROUPS = (range(0, 4), range(4, 8), range(8, _COLUMNS))
+_GROUPS = (range(4), range(4, 8), range(8, _COLUMNS))
 
 
 def _tile(higher: range, lower: range) -> list[tuple[int, int]]:
@@ -210,4 +217,5 @@ def normal_equations(
             information[j, i] = totals[k]
         elif j < PARAMETERS:
             slope[j] = totals[k]
-    return totals[-1]
+    cost: float = totals[-1]
+    return cost

@@ -24,6 +24,7 @@ LANES = 8  # one AVX-512 register of doubles; narrower machines split it
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 _get_or_insert_function: Any = cgutils.get_or_insert_function
+_alloca_once: Any = cgutils.alloca_once
 _FLAGS = ("contract", "nsz", "arcp")  # a*b + c may fuse; NaN and infinity keep their meaning
 
 Number = Union["Lanes", float]
@@ -193,13 +194,14 @@ def traced_sums(
     @intrinsic
     def sums(typingctx: Any, source: Any, blocks: Any, target: Any) -> Any:
         def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            arrays = [
-                context.make_array(signature.args[i])(context, builder, args[i]).data for i in (0, 2)
-            ]
-            first = builder.bitcast(arrays[0], _VECTOR.as_pointer())
+            source_data, target_data = (
+                context.make_array(signature.args[i])(context, builder, args[i]).data
+                for i in (0, 2)
+            )
+            first = builder.bitcast(source_data, _VECTOR.as_pointer())
             place = 0
             for body, count in bodies:
-                totals = [cgutils.alloca_once(builder, _VECTOR) for _ in range(count)]
+                totals = [_alloca_once(builder, _VECTOR) for _ in range(count)]
                 for total in totals:
                     builder.store(_operand(0.0), total)
                 with cgutils.for_range(builder, args[1]) as loop:
@@ -220,7 +222,7 @@ def traced_sums(
                 for total in totals:
                     scalar = _across_lanes(builder, builder.load(total))
                     builder.store(
-                        scalar, builder.gep(arrays[1], [ir.Constant(ir.IntType(64), place)])
+                        scalar, builder.gep(target_data, [ir.Constant(ir.IntType(64), place)])
                     )
                     place += 1
             return context.get_dummy_value()

@@ -71,11 +71,12 @@ def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
 def test_the_noise_decides_between_prior_and_data(scene):
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
     data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
-    held = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, held_terms(), 1.0, 2, 30, 1e-6)[0]
+    start = scene.state_of(motion)
+    held = refine(data, start, gradient, 1e3, 0.0, held_terms(), 1.0, 2, 30, 1e-6)[0]
     np.testing.assert_allclose(held[12:], 0.0, atol=1e-9)
     prior = velocity_terms(0.1, 0.1)
     free, weak, strong = (
-        refine(data, scene.state_of(motion), gradient, 1e3, 0.0, p, noise, 2, 30, 1e-6)[0][12:]
+        refine(data, start, gradient, 1e3, 0.0, p, noise, 2, 30, 1e-6)[0][12:]
         for p, noise in ((NO_PRIOR, 1.0), (prior, 0.5), (prior, 50.0))
     )
     assert np.linalg.norm(weak) < np.linalg.norm(free)

@@ -58,6 +58,34 @@ def test_the_jacobian_is_the_finite_difference_of_the_forward_projection(scene, 
     )
 
 
+def test_a_search_looks_at_the_measured_row_and_finds_nearly_the_same_derivatives(scene):
+    camera, motion, points, true, measured = scene.frame(noise=1.0)
+    state, slope = scene.state_of(motion), np.empty(12)
+    found = np.empty((3, 12, 12))
+    for k, (pixels, looks) in enumerate(((measured, 1), (measured, 2), (true, 2))):
+        residuals.normal_equations(
+            scene.pack(camera, points, pixels), state, camera.row_time_gradient, 100.0, 0.0,
+            looks, found[k], slope,
+        )  # fmt: skip
+    once, twice, noise_free = found
+    scale = np.sqrt(np.outer(np.diag(noise_free), np.diag(noise_free)))
+    assert 1e-5 < np.abs((once - twice) / scale).max() < 0.02
+    np.testing.assert_allclose(once / scale, noise_free / scale, atol=0.02)
+
+
+def test_the_cost_of_a_still_camera_is_that_of_one_that_hardly_moves(scene):
+    camera, motion, points, _, measured = scene.frame(speed=0.05, noise=1.0)
+    still, creeping = scene.state_of(motion), scene.state_of(motion)
+    still[12:], creeping[12:] = 0.0, 1e-12
+    points[0] -= 10 * motion.rotation[2]  # behind the camera
+    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    cost = residuals.truncated_cost(data, still, gradient, 50.0, np.inf)
+    assert 2500 < cost < 2500 * len(points)
+    assert cost == pytest.approx(
+        residuals.truncated_cost(data, creeping, gradient, 50.0, np.inf), rel=1e-9
+    )
+
+
 def test_the_derivative_by_the_angular_velocity_is_that_of_the_exponential(scene):
     """Large turns, where the right Jacobian of the exponential matters, without the row's part."""
     camera, motion, points, true, _ = scene.frame(speed=0.5)

@@ -13,6 +13,7 @@ from rs_localizer.core.simd import (
     select,
     sqrt,
     traced,
+    traced_sums,
 )
 from rs_localizer.core.so3 import hat
 
@@ -116,3 +117,21 @@ def test_cross_and_nearest_rotation():
         assert Rotation.from_matrix(u @ vt).magnitude() == pytest.approx(
             np.arctan(np.linalg.norm(a))
         )
+
+
+def test_sums_go_over_all_lanes_of_all_blocks():
+    bodies = (
+        (lambda v: [v[0] * v[1], v[2]], 2),
+        (lambda v: [v[0] + v[2]], 1),
+    )
+    sums = traced_sums(3, *bodies)
+
+    @kernel
+    def call(source, blocks, target):
+        sums(source, blocks, target)
+
+    source = np.random.default_rng(0).normal(size=(7, 3, LANES))
+    target = np.full(3, np.nan)
+    call(source.reshape(7, -1), 5, target)
+    x, y, z = source[:5].transpose(1, 0, 2)
+    np.testing.assert_allclose(target, [(x * y).sum(), z.sum(), (x + z).sum()], rtol=1e-13)

@@ -8,16 +8,15 @@ from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms
 from rs_localizer.core.refine import refine
 from rs_localizer.core.residuals import (
-    PARAMETERS,
-    STATE_SIZE,
     normal_equations,
     pack,
-    truncated_cost,
     set_weights,
     squared_errors,
+    truncated_cost,
 )
 from rs_localizer.core.scoring import optimize, state_of_model
 from rs_localizer.core.so3 import Array
+from rs_localizer.core.view import PARAMETERS, STATE_SIZE
 
 
 @kernel
