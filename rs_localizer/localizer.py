@@ -8,14 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.acceptance import determines_motion, refusal
+from rs_localizer.core.acceptance import refusal
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.inputs import checked, median_point
-from rs_localizer.core.posterior import (
-    Posterior,
-    maximum_a_posteriori,
-    weigh_against_rest,
-)
+from rs_localizer.core.mirror import settle
+from rs_localizer.core.posterior import Posterior
 from rs_localizer.core.prior import (
     Prior,
     PriorTerms,
@@ -192,14 +189,10 @@ class Localizer:
         return result
 
     def _final(self, frame: Frame, best: Candidate, terms: PriorTerms) -> Posterior:
-        """The maximum a posteriori motion of the inliers, nearer to rest if they show none."""
-        threshold = self.config.inlier_threshold
-        posterior = maximum_a_posteriori(frame.observations, best.state, terms, threshold)
         # Unless more is known of this very frame than the velocity prior of the configuration.
-        uninformed = len(terms.informations) == 1 and self._solver.rolling_shutter
-        if uninformed and determines_motion(posterior):
-            return weigh_against_rest(frame.observations, posterior)
-        return posterior
+        may_rest = len(terms.informations) == 1 and self._solver.rolling_shutter
+        threshold = self.config.inlier_threshold
+        return settle(frame.observations, best.state, terms, threshold, may_rest)
 
     def _accept(
         self, frame: Frame, start: Candidate, best: Candidate, posterior: Posterior

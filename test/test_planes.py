@@ -107,3 +107,33 @@ def test_no_motion_that_keeps_pace_with_the_rows_is_published():
             seen, _ = project_rolling(CAMERA, estimate.at_rows, points)
             assert np.abs(seen - pixels)[estimate.inliers].max() < 10.0
     assert published > 10
+
+
+@pytest.fixture(scope="module")
+def small_planes():
+    """Planes of 0.2 m, 2 to 3 m away, that lean by 20 deg: noise hides which way they lean."""
+    localizer = rsl.Localizer(CAMERA)
+    frames = [plane_frame(seed, 20.0, 0.0, 0.0, 0.1) for seed in range(60)]
+    return [(localizer.localize(points, pixels), points, pixels, true)
+            for points, pixels, true in frames]  # fmt: skip
+
+
+def test_a_mirrored_pose_is_never_published(small_planes):
+    turns = [turn_between(result, true) for result, _, _, true in small_planes if result]
+    assert len(turns) > 20
+    assert max(turns) < 10.0
+    refused = [result for result, *_ in small_planes if not result]
+    assert sum(result.reason == "mirrored" for result in refused) > 5
+    assert all("deg away, fits but" in r.detail for r in refused if r.reason == "mirrored")
+
+
+def test_a_prediction_says_which_of_both_poses_it_is(small_planes):
+    localizer, helped = rsl.Localizer(CAMERA), 0
+    for result, points, pixels, true in small_planes:
+        if not result and result.reason == "mirrored":
+            spread = np.repeat([np.radians(5.0), 0.1, np.radians(1.0), 0.01], 3) ** 2
+            prior = rsl.Prior(motion=true, covariance=np.diag(spread))
+            tracked = localizer.localize(points, pixels, prior=prior)
+            assert not tracked or turn_between(tracked, true) < 10.0
+            helped += bool(tracked)
+    assert helped > 5

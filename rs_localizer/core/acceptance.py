@@ -12,8 +12,6 @@ from rs_localizer.core.ransac import Observations
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray, Failure, Reason
 
-# Of the information matrix scaled to a unit diagonal.
-_LEAST_EIGENVALUE = 1e-11
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5
 # Errors as large as the gate lets them be are those of points strewn over it.
@@ -22,11 +20,8 @@ _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
 # does so fits anything. See :meth:`Observations.row_paces`.
 _LEAST_PACE = 0.25
-
-
-def determines_motion(posterior: Posterior) -> bool:
-    """Whether points and prior together determine all twelve parameters."""
-    return posterior.smallest_eigenvalue > _LEAST_EIGENVALUE
+# A mirrored pose nearer than this (rad) is within what the covariance can say.
+_MOST_MIRRORED_TURN = 0.2
 
 
 def refusal(
@@ -59,7 +54,7 @@ def refusal(
             f"{found} inliers of {len(observations)} points after {samples} samples, "
             f"{needed} are needed",
         )
-    if not determines_motion(posterior):
+    if not posterior.determined:
         return Failure(
             Reason.DEGENERATE,
             f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
@@ -92,6 +87,14 @@ def refusal(
             Reason.IMPLAUSIBLE,
             f"the camera would move by {travel:.3g} m per readout in front of points "
             f"{depth:.3g} m away",
+        )
+    mirror = posterior.mirror
+    if mirror is not None and mirror.turn > _MOST_MIRRORED_TURN:
+        return Failure(
+            Reason.MIRRORED,
+            f"the points lie on a plane, and the pose mirrored on it, "
+            f"{math.degrees(mirror.turn):.0f} deg away, fits but {mirror.evidence:.1f} noise "
+            "variances worse",
         )
     return None
 

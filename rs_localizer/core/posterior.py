@@ -34,12 +34,27 @@ _TOLERANCE = 1e-6  # noise variances
 _LEAST_NOISE = 1e-4
 # A truncation that truncates nothing, px.
 _NO_SCALE = 1e6
+# Of the information matrix scaled to a unit diagonal.
+_LEAST_EIGENVALUE = 1e-11
 _NOISE_ROUNDS = 20
 _VELOCITIES = slice(6, 12)
 # Rest fits worse than this, in noise variances, once in a hundred frames: the 99 % quantile of the
 # chi-squared distribution with six degrees of freedom.
-_EVIDENCE = 16.8
-_CLEARLY_MOVING = 4.0 * _EVIDENCE
+EVIDENCE_OF_MOTION = 16.8
+_CLEARLY_MOVING = 4.0 * EVIDENCE_OF_MOTION
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mirror:
+    """The mirrored pose before a plane, if it cannot be ruled out."""
+
+    step: Array  # (12,) from the estimate to it
+    evidence: float  # noise variances by which it fits worse
+
+    @property
+    def turn(self) -> float:
+        """rad."""
+        return float(np.linalg.norm(self.step[:3]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +68,12 @@ class Posterior:
     smallest_eigenvalue: float  # of the information scaled to a unit diagonal
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
+    mirror: Mirror | None = None
+
+    @property
+    def determined(self) -> bool:
+        """Whether points and prior together determine all twelve parameters."""
+        return self.smallest_eigenvalue > _LEAST_EIGENVALUE
 
     @property
     def variance(self) -> float:
@@ -158,14 +179,19 @@ def maximum_a_posteriori(
     return Posterior(state, covariance, noise, inflation, smallest, inliers, errors)
 
 
-def weigh_against_rest(observations: Observations, posterior: Posterior) -> Posterior:
+def weigh_against_rest(
+    observations: Observations, posterior: Posterior, rest: Array | None
+) -> Posterior:
     """The average of the moving and the resting camera, by what the points say for either.
 
     A camera at rest deserves the six-parameter estimate, which is several times better. The six
-    velocities have to lower the squared errors by :data:`_EVIDENCE` noise variances to count more
-    than rest; mean and covariance are those of the mixture of both, so that nothing jumps between
-    them. The covariance of the velocities stays what the moving model found: that a slow motion
-    was not seen does not mean that there was none.
+    velocities have to lower the squared errors by :data:`EVIDENCE_OF_MOTION` noise variances to
+    count more than rest; mean and covariance are those of the mixture of both, so that nothing
+    jumps between them. The covariance of the velocities stays what the moving model found: that a
+    slow motion was not seen does not mean that there was none.
+
+    Args:
+        rest: state (18,) of the pose at rest, if it is not the one next to the moving one.
     """
     velocities = posterior.state[12:]
     spread = posterior.covariance[_VELOCITIES, _VELOCITIES]
@@ -173,11 +199,11 @@ def weigh_against_rest(observations: Observations, posterior: Posterior) -> Post
     if velocities @ np.linalg.solve(spread, velocities) > _CLEARLY_MOVING:
         return posterior
     noise = posterior.noise
-    start = np.concatenate([posterior.state[:12], np.zeros(6)])
-    state, information, cost, _ = _fit(observations, start, posterior.inliers, held_terms(), noise)
+    start = np.concatenate([posterior.state[:12], np.zeros(6)]) if rest is None else rest
+    state, information, cost, _ = fit(observations, start, posterior.inliers, held_terms(), noise)
     moving_cost = float(posterior.squared_errors[posterior.inliers].sum())
     gained = (cost - moving_cost) / noise**2
-    moving = 1.0 / (1.0 + math.exp(0.5 * (_EVIDENCE - gained)))
+    moving = 1.0 / (1.0 + math.exp(0.5 * (EVIDENCE_OF_MOTION - gained)))
     resting = 1.0 - moving
     # As seen from the moving estimate: rest lies one step away, the average a part of it.
     step = step_between(posterior.state, state)
@@ -193,9 +219,17 @@ def weigh_against_rest(observations: Observations, posterior: Posterior) -> Post
     )
 
 
-def _fit(
+def weigh_against_mirror(posterior: Posterior, mirror: Mirror) -> Posterior:
+    """The posterior with the covariance that the other pose leaves possible."""
+    probability = 1.0 / (1.0 + math.exp(0.5 * mirror.evidence))
+    covariance = posterior.covariance + probability * np.outer(mirror.step, mirror.step)
+    return replace(posterior, covariance=covariance, mirror=mirror)
+
+
+def fit(
     observations: Observations, start: Array, inliers: BoolArray, prior: PriorTerms, noise: float
 ) -> tuple[Array, Array, float, bool]:
+    """Refine a state (18,) on some of the points (see :func:`rs_localizer.core.refine.refine`)."""
     set_weights(observations.packed, inliers.astype(np.float64))
     fitted: tuple[Array, Array, float, bool] = refine(
         observations.packed,

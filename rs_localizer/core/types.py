@@ -25,6 +25,7 @@ class Reason(StrEnum):
     RESIDUAL = "residual"
     DEGENERATE = "degenerate"
     IMPLAUSIBLE = "implausible"
+    MIRRORED = "mirrored"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

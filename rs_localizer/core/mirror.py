@@ -1,0 +1,126 @@
+"""Planes show two poses: the one that is mirrored about the line of sight may fit as well.
+
+From far away, or on a small marker, a plane that leans to the left and one that leans to the right
+look alike but for perspective (Schweighofer, Pinz, "Robust pose estimation from a planar target",
+PAMI 2006). A minimum that was found says nothing of the other one, so it is looked for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.posterior import (
+    EVIDENCE_OF_MOTION,
+    Mirror,
+    Posterior,
+    fit,
+    maximum_a_posteriori,
+    weigh_against_mirror,
+    weigh_against_rest,
+)
+from rs_localizer.core.prior import PriorTerms, held_terms
+from rs_localizer.core.ransac import Observations
+from rs_localizer.core.refine import step_between
+from rs_localizer.core.so3 import Array
+
+# Points whose depth relief is a smaller part than this of their narrower extent are a plane.
+_PLANE = 0.1
+# What leans by less (rad) has no mirrored pose of its own.
+_LEAST_LEAN = 0.01
+# A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
+_CLEARLY_WORSE = 9.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mode:
+    state: Array  # (18,)
+    cost: float  # noise variances; motion has to explain more than rest
+
+
+def mirrored(points: Array, state: Array) -> Array | None:
+    """The state (18,) whose view of the plane of the points (n,3) leans the other way.
+
+    None if the points are no plane, or face the camera.
+    """
+    if len(points) == 0:
+        return None
+    centre = points.mean(axis=0)
+    extents, axes = np.linalg.eigh((points - centre).T @ (points - centre))
+    if not extents[0] < _PLANE**2 * extents[1]:
+        return None
+    rotation, translation = state[:9].reshape(3, 3), state[9:12]
+    seen = rotation @ centre + translation
+    sight = seen / np.linalg.norm(seen)
+    normal = rotation @ axes[:, 0]
+    axis = np.cross(sight, normal * np.sign(sight @ normal))
+    lean = math.asin(min(float(np.linalg.norm(axis)), 1.0))
+    if lean < _LEAST_LEAN:
+        return None
+    flip = so3.exp(-2.0 * lean * axis / np.linalg.norm(axis))
+    turned = flip @ (translation - seen) + seen
+    return np.concatenate([(flip @ rotation).ravel(), turned, state[12:]])
+
+
+def settle(
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, may_rest: bool
+) -> Posterior:
+    """The maximum a posteriori motion: of the two before a plane the better one, and nearer to
+    rest if the points show no motion.
+
+    Args:
+        start: state (18,).
+        threshold: px, of inliers.
+        may_rest: nothing speaks for a motion but the points.
+    """
+    posterior = maximum_a_posteriori(observations, start, terms, threshold)
+    if not posterior.determined:
+        return posterior
+    moving = _pair(observations, posterior, posterior.state, terms)
+    if moving and moving[1].cost < moving[0].cost:
+        posterior = maximum_a_posteriori(observations, moving[1].state, terms, threshold)
+    modes, rest = moving, None
+    if moving and may_rest:
+        still = np.concatenate([posterior.state[:12], np.zeros(6)])
+        resting = _pair(observations, posterior, still, held_terms())
+        rest = min(resting, key=lambda mode: mode.cost).state if resting else None
+        modes = [*(_Mode(m.state, m.cost + EVIDENCE_OF_MOTION) for m in moving), *resting]
+    if may_rest:
+        posterior = weigh_against_rest(observations, posterior, rest)
+    mirror = _other(posterior, modes)
+    return posterior if mirror is None else weigh_against_mirror(posterior, mirror)
+
+
+def _pair(
+    observations: Observations, posterior: Posterior, state: Array, terms: PriorTerms
+) -> list[_Mode]:
+    """The minimum next to a state and the mirrored one; nothing if there is no such pair."""
+    first = _mode(observations, posterior, state, terms)
+    start = mirrored(observations.points[posterior.inliers], first.state)
+    return [] if start is None else [first, _mode(observations, posterior, start, terms)]
+
+
+def _mode(
+    observations: Observations, posterior: Posterior, start: Array, terms: PriorTerms
+) -> _Mode:
+    state, _, cost, _ = fit(observations, start, posterior.inliers, terms, posterior.noise)
+    return _Mode(state, cost / posterior.noise**2)
+
+
+def _other(posterior: Posterior, modes: list[_Mode]) -> Mirror | None:
+    """The best of the modes that are not the estimate, unless it is clearly worse."""
+    variance = float(np.trace(posterior.covariance[:3, :3]))
+    steps = [step_between(posterior.state, mode.state) for mode in modes]
+    others = [
+        (mode.cost, step)
+        for mode, step in zip(modes, steps, strict=True)
+        if step[:3] @ step[:3] > variance
+    ]
+    if not others:
+        return None
+    cost, step = min(others, key=lambda other: other[0])
+    evidence = cost - min(mode.cost for mode in modes)
+    return Mirror(step, evidence) if evidence < _CLEARLY_WORSE else None
