@@ -33,6 +33,8 @@ _PLANE = 0.1
 _LEAST_LEAN = 0.01
 # A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
 _CLEARLY_WORSE = 9.2
+# The covariance speaks for poses within so many standard deviations of the orientation.
+_COVERED = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,12 +114,15 @@ def _mode(
 
 def _other(posterior: Posterior, modes: list[_Mode]) -> Mirror | None:
     """The best of the modes that are not the estimate, unless it is clearly worse."""
-    variance = float(np.trace(posterior.covariance[:3, :3]))
+    if not modes:
+        return None
+    # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
+    deviation = math.sqrt(np.linalg.eigvalsh(posterior.covariance[:3, :3])[-1])
     steps = [step_between(posterior.state, mode.state) for mode in modes]
     others = [
         (mode.cost, step)
         for mode, step in zip(modes, steps, strict=True)
-        if step[:3] @ step[:3] > variance
+        if np.linalg.norm(step[:3]) > _COVERED * deviation
     ]
     if not others:
         return None
