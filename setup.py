@@ -64,6 +64,7 @@ setup(
     entry_points={
         "console_scripts": [
             "localizer = rs_localizer.ros.main:main",
+            "marker_detector = rs_localizer.ros.main:marker_detector",
             "rs_localizer = rs_localizer.__main__:run",
         ],
     },

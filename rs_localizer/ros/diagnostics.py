@@ -16,12 +16,14 @@ _WORTH_A_LINE = 5
 
 
 class Diagnostics:
-    """A status ``NODE: localizer`` on ``/diagnostics``, once a second and whatever ROS time does.
+    """A status ``NODE: TASK`` on ``/diagnostics``, once a second and whatever ROS time does.
 
     Args:
         node: publishes it.
         examine: the health, and the camera's frame (the hardware_id; empty if unknown).
         notice: told of a state that lasts and is not right, by its name and one sentence.
+        task: what the node does.
+        lack: name of the notice.
     """
 
     def __init__(
@@ -29,13 +31,16 @@ class Diagnostics:
         node: Node,
         examine: Callable[[], tuple[Health, str]],
         notice: Callable[[str, str], None],
+        task: str = "localizer",
+        lack: str = "no_pose",
     ) -> None:
         self._node = node
         self._examine = examine
         self._notice = notice
+        self._lack = lack
         self._state, self._periods = "", 0
         # As diagnostic_updater in C++: with the namespace and without the first slash.
-        self._name = f"{node.get_fully_qualified_name().lstrip('/')}: localizer"
+        self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {task}"
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 1)
         self._timer = node.create_timer(
             _PERIOD, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -63,4 +68,4 @@ class Diagnostics:
         # What is wrong with single frames has been logged with each of them.
         waiting = health.state.startswith("waiting for") and health.level != Level.OK
         if waiting and self._periods % _WORTH_A_LINE == 0:
-            self._notice("no_pose", health.message)
+            self._notice(self._lack, health.message)

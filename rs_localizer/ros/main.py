@@ -1,21 +1,47 @@
-"""The executable ``localizer``: takes signals in hand, then imports what takes long."""
+"""The executables of the nodes: take signals in hand, then import what takes long."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 
 from rs_localizer.stopping import StopRequest
 
+Run = Callable[[StopRequest, list[str] | None], int]
+
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
+    """Run the localizer until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
+
+    def load() -> Run:
+        from rs_localizer.ros.run import run
+
+        return run
+
+    return _guarded("localizer", load, args)
+
+
+def marker_detector(args: list[str] | None = None) -> int:
+    """Run the marker detector likewise."""
+
+    def load() -> Run:
+        from rs_localizer.ros.marker_detector_node import MarkerDetectorNode
+        from rs_localizer.ros.run import run
+        from rs_localizer.settings import DETECTOR_NAME
+
+        return lambda stop, args: run(stop, args, MarkerDetectorNode, DETECTOR_NAME)
+
+    return _guarded("marker_detector", load, args)
+
+
+def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:
     with StopRequest() as stop:
         try:
             with stop.at_once():
-                from rs_localizer.ros.run import run
+                run = load()
         except ImportError as error:
             sys.stderr.write(
-                f"localizer: {' '.join(str(error).split())}: it needs ROS 2 and the Python "
+                f"{name}: {' '.join(str(error).split())}: it needs ROS 2 and the Python "
                 "packages of README.md; source a ROS 2 workspace, or install them with pip\n"
             )
             return 1

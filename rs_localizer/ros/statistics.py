@@ -7,6 +7,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class Summary:
     busy: float | None  # s for which the worker has had the same frame
     latency: Percentiles | None  # from receiving to publishing
     delay: Percentiles | None  # from the header's stamp to publishing, where that makes sense
-    last: Answer | None
+    last: Any  # the last answer; None: there was none
 
 
 class Statistics:
@@ -79,7 +80,7 @@ class Statistics:
         self._lock = threading.Lock()
         self._received: Counter[str] = Counter()
         self._answered = self._replaced = self._refused = self._in_a_row = 0
-        self._last: Answer | None = None
+        self._last: Any = None
         self._started: float | None = None
         # Times of what happened, and what is told of each answer.
         self._in: deque[float] = deque(maxlen=_MOST_FRAMES)
@@ -114,8 +115,6 @@ class Statistics:
 
     def answered(self, frame: Frame, received: float) -> None:
         """A frame was published that had been received at this time of the clock."""
-        now = self._clock()
-        delay = (self._ros_time() - frame.input_stamp_ns) * 1e-9
         estimate = frame.estimate
         residuals = estimate.residuals[estimate.inliers]
         answer = Answer(
@@ -126,6 +125,12 @@ class Statistics:
             iterations=estimate.iterations,
             tracked=estimate.tracked,
         )
+        self.note(frame.input_stamp_ns, answer, received)
+
+    def note(self, input_stamp_ns: int, answer: Any, received: float) -> None:
+        """A frame with this stamp was answered, and what is told of it."""
+        now = self._clock()
+        delay = (self._ros_time() - input_stamp_ns) * 1e-9
         with self._lock:
             self._answered += 1
             self._in_a_row = 0
