@@ -96,8 +96,9 @@ def _observed(
     groups = np.split(order, firsts[1:]) if len(order) else []
     try:
         with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as tables:
+            tables.text_factory = bytes  # of a damaged one, text may be none
             columns = [row[1] for row in tables.execute("PRAGMA table_info(descriptors)")]
-            kind = "type" if "type" in columns else str(_SIFT)
+            kind = "type" if b"type" in columns else str(_SIFT)
             for image, rows in zip(images.tolist(), groups, strict=True):
                 part = _of_image(tables, image, kind)
                 if part is None:
@@ -113,7 +114,7 @@ def _observed(
                 there = features < len(part)
                 found[rows[there]] = part[features[there]]
                 known[rows[there]] = True
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # which the text of an error may cause
         raise MapError(f"it cannot be read as a database of COLMAP: {error}") from error
     if found is None:
         raise MapError("it has no descriptors of the images of the model")

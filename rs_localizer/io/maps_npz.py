@@ -7,6 +7,8 @@ sizes in the archive and the size of the file agree.
 from __future__ import annotations
 
 import struct
+import tokenize
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -27,14 +29,21 @@ _LONGEST_HEADER = 10_000
 # What zipfile, zlib and NumPy raise for damaged files.
 _DAMAGES = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, RuntimeError,
-    ValueError, KeyError, OverflowError, SyntaxError, TypeError,
+    ValueError, KeyError, OverflowError, SyntaxError, TypeError, OSError, tokenize.TokenError,
 )  # fmt: skip
 
 
 def read_npz(path: Path, frame: str) -> Map:
     """Read a map; raises MapError for anything that is none, OSError as any file."""
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy warns of old headers
+        arrays = _arrays(file)
+    return make_map(arrays["points"], arrays.get("ids"), arrays.get("descriptors"), frame)
+
+
+def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(file) as archive:
             members = {info.filename: info for info in archive.infolist()}
             wanted = [members[f"{name}.npy"] for name in _ARRAYS if f"{name}.npy" in members]
             if "points.npy" not in members:
@@ -42,12 +51,12 @@ def read_npz(path: Path, frame: str) -> Map:
                 raise MapError(f"the archive has no array 'points'; found {found}")
             if sum(info.file_size for info in wanted) > _MOST_BYTES:
                 raise MapError(f"the arrays are larger than {_MOST_BYTES // 2**30} GiB")
-            arrays = {info.filename[:-4]: _read(archive, info) for info in wanted}
+            return {info.filename[:-4]: _read(archive, info) for info in wanted}
     except MapError:
         raise
     except _DAMAGES as error:
-        raise MapError(f"no readable NumPy archive: {' '.join(str(error).split())}") from error
-    return make_map(arrays["points"], arrays.get("ids"), arrays.get("descriptors"), frame)
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MapError(f"no readable NumPy archive: {reason}") from error
 
 
 def write_npz(path: Path, landmarks: Map) -> None:

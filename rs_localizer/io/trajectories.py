@@ -22,6 +22,8 @@ from rs_localizer.core.so3 import Array
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
 _QUATERNION_TOLERANCE = 0.01
+# Seconds whose nanoseconds fit 64 bits.
+_LATEST = 9_223_372_036
 
 
 class TrajectoryError(ValueError):
@@ -111,7 +113,8 @@ def split_at_gaps(trajectory: Trajectory, factor: float = 3.0) -> list[Trajector
 def parse_stamp(text: str) -> int:
     """Nanoseconds of a decimal number of seconds, exact (also ``1.5e9``)."""
     seconds = Decimal(text)
-    if not seconds.is_finite():
+    # Compared first: the integer of 1e999999999 would fill the memory.
+    if not seconds.is_finite() or abs(seconds) >= _LATEST:
         raise InvalidOperation
     return int((seconds * 1_000_000_000).to_integral_value())
 

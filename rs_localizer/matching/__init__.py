@@ -176,13 +176,13 @@ def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> C
     if matches.scores is not None:
         kinds.append(("score", "<f4"))
     table = np.empty(len(matches), kinds)
-    for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
-        table[name] = column
+    with np.errstate(over="ignore"):  # pixels of 1e300 are no pixels in single precision either
+        for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
+            table[name] = column
+        if matches.scores is not None:
+            table["score"] = matches.scores
     if landmarks.ids is not None:
         table["id"] = landmarks.ids[matches.landmarks]
-    if matches.scores is not None:
-        with np.errstate(over="ignore"):
-            table["score"] = matches.scores
     return Correspondences(
         stamp_ns=keypoints.stamp_ns,
         frame=landmarks.frame,
