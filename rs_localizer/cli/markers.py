@@ -1,0 +1,172 @@
+"""``rs_localizer markers make|check``: prints with their map file; is a map file consistent?"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from rs_localizer.arguments import integer, number
+from rs_localizer.cli import UsageError
+from rs_localizer.markers.consistency import problems
+from rs_localizer.markers.families import FAMILIES, family
+from rs_localizer.markers.maps import MarkerMap, read_marker_map, wall, write_marker_map
+from rs_localizer.markers.printing import PAGES, plan, write_pages
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, Pose
+
+# Six markers that fill a page of A4 or letter.
+_FAMILY, _GRID, _SIZE, _GAP = "4x4_50", "2x3", 0.06, 0.02
+_SQUARE = 0.03
+# Of a ChArUco board: as large as leaves the marker enough white.
+_MARKER_SHARE = 0.75
+# A print that stands: x to the right, z up, y into the wall.
+_STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="action", required=True, metavar="make|check")
+    make = commands.add_parser(
+        "make",
+        help="a PDF or PNG to print, true to scale, and its map",
+        description="Write OUT.pdf, to be printed at 100 %, and its map OUT.yaml.",
+    )
+    make.add_argument("out", type=Path, metavar="OUT", help="path of both files, without ending")
+    above = number(0.0, above=True)
+    kind = make.add_mutually_exclusive_group()
+    kind.add_argument(
+        "--grid",
+        metavar="2x3",
+        help=f"markers, columns x rows (default: {_GRID}); what does not fit on a page together "
+        "is to be cut out and mounted as the map says",
+    )
+    kind.add_argument("--chessboard", metavar="6x4", help="inner corners, along a row x rows")
+    kind.add_argument("--charuco", metavar="5x7", help="squares, along a row x rows")
+    make.add_argument(
+        "--family", help=f"of the markers: {', '.join(FAMILIES)} (default: {_FAMILY})"
+    )
+    make.add_argument(
+        "--size", type=above, metavar="M", help=f"side of a marker (default: {_SIZE})"
+    )
+    make.add_argument(
+        "--gap", type=number(0.0), metavar="M", help=f"between the markers of a grid ({_GAP})"
+    )
+    make.add_argument("--first-id", type=integer(0), metavar="N", help="id of the first (0)")
+    make.add_argument(
+        "--square", type=above, metavar="M", help=f"side of a board's squares (default: {_SQUARE})"
+    )
+    make.add_argument(
+        "--marker",
+        type=above,
+        metavar="M",
+        help=f"side of a ChArUco board's markers (default: {_MARKER_SHARE} squares)",
+    )
+    make.add_argument("--page", choices=sorted(PAGES), default="a4", help="(default: %(default)s)")
+    make.add_argument("--format", choices=["pdf", "png"], default="pdf")
+    make.add_argument("--map-frame", default="map", help="(default: %(default)s)")
+    make.add_argument(
+        "--standing",
+        action="store_true",
+        help="map frame with z up and y into the wall; otherwise x is to the right, y up and z "
+        "toward the viewer, which is right for a print that lies on a table",
+    )
+    make.add_argument("--overwrite", action="store_true", help="replace earlier files")
+    check = commands.add_parser(
+        "check",
+        help="say what is wrong with a map file",
+        description="Read a map and look for overlaps, mirrored markers and sizes in other units.",
+    )
+    check.add_argument("map", type=Path, metavar="MAP")
+
+
+def run(args: argparse.Namespace) -> None:
+    if args.action == "make":
+        _make(args)
+    else:
+        _check(args.map)
+
+
+def _make(args: argparse.Namespace) -> None:
+    try:
+        marker_map = _map(args)
+    except UsageError:
+        raise
+    except ValueError as error:  # the arguments are all that can be wrong with it
+        raise UsageError(str(error)) from error
+    found = problems(marker_map)
+    if found:
+        raise UsageError(found[0])
+    # An ending would be lost with a dot in the name.
+    target = Path(f"{args.out}.{args.format}")
+    map_file = Path(f"{args.out}.yaml")
+    pages = plan(marker_map, args.page)
+    for path in (target, map_file):
+        if path.exists() and not args.overwrite:
+            raise ValueError(f"{path} exists already; it is replaced with --overwrite")
+    files = write_pages(pages, target)
+    write_marker_map(map_file, marker_map)
+    shown = str(files[0]) if len(files) == 1 else f"{files[0]} ... {files[-1].name}"
+    count = f"{len(pages)} page{'s' if len(pages) > 1 else ''} of {args.page}"
+    print(f"{shown}: {count}; print at 100 % and measure the bar")
+    print(f"{map_file}: {len(marker_map.points)} corners in {marker_map.map_frame}")
+    if marker_map.markers and len(pages) > 1:
+        print("the markers do not fit on a page together: mount each where the map has it")
+
+
+def _map(args: argparse.Namespace) -> MarkerMap:
+    pose = Pose(np.zeros(3), _STANDING if args.standing else np.eye(3))
+    if args.chessboard is None and args.charuco is None:
+        _refuse(args, "a board", "square", "marker")
+        columns, rows = _counts(args.grid or _GRID, "--grid")
+        size = args.size or _SIZE
+        gap = _GAP * size / _SIZE if args.gap is None else args.gap
+        markers = wall(
+            args.family or _FAMILY,
+            *(columns, rows, size, gap),
+            first_id=args.first_id or 0,
+            pose=pose,
+        )
+        return MarkerMap(markers, map_frame=args.map_frame)
+    _refuse(args, "a grid", "size", "gap")
+    square = args.square or _SQUARE
+    if args.chessboard is not None:
+        _refuse(args, "markers", "family", "first_id", "marker")
+        board: Board = Chessboard(*_counts(args.chessboard, "--chessboard"), square, pose)
+    else:
+        columns, rows = _counts(args.charuco, "--charuco")
+        marker = args.marker or _MARKER_SHARE * square
+        chosen = family(args.family or _FAMILY)
+        board = Charuco(columns, rows, square, marker, chosen, args.first_id or 0, False, pose)
+    return MarkerMap(boards=(board,), map_frame=args.map_frame)
+
+
+def _refuse(args: argparse.Namespace, what: str, *names: str) -> None:
+    for name in names:
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} is for {what}")
+
+
+def _counts(text: str, option: str) -> tuple[int, int]:
+    try:
+        columns, rows = (int(word) for word in text.split("x"))
+    except ValueError:
+        raise UsageError(f"{option} must be of the form 6x4, got {text!r}") from None
+    if min(columns, rows) < 1:
+        raise UsageError(f"{option} must be of the form 6x4, got {text!r}")
+    return columns, rows
+
+
+def _check(path: Path) -> None:
+    marker_map = read_marker_map(path)
+    found = problems(marker_map)
+    for text in found:
+        print(text)
+    if found:
+        count = "a problem" if len(found) == 1 else f"{len(found)} problems"
+        raise ValueError(f"{path} has {count}")
+    kinds = sorted({marker.family.name for marker, _ in marker_map.all_markers()})
+    of = f" of {', '.join(kinds)}" if kinds else ""
+    print(
+        f"{path}: {len(marker_map.markers)} markers and {len(marker_map.boards)} boards{of} in "
+        f"{marker_map.map_frame}; no problem found"
+    )

@@ -1,0 +1,294 @@
+"""Pages to print, true to scale, of markers and boards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.so3 import Array
+from rs_localizer.markers.dictionaries import pattern
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
+
+# Upright, in mm.
+PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
+_MARGIN = 10.0  # mm: printers leave about 5 white
+_TEXT_HEIGHT = 12.0  # mm, at the foot of a page
+_BAR = 100.0  # mm, to be measured
+_MM = 1000.0  # in a metre
+_INCH = 25.4  # mm
+_FONT = 7.0  # pt
+# Prints lie in one plane and face the same way to within this.
+_FLAT = 1e-6
+_PNG_DPI = 300
+
+
+class PrintError(ValueError):
+    """Something that cannot be printed; the message says why."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Figure:
+    """Something on a page: black rectangles, and what it needs around them."""
+
+    black: Array  # (n,4) mm: left, bottom, width, height, from its lower left corner
+    width: float  # mm, with the white rim
+    height: float
+    rim: float  # mm, white, inside the width and height
+    label: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Page:
+    """Figures by their lower left corners in mm."""
+
+    width: float
+    height: float
+    figures: tuple[tuple[float, float, _Figure], ...]
+    note: str
+
+
+def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
+    """Lay a map out on pages.
+
+    Markers in one plane that fit on a page together are on it as in the map; others get a place
+    of their own, to be cut out. A board has a page to itself.
+
+    Raises:
+        PrintError: when something is larger than the page.
+    """
+    size = PAGES[page]
+    pages = [_board_page(board, size, page) for board in marker_map.boards]
+    markers = marker_map.markers
+    if markers:
+        together = _together(markers, size)
+        pages += [together] if together is not None else _apart(markers, size, page)
+    return pages
+
+
+def write_pages(pages: Sequence[Page], path: Path) -> list[Path]:
+    """Write a PDF, or a PNG for each page (by the path's ending); the files.
+
+    Raises:
+        PrintError: for another ending.
+        OSError: when a file cannot be written.
+    """
+    count = len(pages)
+    figures = [_draw(page, f"page {k + 1} of {count}") for k, page in enumerate(pages)]
+    if path.suffix == ".pdf":
+        from matplotlib.backends.backend_pdf import PdfPages
+
+        with PdfPages(path) as file:
+            for figure in figures:
+                file.savefig(figure)
+        return [path]
+    if path.suffix != ".png":
+        raise PrintError(f"{path} must end in .pdf or .png")
+    names = [path] if count == 1 else [path.with_stem(f"{path.stem}_{k + 1}") for k in range(count)]
+    for figure, name in zip(figures, names, strict=True):
+        figure.savefig(name, dpi=_PNG_DPI)
+    return names
+
+
+# -- layout -------------------------------------------------------------------------------------
+
+
+def _room(size: tuple[float, float]) -> tuple[float, float]:
+    return size[0] - 2 * _MARGIN, size[1] - 2 * _MARGIN - _TEXT_HEIGHT
+
+
+def _turned(size: tuple[float, float], width: float, height: float) -> tuple[float, float] | None:
+    """The page, upright or on its side, on which this fits."""
+    for way in (size, size[::-1]):
+        room = _room(way)
+        if width <= room[0] + 1e-9 and height <= room[1] + 1e-9:
+            return way
+    return None
+
+
+def _too_large(what: str, width: float, height: float, size: tuple[float, float], page: str) -> str:
+    room = _room(size)
+    return (
+        f"{what} takes {width:.0f} x {height:.0f} mm, but {page} has room for {room[0]:.0f} x "
+        f"{room[1]:.0f} mm; choose a larger page or a smaller size"
+    )
+
+
+def _board_page(board: Board, size: tuple[float, float], page: str) -> Page:
+    figure = _board_figure(board)
+    way = _turned(size, figure.width, figure.height)
+    if way is None:
+        raise PrintError(_too_large(board.name, figure.width, figure.height, size, page))
+    note = f"{figure.label}; mount it on something flat"
+    return _middle(way, [(0.0, 0.0, figure)], figure.width, figure.height, note)
+
+
+def _together(markers: tuple[Marker, ...], size: tuple[float, float]) -> Page | None:
+    """All markers as in the map, if they lie in one plane, upright, and fit on a page."""
+    first = markers[0].pose
+    figures = []
+    for marker in markers:
+        pose = marker.pose
+        if np.abs(pose.rotation - first.rotation).max() > _FLAT:
+            return None
+        x, y, z = (pose.position - first.position) @ first.rotation * _MM
+        if abs(z) > _FLAT * _MM:
+            return None
+        figure = _marker_figure(marker)
+        figures.append((x - 0.5 * figure.width, y - 0.5 * figure.height, figure))
+    left, bottom = min(x for x, _, _ in figures), min(y for _, y, _ in figures)
+    width = max(x + figure.width for x, _, figure in figures) - left
+    height = max(y + figure.height for _, y, figure in figures) - bottom
+    way = _turned(size, width, height)
+    if way is None:
+        return None
+    moved = [(x - left, y - bottom, figure) for x, y, figure in figures]
+    note = "all markers are where the map has them" if len(markers) > 1 else ""
+    return _middle(way, moved, width, height, note)
+
+
+def _apart(markers: tuple[Marker, ...], size: tuple[float, float], page: str) -> list[Page]:
+    """As many markers to a page as fit, to be cut out and put where the map has them."""
+    figures = [_marker_figure(marker) for marker in markers]
+    width = max(figure.width for figure in figures)
+    height = max(figure.height for figure in figures)
+    way = _turned(size, width, height)
+    if way is None:
+        raise PrintError(_too_large(markers[0].name, width, height, size, page))
+    columns, rows, way = max(
+        ((int(_room(w)[0] // width), int(_room(w)[1] // height), w) for w in (size, size[::-1])),
+        key=lambda item: item[0] * item[1],
+    )
+    pages = []
+    for start in range(0, len(figures), columns * rows):
+        placed = []
+        for k, figure in enumerate(figures[start : start + columns * rows]):
+            column, row = k % columns, k // columns
+            placed.append((column * width, (rows - 1 - row) * height, figure))
+        note = "cut along the lines and put each marker where the map has it"
+        pages.append(_middle(way, placed, columns * width, rows * height, note))
+    return pages
+
+
+def _middle(
+    way: tuple[float, float],
+    figures: list[tuple[float, float, _Figure]],
+    width: float,
+    height: float,
+    note: str,
+) -> Page:
+    room = _room(way)
+    x = _MARGIN + 0.5 * (room[0] - width)
+    y = _MARGIN + _TEXT_HEIGHT + 0.5 * (room[1] - height)
+    return Page(*way, tuple((x + a, y + b, figure) for a, b, figure in figures), note)
+
+
+# -- figures ------------------------------------------------------------------------------------
+
+
+def _marker_figure(marker: Marker) -> _Figure:
+    cell = marker.size * _MM / marker.family.cells
+    black = _rectangles(pattern(marker.family, marker.id), cell) + np.array([cell, cell, 0.0, 0.0])
+    side = cell * (marker.family.cells + 2)
+    label = f"{marker.family.name}  id {marker.id}  {marker.size * _MM:g} mm"
+    return _Figure(black, side, side, cell, label)
+
+
+def _board_figure(board: Board) -> _Figure:
+    square = board.square * _MM
+    if isinstance(board, Chessboard):
+        columns, rows = board.columns + 1, board.rows + 1
+        label = f"{board.name} inner corners  squares {square:g} mm"
+    else:
+        columns, rows = board.columns, board.rows
+        label = f"{board.name}  squares {square:g} mm  markers {board.marker * _MM:g} mm"
+    whites = _white_cells(board, columns, rows)
+    white = np.zeros((rows, columns), bool)
+    for column, row in whites:
+        white[row, column] = True
+    black = [_rectangles(white, square)]
+    if isinstance(board, Charuco):
+        side = board.marker * _MM
+        rim, cell = 0.5 * (square - side), side / board.family.cells
+        for index, (column, row) in enumerate(whites):
+            inside = _rectangles(pattern(board.family, board.first_id + index), cell)
+            x, y = column * square + rim, (rows - 1 - row) * square + rim
+            black.append(inside + np.array([x, y, 0.0, 0.0]))
+    return _Figure(np.concatenate(black), columns * square, rows * square, 0.0, label)
+
+
+def _white_cells(board: Board, columns: int, rows: int) -> list[tuple[int, int]]:
+    if isinstance(board, Charuco):
+        return board.cells
+    return [(c, r) for r in range(rows) for c in range(columns) if (c + r) % 2 == 1]
+
+
+def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
+    """The black cells as rectangles (n,4), as few as runs along the rows make them."""
+    rows = len(white)
+    found = []
+    for row in range(rows):
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], white[row], [True]]).astype(int)))
+        for start, end in edges.reshape(-1, 2).tolist():
+            found.append([start * cell, (rows - 1 - row) * cell, (end - start) * cell, cell])
+    return np.array(found, np.float64).reshape(-1, 4)
+
+
+# -- drawing ------------------------------------------------------------------------------------
+
+
+def _draw(page: Page, number: str) -> Any:
+    from matplotlib.figure import Figure
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    figure = Figure(figsize=(page.width / _INCH, page.height / _INCH))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0.0, page.width), ylim=(0.0, page.height))
+    axes.set_axis_off()
+    vertices, codes = [], []
+    for x, y, item in page.figures:
+        for left, bottom, width, height in item.black + np.array([x, y, 0.0, 0.0]):
+            right, top = left + width, bottom + height
+            corners = [(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)]
+            vertices += corners
+            codes += [Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY]
+        if item.rim > 0.0:
+            _add_rim(axes, x, y, item)
+    # One path: between several, a viewer would show hairlines. Snapped to pixels, sizes are wrong.
+    axes.add_patch(
+        PathPatch(Outline(vertices, codes), facecolor="black", edgecolor="none", snap=False)
+    )
+    _foot(axes, page, number)
+    return figure
+
+
+def _add_rim(axes: Any, x: float, y: float, item: _Figure) -> None:
+    """Where to cut, and which marker it is."""
+    from matplotlib.patches import Rectangle
+
+    axes.add_patch(
+        Rectangle((x, y), item.width, item.height, fill=False, edgecolor="0.8", linewidth=0.25)
+    )
+    # At the edge of the white rim, where it is far from the marker.
+    small = {"fontsize": 0.5 * _FONT, "color": "0.5"}
+    axes.text(x + 1.0, y + 0.8, item.label, va="bottom", **small)
+    right, top = x + item.width - 1.0, y + item.height - 0.8
+    axes.text(right, top, "top", ha="right", va="top", **small)
+
+
+def _foot(axes: Any, page: Page, number: str) -> None:
+    y = _MARGIN
+    axes.plot([_MARGIN, _MARGIN + _BAR], [y, y], color="black", linewidth=0.5)
+    for k in range(11):
+        x = _MARGIN + 0.1 * _BAR * k
+        axes.plot([x, x], [y, y + (2.0 if k % 5 else 3.0)], color="black", linewidth=0.5)
+    told = f"print at 100 % (actual size): this bar is {_BAR:.0f} mm long"
+    axes.text(_MARGIN, y + 4.0, told, fontsize=_FONT)
+    right = "; ".join(text for text in (page.note, number) if text)
+    axes.text(page.width - _MARGIN, y, right, fontsize=0.8 * _FONT, ha="right")

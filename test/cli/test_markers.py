@@ -1,0 +1,100 @@
+"""Prints with their maps, and what is said of maps that cannot be right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rs_localizer.cli.main import main
+from rs_localizer.markers.maps import read_marker_map
+
+
+def make(out: Path, *words: str) -> int:
+    return main(["markers", "make", str(out), *words])
+
+
+def test_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "wall.v2"
+    assert make(out) == 0
+    said = capsys.readouterr().out
+    assert f"{out}.pdf: 1 page of a4; print at 100 %" in said
+    assert (tmp_path / "wall.v2.pdf").read_bytes().startswith(b"%PDF")
+    made = read_marker_map(tmp_path / "wall.v2.yaml")
+    assert [marker.name for marker in made.markers] == [f"marker 4x4_50 {k}" for k in range(6)]
+    assert main(["markers", "check", f"{out}.yaml"]) == 0
+    said = capsys.readouterr().out
+    assert "6 markers and 0 boards of 4x4_50 in map; no problem found" in said
+    # Nothing is overwritten.
+    assert make(out, "--size", "0.05") == 1
+    assert "exists already" in capsys.readouterr().err
+    assert make(out, "--size", "0.05", "--overwrite") == 0
+    assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
+
+
+def test_standing_prints_have_z_up(tmp_path: Path) -> None:
+    words = ["--charuco", "5x7", "--square", "0.03", "--map-frame", "hall", "--standing"]
+    assert make(tmp_path / "board", *words, "--family", "36h11", "--format", "png") == 0
+    assert (tmp_path / "board.png").exists()
+    made = read_marker_map(tmp_path / "board.yaml")
+    assert made.map_frame == "hall"
+    first, last = made.points[0], made.points[-1]
+    np.testing.assert_allclose(first, [-0.045, 0, 0.075], atol=1e-9)
+    np.testing.assert_allclose(last, [0.045, 0, -0.075], atol=1e-9)
+
+
+def test_large_markers_come_on_pages_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert make(tmp_path / "wall", "--size", "0.13", "--grid", "2x1", "--page", "letter") == 0
+    assert "2 pages of letter" in (said := capsys.readouterr().out)
+    assert "mount each where the map has it" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--family", "4x5_50"), "unknown family '4x5_50'"),
+        (("--grid", "10x10"), "4x4_50 has the ids 0 to 49, found 50"),
+        (("--grid", "0x1"), "--grid must be of the form 6x4, got '0x1'"),
+        (("--grid", "two"), "--grid must be of the form 6x4, got 'two'"),
+        (("--gap", "0.001"), "each needs a white rim of a cell"),
+        (("--square", "0.1"), "--square is for a board"),
+        (("--chessboard", "6x4", "--size", "0.1"), "--size is for a grid"),
+        (("--chessboard", "6x4", "--family", "4x4_50"), "--family is for markers"),
+        (("--chessboard", "2x2"), "a board needs 3x3 inner corners"),
+        (("--charuco", "5x7", "--marker", "0.1"), "do not fit into squares"),
+        (("--size", "0"), "--size: must be more than 0"),
+        (("--page", "a5"), "invalid choice: 'a5'"),
+    ],
+)
+def test_wrong_usage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], text: str
+) -> None:
+    assert make(tmp_path / "wall", *words) == 2
+    assert text in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_does_not_fit_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert make(tmp_path / "wall", "--size", "0.5") == 1
+    assert "but a4 has room for" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_problems_of_a_map_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert make(tmp_path / "wall", "--grid", "2x1", "--size", "0.05", "--gap", "0.03") == 0
+    path = tmp_path / "wall.yaml"
+    text = path.read_text()
+    path.write_text(text.replace("[0.04, 0.0, 0.0]", "[0.0, 0.0, 0.0]"))
+    capsys.readouterr()
+    assert main(["markers", "check", str(path)]) == 1
+    said = capsys.readouterr()
+    assert said.out == "marker 4x4_50 0 and marker 4x4_50 1 overlap by 0.01 m\n"
+    assert said.err == f"rs_localizer markers: {path} has a problem\n"
+    path.write_text(text.replace("id: 1", "id: 0"))
+    assert main(["markers", "check", str(path)]) == 1
+    assert "marker 4x4_50 0 is there twice" in capsys.readouterr().err
