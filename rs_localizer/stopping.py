@@ -55,13 +55,16 @@ class _Signals(abc.ABC):
             self._at_once = before
 
     def _take(self, number: int, frame: FrameType | None) -> None:
+        self._leave_if_at_once()
+        first, self.requested = not self.requested, True
+        if first:
+            self._stop()
+
+    def _leave_if_at_once(self) -> None:
         if self._at_once is not None:
             code, text = self._at_once
             os.write(2, text.encode())
             os._exit(code)
-        first, self.requested = not self.requested, True
-        if first:
-            self._stop()
 
     @abc.abstractmethod
     def _stop(self) -> None:
@@ -83,6 +86,14 @@ class StopRequest(_Signals):
 
     An exception in the middle of a callback, or of rclpy's own clean-up, is lost or breaks it.
     """
+
+    @contextlib.contextmanager
+    def at_once(self, code: int = 0, text: str = "") -> Iterator[None]:
+        """As of all; what was requested before it is not put off until it is over."""
+        with super().at_once(code, text):
+            if self.requested:
+                self._leave_if_at_once()
+            yield
 
     def _stop(self) -> None:
         pass

@@ -90,9 +90,9 @@ class LocalizerNode(RobustLifecycleNode):
             frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
             self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
             self._diagnostics.publish()
-            frames.load_map()
-            self._say_map(frames)
             with self._compiling():
+                frames.load_map()
+                self._say_map(frames)
                 seconds = _warm_up(frames)
             self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
             self._broadcaster.configure(config)

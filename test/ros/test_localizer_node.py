@@ -410,6 +410,43 @@ def test_signals_while_it_compiles(start_node: Start, tmp_path: Path, number: in
     assert "Traceback" not in node.log
 
 
+def test_a_signal_before_it_compiles(start_node: Start, tmp_path: Path) -> None:
+    # In the last moment before compiling, which then must not begin.
+    signalled = (
+        "import os, signal, sys, rs_localizer.ros.parameters as p\n"
+        "read = p.read\n"
+        "def kill(*a, **k): os.kill(os.getpid(), signal.SIGTERM); return read(*a, **k)\n"
+        "p.read = kill\n"
+        "from rs_localizer.ros.main import main; sys.exit(main())"
+    )
+    node = start_node(run=signalled, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert node.process.wait(60.0) == 0
+    assert "kernels are ready" not in node.log
+    assert "Traceback" not in node.log
+    assert not list(tmp_path.rglob("*.nbc"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_frame_takes_long(
+    recording: Path, start_node: Start, peer: Any, number: int
+) -> None:
+    slow = (
+        "import sys, time; from rs_localizer.frames import FrameLocalizer as F\n"
+        "def wait(self, message): print('a slow frame', flush=True); time.sleep(100)\n"
+        "F.localize = wait\n"
+        "from rs_localizer.ros.main import main; sys.exit(main())"
+    )
+    node = start_node(*SHUTTER, run=slow)
+    talk = Talk(peer)
+    talk.connect()
+    while "a slow frame" not in node.log:
+        talk.send(*inputs(recording)[0], timeout=0.1)
+    start = time.monotonic()
+    assert node.stop(number, number) == 0
+    assert time.monotonic() - start < 10.0
+    assert "Traceback" not in node.log
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

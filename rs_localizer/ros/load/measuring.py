@@ -27,7 +27,9 @@ from rs_localizer.ros.load.camera import Camera
 from rs_localizer.ros.load.frames import READOUT_TIME, Frames
 from rs_localizer.settings import NODE_NAME
 
-_NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
+NODE_PROGRAM = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
+"""The node as its executable runs it, which may not be on the path."""
+
 # The first start on a machine compiles all kernels.
 _START_TIMEOUT = 300.0
 # Frames that are still on their way when the last one has been sent, in s.
@@ -190,7 +192,7 @@ def _start_node(namespace: str, log: Path) -> subprocess.Popen[bytes]:
     settings = ("-r", f"__ns:={namespace}", "-p", f"readout_time:={READOUT_TIME}")
     with log.open("wb") as file:
         return subprocess.Popen(
-            [sys.executable, "-c", _NODE, "--ros-args", *settings], stdout=file, stderr=file
+            [sys.executable, "-c", NODE_PROGRAM, "--ros-args", *settings], stdout=file, stderr=file
         )
 
 
