@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,4 +75,5 @@ def _marks(rows: Rows, message: Any) -> tuple[Ids | None, Descriptors | None]:
         return ids, None
     found = rows.table["descriptor"]
     native = found.dtype.newbyteorder("=")
-    return ids, np.ascontiguousarray(found.reshape(len(found), -1), dtype=native)
+    width = math.prod(found.shape[1:])  # also without a row left
+    return ids, np.ascontiguousarray(found.reshape(len(found), width), dtype=native)

@@ -102,6 +102,19 @@ def test_rows_that_are_not_finite_are_dropped_and_counted(name: str) -> None:
     assert len(read) == COUNT - 1
 
 
+@pytest.mark.parametrize("mark", [("id", "u2"), BITS, NUMBERS])
+def test_no_row_is_left(mark: Any) -> None:
+    message = cloud(*UV, mark)
+    data = message.data.copy()
+    data.reshape(COUNT, -1)[:, :4] = np.array([np.nan], "<f4").view(np.uint8)
+    message.data = data
+    read = read_keypoints(message)
+    assert (len(read), read.dropped) == (0, COUNT)
+    if mark[0] == "descriptor":
+        assert read.descriptors is not None
+        assert read.descriptors.shape == (0, mark[2][0])
+
+
 def test_landmarks_that_are_not_finite() -> None:
     message = cloud(("x", "f4"), ("y", "f4"), ("z", "f4"), ("id", "u4"))
     data = message.data.copy()

@@ -33,7 +33,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 from std_msgs.msg import String
@@ -41,11 +41,14 @@ from std_srvs.srv import Trigger
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.maps import Map
+from rs_localizer.lab.landmarks import map_rows, random_descriptors
 from rs_localizer.lab.recording import write_simulated
 from rs_localizer.lab.scene import room
 from rs_localizer.lab.simulation import FrameSettings, simulate_frames
 from rs_localizer.lab.true_motion import ConstantVelocity
-from rs_localizer.ros.conversion import copy_message
+from rs_localizer.ros.conversion import copy_message, make_message
 from rs_localizer.ros.localizer_node import LocalizerNode
 from rs_localizer.ros.run import spin
 
@@ -54,6 +57,8 @@ K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 PATIENCE = 20.0  # s, of a machine that is busy
 CLOSE = 0.05  # m: the poses are right
 SECOND = 1_000_000_000
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DESCRIPTORS = random_descriptors(5000, np.random.default_rng(9))  # of the landmarks, by number
 
 
 @dataclass(frozen=True)
@@ -135,7 +140,9 @@ class World:
 
     def table(self) -> np.ndarray:
         """The rows of a good frame."""
-        cloud = self.recording.clouds[0]
+        return self.table_of(self.recording.clouds[0])
+
+    def table_of(self, cloud: PointCloud2) -> np.ndarray:
         kinds = {PointField.FLOAT32: "<f4", PointField.UINT32: "<u4"}
         columns = [(item.name, kinds[item.datatype]) for item in cloud.fields]
         return np.frombuffer(bytes(cloud.data), columns).copy()
@@ -233,15 +240,25 @@ class Peer:
             CameraInfo: create(CameraInfo, "camera_info", 10),
             PointCloud2: create(PointCloud2, "correspondences", 10),
         }
+        self._others = {
+            "keypoints": create(PointCloud2, "keypoints", 10),
+            "map_points": create(PointCloud2, "map_points", LATCHED),
+        }
         self.node.create_subscription(PoseStamped, "rs_localizer/pose", self.poses.append, 100)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
 
     def connected(self) -> bool:
-        counts = [publisher.get_subscription_count() for publisher in self._publishers.values()]
+        publishers = [*self._publishers.values(), *self._others.values()]
+        counts = [publisher.get_subscription_count() for publisher in publishers]
         return min(counts) > 0 and self.node.count_publishers("rs_localizer/pose") > 0
 
     def send(self, message: Any) -> None:
-        self._publishers[type(message)].publish(message)
+        """A camera_info or correspondences, or a pair of another topic and its message."""
+        if isinstance(message, tuple):
+            topic, message = message
+            self._others[topic].publish(message)
+        else:
+            self._publishers[type(message)].publish(message)
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -668,6 +685,110 @@ def mounting(world: World) -> str:
     return str(answer)
 
 
+# -- keypoints and maps ----------------------------------------------------------------------
+
+
+def landmarks(world: World, frame: str = "map") -> Map:
+    """What all frames of the recording show, with a descriptor for each number."""
+    tables = [
+        np.unique(world.table_of(cloud)[["id", "x", "y", "z"]]) for cloud in world.recording.clouds
+    ]
+    table = np.unique(np.concatenate(tables))
+    points = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
+    return Map(points, table["id"].astype(np.int64), DESCRIPTORS[table["id"]], frame)
+
+
+def map_message(
+    world: World, change: Callable[[np.ndarray], np.ndarray] = lambda rows: rows, frame: str = "map"
+) -> Any:
+    rows = change(map_rows(landmarks(world, frame)))
+    return "map_points", make_cloud(make_message, 0, frame, rows)
+
+
+def keypoints(world: World, count: int = 0, **columns: np.ndarray) -> Any:
+    """Those of a good frame, with other marks; repeated up to a count."""
+    table = world.table()
+    marks = columns or {"descriptor": DESCRIPTORS[table["id"]]}
+    kinds = [("u", "<f4"), ("v", "<f4")]
+    kinds += [(name, mark.dtype, mark.shape[1:]) for name, mark in marks.items()]
+    rows = np.zeros(len(table), kinds)
+    for name, values in {"u": table["u"], "v": table["v"], **marks}.items():
+        rows[name] = values
+    rows = np.resize(rows, count or len(rows))
+    world.stamp += SECOND // 30
+    return "keypoints", make_cloud(make_message, world.stamp, "camera", rows)
+
+
+def marked(**columns: Any) -> Callable[[World], Any]:
+    """Keypoints with these marks, made of the ids of a good frame."""
+    return lambda world: [
+        keypoints(world, **{name: mark(world.table()["id"]) for name, mark in columns.items()})
+    ]
+
+
+def mapped(change: Callable[[np.ndarray], np.ndarray], **attributes: Any) -> Callable[[World], Any]:
+    def do(world: World) -> Any:
+        topic, message = map_message(world, change)
+        for name, value in attributes.items():
+            setattr(message, name, value)
+        return [(topic, message)]
+
+    return do
+
+
+def without_a_map(world: World) -> str:
+    """Keypoints come, a map does not."""
+    before = len(world.said)
+    world.send(world.recording.info)
+    world.wait(lambda: world.send(keypoints(world)) or len(world.said) > before)
+    assert world.diagnosis("State = waiting for a map")
+    return "; ".join(world.said[before:])
+
+
+def late_map(world: World) -> str:
+    assert not world.poses(keypoints(world), within=0.3)
+    world.send(map_message(world))
+    world.wait(lambda: world.poses(keypoints(world), within=0.3))
+    return "localized since the map came"
+
+
+def replaced_within_a_frame(world: World) -> str:
+    """The frame that is worked on is answered by the old map, the next one by the new."""
+    frames = world.node._localizer
+    localize = frames.localize_keypoints
+    started, go_on = threading.Event(), threading.Event()
+
+    def wait(message: Any) -> Any:
+        del frames.localize_keypoints
+        started.set()
+        assert go_on.wait(PATIENCE)
+        return localize(message)
+
+    frames.localize_keypoints = wait
+    before = len(world.peer.poses)
+    world.wait(lambda: world.send(keypoints(world)) or started.wait(0.1))
+    world.send(map_message(world, frame="hall"))
+    world.wait(lambda: "map" in world.node._worker._mailbox._updates)
+    go_on.set()
+    world.wait(lambda: len(world.peer.poses) > before)
+    assert world.peer.poses[before].header.frame_id == "map"
+    world.wait(lambda: world.poses(keypoints(world), within=0.3))
+    assert world.peer.poses[-1].header.frame_id == "hall"
+    world.send(map_message(world))
+    world.wait(
+        lambda: (
+            world.poses(keypoints(world), within=0.3)
+            and world.peer.poses[-1].header.frame_id == "map"
+        )
+    )
+    return next(text for text in world.said if text.startswith("map_replaced"))
+
+
+def repeated(rows: np.ndarray) -> np.ndarray:
+    rows["id"][1] = rows["id"][0]
+    return rows
+
+
 RELIABLE = ("-p", "qos_overrides./other/correspondences.subscription.reliability:=reliable")
 
 FAULTS = [
@@ -746,6 +867,41 @@ FAULTS = [
         "two nodes in one process; another type on the topic",
         second_node((), String, 10),
         "/other/driver publishes std_msgs/msg/String, not sensor_msgs/msg/PointCloud2",
+    ),
+    # Keypoints and maps
+    Fault("keypoints without a map", without_a_map, "no_map: no usable map has come yet"),
+    Fault("a map of 2^31 landmarks", mapped(lambda t: t, width=2**31), "bad_map: .*truncated"),
+    Fault("a map with an id twice", mapped(repeated), "bad_map: 1 ids stand for several"),
+    Fault("a map of NaN", mapped(with_values(x=np.nan)), "bad_map: the map has no landmarks"),
+    Fault("a map of points only", mapped(lambda t: t[[*"xyz"]].copy()), "bad_map: .*neither"),
+    Fault("a map that comes late", late_map, "localized since the map came"),
+    Fault("a map replaced within a frame", replaced_within_a_frame, "map_replaced: a map of"),
+    Fault(
+        "descriptors of another width",
+        marked(descriptor=lambda ids: np.zeros((len(ids), 64), np.uint8)),
+        "bad_keypoints: the keypoints have descriptors of 64 x uint8, the map has .*32 x uint8",
+    ),
+    Fault(
+        "descriptors of another kind",
+        marked(descriptor=lambda ids: np.zeros((len(ids), 32), np.float32)),
+        "bad_keypoints: the keypoints have descriptors of 32 x float32",
+    ),
+    Fault(
+        "descriptors as INT16",
+        marked(descriptor=lambda ids: np.zeros((len(ids), 32), np.int16)),
+        "bad_keypoints: field 'descriptor' must be one of UINT8, FLOAT32; found INT16",
+    ),
+    Fault(
+        "keypoints without marks",
+        marked(size=lambda ids: np.zeros(len(ids), np.float32)),
+        "bad_keypoints: the cloud has neither a field id nor descriptor",
+    ),
+    Fault("unknown ids only", marked(id=lambda ids: ids + 10**6), "no_matches: none of"),
+    Fault(
+        "100,000 keypoints",
+        lambda world: [keypoints(world, 100_000)],
+        "too_many_keypoints: 100000 keypoints",
+        pose=True,
     ),
     # TF
     Fault("tf2_ros is not installed", without_tf2_ros, "needs the Python package tf2_ros"),
