@@ -22,8 +22,12 @@ from rs_localizer.cli.simulated_camera import (
 )
 from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import STORAGES, BagWriter
+from rs_localizer.io.map_files import write_map_file
 from rs_localizer.lab.image_sequence import FORMATS, Encoding, rendered_frames
+from rs_localizer.lab.landmarks import described, keypoint_rows
 from rs_localizer.lab.recording import (
+    MAP,
+    MAP_FRAME,
     MARKER_MAP,
     PARAMETERS,
     write_parameters,
@@ -38,7 +42,7 @@ from rs_localizer.lab.walls import SCENES
 from rs_localizer.markers.maps import write_marker_map
 
 # Options of the one kind of recording that mean nothing to the other.
-_OF_CORRESPONDENCES = ("points", "noise", "outliers")
+_OF_POINTS = ("points", "noise", "outliers", "keypoints")
 _OF_IMAGES = ("walls", "exposure", "grey_noise", "vignetting", "format", "quality")
 
 
@@ -51,6 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(seen, "--points", integer(1), frames.points, "N", "of a frame, if it sees so many")
     option(seen, "--noise", number(0.0), frames.noise, "PX", "deviation of each raw coordinate")
     option(seen, "--outliers", number(0.0, 1.0), frames.outliers, "SHARE", "of the points")
+    seen.add_argument(
+        "--keypoints",
+        action="store_true",
+        help=f"pixels with binary descriptors, and the map beside them, {MAP}: for matching",
+    )
     pictures, encoding = ImageSettings(), Encoding()
     images = parser.add_argument_group("what it sees: images")
     images.add_argument(
@@ -81,12 +90,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--storage", choices=list(STORAGES), default="mcap", help="(default: %(default)s)"
     )
     parser.set_defaults(defaults={
-        name: parser.get_default(name) for name in (*_OF_CORRESPONDENCES, *_OF_IMAGES)
+        name: parser.get_default(name) for name in (*_OF_POINTS, *_OF_IMAGES)
     })  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> None:
-    foreign = _OF_CORRESPONDENCES if args.images else _OF_IMAGES
+    foreign = _OF_POINTS if args.images else _OF_IMAGES
     given = [name for name in foreign if getattr(args, name) != args.defaults[name]]
     if given:
         option = f"--{given[0].replace('_', '-')}"
@@ -98,19 +107,25 @@ def run(args: argparse.Namespace) -> None:
     if args.images:
         _write_images(args)
     else:
-        _write_correspondences(args)
+        _write_points(args)
 
 
-def _write_correspondences(args: argparse.Namespace) -> None:
+def _write_points(args: argparse.Namespace) -> None:
     camera, motion = camera_of(args), motion_of(args)
     seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
     stamps = stamps_of(args, camera, motion)
-    map_points = room(_way(motion), np.random.default_rng(args.seed))
+    rng = np.random.default_rng(args.seed)
+    landmarks = described(room(_way(motion), rng), MAP_FRAME, rng)
     counts: list[int] = []
     with BagWriter(args.out, args.storage) as bag:
-        frames = simulate_frames(camera, motion, map_points, seen, stamps_ns=stamps, seed=args.seed)
+        frames = simulate_frames(
+            camera, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
+        )
         for frame in tqdm(frames, total=len(stamps), unit="frame", desc="simulate", disable=None):
-            write_simulated(bag, camera, frame)
+            if args.keypoints:
+                write_simulated(bag, camera, frame, keypoint_rows(frame, landmarks, rng))
+            else:
+                write_simulated(bag, camera, frame)
             counts.append(len(frame.points))
     if not any(counts):
         shutil.rmtree(args.out)
@@ -124,7 +139,11 @@ def _write_correspondences(args: argparse.Namespace) -> None:
     )
     out = shlex.quote(str(args.out))
     poses = shlex.quote(f"{args.out}_poses")
-    print(f"next: rs_localizer replay {out} --params {out}/{PARAMETERS} --out {poses}")
+    given = f"--params {out}/{PARAMETERS}"
+    if args.keypoints:
+        write_map_file(args.out / MAP, landmarks)
+        given += f" --map {out}/{MAP}"
+    print(f"next: rs_localizer replay {out} {given} --out {poses}")
 
 
 def _write_images(args: argparse.Namespace) -> None:

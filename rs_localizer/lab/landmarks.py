@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core.so3 import Array
 from rs_localizer.io.maps import Descriptors, Map
 from rs_localizer.lab.simulation import SimulatedFrame
 
@@ -19,6 +20,11 @@ DEVIATION = 0.3
 def random_descriptors(count: int, rng: np.random.Generator, width: int = 32) -> NDArray[np.uint8]:
     """Binary descriptors (count,width) without anything in common."""
     return rng.integers(0, 256, (count, width), dtype=np.uint8)
+
+
+def described(points: Array, frame: str, rng: np.random.Generator) -> Map:
+    """Points (n,3) as a map, with numbers and descriptors."""
+    return Map(points, np.arange(len(points)), random_descriptors(len(points), rng), frame)
 
 
 def seen_descriptors(descriptors: Descriptors, rng: np.random.Generator) -> Descriptors:

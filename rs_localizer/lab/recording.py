@@ -24,6 +24,7 @@ CAMERA_FRAME = "camera_optical_frame"
 MAP_FRAME = "map"
 CAMERA_INFO_TOPIC = "/camera_info"
 CORRESPONDENCES_TOPIC = "/correspondences"
+KEYPOINTS_TOPIC = "/keypoints"
 IMAGE_TOPIC = "/image/compressed"
 RAW_IMAGE_TOPIC = "/image_raw/compressed"
 TRUE_POSE_TOPIC = "/truth/pose"
@@ -31,6 +32,7 @@ TRUE_TWIST_TOPIC = "/truth/twist"
 # A params file and a map of markers in the directory of a recording.
 PARAMETERS = "parameters.yaml"
 MARKER_MAP = "marker_map.yaml"
+MAP = "map.npz"
 
 # Single precision is what RViz shows and most trackers give: 3e-5 px at the rim of an image.
 _ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "u", "v")] + [("id", "<u4")])
@@ -47,9 +49,19 @@ def write_parameters(directory: Path, readout_time: float, scan_direction: str) 
     )
 
 
-def write_simulated(bag: BagWriter, camera: Camera, frame: SimulatedFrame) -> None:
-    """Camera info, correspondences, and the truth at the first and at the middle row."""
-    write_frame(bag, camera, frame.stamp_ns, frame.points, frame.pixels, frame.ids)
+def write_simulated(
+    bag: BagWriter, camera: Camera, frame: SimulatedFrame, keypoints: NDArray[Any] | None = None
+) -> None:
+    """Camera info, correspondences, and the truth at the first and at the middle row.
+
+    With rows of keypoints (n,) these in the place of correspondences.
+    """
+    if keypoints is None:
+        write_frame(bag, camera, frame.stamp_ns, frame.points, frame.pixels, frame.ids)
+    else:
+        bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
+        cloud = make_cloud(make_message, frame.stamp_ns, CAMERA_FRAME, keypoints)
+        bag.write(KEYPOINTS_TOPIC, cloud, frame.stamp_ns)
     write_truth(bag, frame.stamp_ns, frame.first_row)
     if frame.middle_ns != frame.stamp_ns:
         write_truth(bag, frame.middle_ns, frame.middle_row)

@@ -147,3 +147,20 @@ def test_what_is_refused(
     assert main(["replay", str(flight / bag), *more, *out]) == code
     assert text in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_simulated_recording_and_its_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The line that simulate prints as the next one works, and gives the true poses."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "flight", "--keypoints", "--duration", "0.4", "--points", "200"]) == 0
+    said = capsys.readouterr().out
+    following = said.splitlines()[-1].removeprefix("next: rs_localizer ").split()
+    assert following[-4:] == ["--map", "flight/map.npz", "--out", "flight_poses"]
+    assert main(following) == 0
+    found = errors(tmp_path / "flight_poses", tmp_path / "flight")
+    assert len(found) == 12
+    assert np.median(found) < 0.02
+    assert main(["simulate", "other", "--keypoints", "--images"]) == 2
+    assert "--keypoints is for points" in capsys.readouterr().err
