@@ -8,6 +8,7 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import count, islice
 from random import Random
 from typing import Any
 
@@ -66,15 +67,18 @@ def case_of(target: Target, name: str, seed: int, number: int) -> Any:
 def run(targets: Mapping[str, Target], executions: int, seed: int) -> Iterator[Report]:
     """Feed all targets in turn; the report so far, after every execution."""
     report = Report({name: Counter() for name in targets})
-    names = list(targets)
     before = _peak_mb()
-    for number in range(executions):
-        name = names[number % len(names)]
+    for number, name in enumerate(islice(_turns(targets), executions)):
         _execute(report, name, targets[name], seed, number)
-        if number == len(names):
+        if number == len(targets):
             before = _peak_mb()  # everything has been imported and tried once
         report.peak_mb = _peak_mb() - before
         yield report
+
+
+def _turns(targets: Mapping[str, Target]) -> Iterator[str]:
+    for turn in count():
+        yield from (name for name, target in targets.items() if turn % target.every == 0)
 
 
 def _execute(report: Report, name: str, target: Target, seed: int, number: int) -> None:

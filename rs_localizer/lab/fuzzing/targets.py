@@ -78,6 +78,7 @@ class Target:
     make: Callable[[Random], Any]
     read: Callable[[Any], object]
     errors: tuple[type[Exception], ...]
+    every: int = 1  # of how many turns it takes one
 
 
 def targets(folder: Path) -> dict[str, Target]:
@@ -102,8 +103,10 @@ def targets(folder: Path) -> dict[str, Target]:
     message, map_error = (MessageError,), (MapError,)
     frames, shown = seeds.frames()
     return {
-        "localize": Target(_messages(frames), _Localizer(None), _OVERFLOWS),
-        "localize_keypoints": Target(_messages(shown), _Localizer(seeds.landmarks()), _OVERFLOWS),
+        "localize": Target(_messages(frames), _Localizer(None), _OVERFLOWS, every=10),
+        "localize_keypoints": Target(
+            _messages(shown), _Localizer(seeds.landmarks()), _OVERFLOWS, every=10
+        ),
         "correspondences": Target(_messages(clouds), read_correspondences, message),
         "keypoints": Target(_messages(keypoints), read_keypoints, message),
         "map_points": Target(_messages(landmarks), read_map, message),
