@@ -23,9 +23,9 @@ from rs_localizer.ros.conversion import type_name
 from rs_localizer.ros.intake import Intake, NotByExecutor
 from rs_localizer.ros.refusals import Refusals
 
-# As qos_profile_sensor_data: best effort, and room for the messages that come while the executor
-# is busy elsewhere; the mailbox keeps the newest of them and counts the others.
-SENSOR_DATA = {"depth": 5, "reliability": ReliabilityPolicy.BEST_EFFORT}
+# As qos_profile_sensor_data, with more room: what comes while this process does not get the CPU
+# shall be counted by the mailbox, which keeps the newest, and not be lost unseen.
+SENSOR_DATA = {"depth": 20, "reliability": ReliabilityPolicy.BEST_EFFORT}
 
 # A topic without a message for so long (s) is silent.
 _LONG = 2.0

@@ -66,13 +66,14 @@ def run(
 
 def _start(node: Any) -> int:
     """Configure and activate the node if it is to do so itself; the exit code if that failed."""
-    if node.autostart:
-        for transition in (node.trigger_configure, node.trigger_activate):
-            if transition() != TransitionCallbackReturn.SUCCESS:
-                return 1
-    # What has been compiled stays; to look through it for garbage would take a tenth of a second.
+    if node.autostart and node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+        return 1
+    # What has been compiled stays; to look through it for garbage takes some tenths of a second,
+    # and must not come between frames.
     gc.collect()
     gc.freeze()
+    if node.autostart and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+        return 1
     # Other threads than the worker have little to do and give the GIL back soon.
     sys.setswitchinterval(_SWITCH_INTERVAL)
     return 0
