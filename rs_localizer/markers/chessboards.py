@@ -15,6 +15,10 @@ from rs_localizer.markers.prints import Charuco, Chessboard
 _WINDOW_SHARE = 0.45
 _WINDOW_RANGE = (2, 15)
 _SMOOTHING = 1.0  # px
+# A chessboard is looked for in an image whose longer side is this (px) or less: where there is
+# none, the search takes 50 ms in 640x480, and its time grows with more than the area.
+# (cv2.checkChessboard and the flag for it are fast, and overlook small boards.)
+_LARGEST_SEARCH = 1024
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 
 
@@ -28,10 +32,12 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
     Returns:
         None when the whole board is not seen.
     """
-    found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows))
+    small, scale = _shrunk(image)
+    found, corners = cv2.findChessboardCorners(small, (board.columns, board.rows))
     if not found:
         return None
-    grid = np.asarray(corners, np.float64).reshape(board.rows, board.columns, 2)
+    corners = scale * np.asarray(corners, np.float64) + 0.5 * (scale - 1)
+    grid = corners.reshape(board.rows, board.columns, 2)
     gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     window = int(np.clip(_WINDOW_SHARE * min(gaps), *_WINDOW_RANGE))
     refined = _refine(_smooth(image), grid, window)
@@ -70,6 +76,18 @@ def find_charuco(
             rows.append(corner)
             pixels.append(refined)
     return np.array(rows, np.int64), np.array(pixels, np.float64).reshape(-1, 2)
+
+
+def _shrunk(image: Gray) -> tuple[Gray, int]:
+    """An image in which a board is found soon, and by what whole number it is smaller."""
+    height, width = image.shape
+    scale = -(-max(height, width) // _LARGEST_SEARCH)
+    if scale == 1:
+        return image, 1
+    # A pixel becomes of scale x scale whole ones: pixel centres stay exact.
+    size = (width // scale, height // scale)
+    whole = image[: size[1] * scale, : size[0] * scale]
+    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 
 
 def _around(board: Charuco, index: int, quad: Array) -> list[tuple[int, Array, float]]:

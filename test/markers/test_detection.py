@@ -154,7 +154,7 @@ def test_noise_shows_nothing() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
     marker_map = MarkerMap(
         wall("apriltag_36h11", 10, 10, 0.1, 0.1),
-        (Charuco(5, 7, 0.04, 0.03, family("5x5_100")),),
+        (Charuco(5, 7, 0.04, 0.03, family("5x5_100")), Chessboard(6, 4, 0.03)),
     )
     assert len(MarkerDetector(marker_map).detect(noise).ids) == 0
 
@@ -199,6 +199,24 @@ def test_chessboard_corners_are_where_they_were_rendered(
         errors = found.pixels - project(board.points, look(roll))
         assert np.abs(errors).max() < 0.12  # the squares are 25 px wide
         assert np.abs(errors.mean(axis=0)).max() < 0.02
+
+
+def test_large_images_are_searched_in_a_small_one(chessboard_cells: Any) -> None:
+    # 50 megapixels; squares of 300 px, the first inner corner between pixels 1299 and 1300.
+    image = np.full((6144, 8192), 200, np.uint8)
+    drawn = np.kron(chessboard_cells(7, 5), np.ones((300, 300)))
+    image[1000:2500, 1000:3100] = np.where(drawn > 0, 220, 30)
+    square = Marker.at("4x4_50", 5, SIZE)
+    cells = np.kron(pattern(square.family, 5), np.ones((100, 100)))
+    image[4000:4600, 7000:7600] = np.where(cells > 0, 220, 30)
+    detector = MarkerDetector(MarkerMap((square,), (Chessboard(6, 4, 0.03),)))
+    found = detector.detect(image)
+    assert found.ids.tolist() == list(range(4 + 24))
+    corners = [[7000, 4000], [7600, 4000], [7600, 4600], [7000, 4600]]
+    np.testing.assert_allclose(found.pixels[:4], np.array(corners) - 0.5, atol=0.05)
+    y, x = np.mgrid[:4, :6]
+    expected = np.stack([1300 + 300 * x, 1300 + 300 * y], axis=-1).reshape(-1, 2) - 0.5
+    np.testing.assert_allclose(found.pixels[4:], expected, atol=0.05)
 
 
 def test_order_of_a_symmetric_board_is_kept_through_a_full_turn(
