@@ -469,7 +469,7 @@ def setting(**values: object) -> Callable[[World], str]:
 def impossible(transition: int) -> Callable[[World], str]:
     def do(world: World) -> str:
         assert not world.change_state(transition)
-        return ""
+        return "success: false"
 
     return do
 
@@ -850,8 +850,8 @@ FAULTS = [
     Fault("no such parameter", setting(min_inlier=9), "undeclared"),
     Fault("one good, one bad", setting(min_inliers=20, solver="p4p"), "solver must be one of"),
     # Life cycle and services
-    Fault("activate twice", impossible(Transition.TRANSITION_ACTIVATE), ""),
-    Fault("transition 99", impossible(99), ""),
+    Fault("activate twice", impossible(Transition.TRANSITION_ACTIVATE), "false"),
+    Fault("transition 99", impossible(99), "false"),
     Fault("deactivated within a frame", deactivated, "inactive"),
     Fault("cleaned up within a frame", cleaned_up, "waiting for camera_info"),
     Fault("reset within a frame", reset, "the previous pose and twist are forgotten"),

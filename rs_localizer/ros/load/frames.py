@@ -80,21 +80,19 @@ class Frames:
         return round((seconds * 1_000_000_000 + nanoseconds - _FIRST_NS) * 1e-9 * self.rate)
 
 
-def simulated(points: int, outliers: float, rate: float, seed: int = 0) -> Frames:
-    """Frames of a camera that is moved by hand through a room."""
+def simulated(points: int, outliers: float, rate: float, different: int = _DIFFERENT) -> Frames:
+    """Frames of a camera that is moved by hand through a room, so many before it starts over."""
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     camera = Camera(640, 480, _K, _D, readout_time=READOUT_TIME)
-    world = room(sampled_way(motion).positions, np.random.default_rng(seed), count=20_000)
+    world = room(sampled_way(motion).positions, np.random.default_rng(0), count=20_000)
     start = motion.intervals_ns[0][0]
-    stamps = [start + round(k * 1e9 / rate) for k in range(_DIFFERENT)]
+    stamps = [start + round(k * 1e9 / rate) for k in range(different)]
     settings = FrameSettings(points=points, noise=0.7, outliers=outliers, rate=rate)
     infos, clouds = [], []
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "frames"
         with BagWriter(path) as bag:
-            for frame in simulate_frames(
-                camera, motion, world, settings, stamps_ns=stamps, seed=seed
-            ):
+            for frame in simulate_frames(camera, motion, world, settings, stamps_ns=stamps):
                 write_simulated(bag, camera, frame)
         with open_bag(path) as recording:
             topics = (CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC)
