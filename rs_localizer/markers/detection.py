@@ -5,6 +5,7 @@ The node and the offline command run this one class, so the same images give the
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +63,8 @@ class MarkerDetector:
 
     def __init__(self, marker_map: MarkerMap, min_side: float = 0.0) -> None:
         self.map = marker_map
+        # Spent so far: altogether, and in OpenCV's search for markers and chessboards.
+        self.seconds = self.opencv_seconds = 0.0
         self._min_side = min_side
         self._points = marker_map.points
         self._finders = _finders(marker_map)
@@ -101,17 +104,21 @@ class MarkerDetector:
         """
         if image.dtype != np.uint8 or image.ndim != 2 or 0 in image.shape:
             raise ValueError(f"an image must be (h,w) uint8, got {image.dtype} {image.shape}")
+        started = time.perf_counter()
         image = np.ascontiguousarray(image)
         seen = [self._seen(finder, image) for finder in self._finders]
         parts = [self._corners(item) for item in seen]
         boards = []
         for row, board in self._boards:
+            looking = time.perf_counter()
             rows, pixels = self._board(image, board, seen, stamp_ns)
+            if isinstance(board, Chessboard):
+                self.opencv_seconds += time.perf_counter() - looking
             if len(rows):
                 parts.append((row + rows, pixels, _spacings(pixels)))
                 boards.append((board.name, pixels))
         rows = np.concatenate([np.empty(0, np.int64), *(part[0] for part in parts)])
-        return Detections(
+        detections = Detections(
             ids=rows,
             points=self._points[rows],
             pixels=np.concatenate([np.empty((0, 2)), *(part[1] for part in parts)]),
@@ -128,10 +135,14 @@ class MarkerDetector:
                 f"{item.family.name} {i}" for item in seen for i in _twice(item.ids).tolist()
             ),
         )
+        self.seconds += time.perf_counter() - started
+        return detections
 
     def _seen(self, finder: MarkerFinder, image: Gray) -> Seen:
         family = finder.family
+        started = time.perf_counter()
         ids, quads = finder.find(image)
+        self.opencv_seconds += time.perf_counter() - started
         order = np.argsort(ids, kind="stable")  # OpenCV's threads may give any order
         ids, quads = ids[order], np.ascontiguousarray(quads[order])
         large = _sides(quads) >= self._min_side

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -152,8 +153,9 @@ def test_bag_of_markers(files: Any, tmp_path: Path, capsys: pytest.CaptureFixtur
     (tmp_path / "bag" / "parameters.yaml").write_text(
         "rs_localizer: {ros__parameters: {readout_time: 0.02}}"
     )
-    assert detect(files, str(tmp_path / "bag"), *files.map) == 0
+    assert detect(files, str(tmp_path / "bag"), *files.map, "--timing") == 0
     said = capsys.readouterr().out
+    assert re.search(r"time per image: [\d.]+ ms, of which OpenCV's search took [\d.]+ ms", said)
     assert "2 of 4 images, 8 corners each (median), within 0." in said
     assert "the first one because the data are truncated" in said
     first, second = clouds(files.out)
