@@ -13,6 +13,7 @@ from rs_localizer.ros.health import Health, Level
 _PERIOD = 1.0  # s
 # The same state for so many periods is worth a line in the log.
 _WORTH_A_LINE = 5
+_RARELY = 128
 
 
 class Diagnostics:
@@ -38,7 +39,8 @@ class Diagnostics:
         self._examine = examine
         self._notice = notice
         self._lack = lack
-        self._state, self._periods = "", 0
+        self._state: tuple[Level, str] | None = None
+        self._periods = 0
         # As diagnostic_updater in C++: with the namespace and without the first slash.
         self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {task}"
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 1)
@@ -63,9 +65,16 @@ class Diagnostics:
 
     def _tick(self) -> None:
         health = self.publish()
-        self._periods = self._periods + 1 if health.state == self._state else 1
-        self._state = health.state
-        # What is wrong with single frames has been logged with each of them.
-        waiting = health.state.startswith("waiting for") and health.level != Level.OK
-        if waiting and self._periods % _WORTH_A_LINE == 0:
-            self._notice(self._lack, health.message)
+        state = health.level, health.state
+        self._periods = self._periods + 1 if state == self._state else 1
+        self._state = state
+        if health.level != Level.OK and health.state != "inactive" and self._worth_a_line():
+            lacking = health.state.startswith("waiting for") or health.state == "lost"
+            self._notice(self._lack if lacking else health.state, health.message)
+
+    def _worth_a_line(self) -> bool:
+        """After 5, 10, 20, 40, ... periods in the same state, then every ten minutes."""
+        times, rest = divmod(self._periods, _WORTH_A_LINE)
+        if rest:
+            return False
+        return times.bit_count() == 1 if times < _RARELY else times % _RARELY == 0
