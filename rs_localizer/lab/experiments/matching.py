@@ -19,6 +19,7 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps import Map
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.lab.experiments.matching_scores import scores_claim
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
 from rs_localizer.lab.landmarks import keypoint_rows, random_descriptors
 from rs_localizer.lab.scene import room
@@ -100,7 +101,11 @@ def run(context: Context) -> Result:
         "them wrong; binary descriptors of 32 bytes in which a tenth of the bits differ from the "
         "map's. Times are medians from the message to the pose, matched and localized, on a "
         "machine that may have other things to do: of the clock, and of the CPU in all threads.",
-        [*(_fast_enough(r) for r in runs if np.isfinite(r.at_least)), *_recognized(runs)],
+        [
+            *(_fast_enough(run) for run in runs if np.isfinite(run.at_least)),
+            *_recognized(runs),
+            scores_claim(context, camera, motion, stamps, points),
+        ],
         {"matching": Table(_COLUMNS, [_row(run) for run in runs])},
         notes=[_text(runs)],
     )

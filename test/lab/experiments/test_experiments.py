@@ -78,6 +78,7 @@ HELD = {
     "augmented-reality.cube",
     "matching.localized",
     "matching.alike",
+    "matching.scores",
 }
 NOT_HELD = {
     "motion.r9p_ahead_noisy",
