@@ -17,9 +17,10 @@ from rs_localizer.frames import Refusal
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_compressed_image, read_image
 from rs_localizer.io.messages import Make, MessageError
-from rs_localizer.markers.consistency import MapCheck
 from rs_localizer.markers.detection import Detections, MarkerDetector
-from rs_localizer.markers.maps import MarkerMap, MarkerMapError, read_marker_map
+from rs_localizer.markers.map_check import MapCheck
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 
 # Single precision is what RViz shows: 3e-5 px at the rim of an image.
 ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "u", "v", "score")] + [("id", "<u4")])

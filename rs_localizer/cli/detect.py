@@ -32,8 +32,10 @@ from rs_localizer.io.bags import STORAGES, open_bag
 from rs_localizer.io.calibration import read_calibration
 from rs_localizer.lab.recording import PARAMETERS, write_parameters
 from rs_localizer.marker_frames import FrameDetector
-from rs_localizer.markers.maps import MarkerMap, read_marker_map
-from rs_localizer.markers.prints import Chessboard, Pose
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Chessboard
 from rs_localizer.settings import settings
 
 _BAG_SUFFIXES = (".mcap", ".db3", ".bag")

@@ -11,9 +11,12 @@ from rs_localizer.arguments import integer, number
 from rs_localizer.cli import UsageError
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import FAMILIES, family
-from rs_localizer.markers.maps import MarkerMap, read_marker_map, wall, write_marker_map
-from rs_localizer.markers.printing import PAGES, plan, write_pages
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, Pose
+from rs_localizer.markers.map_files import read_marker_map, write_marker_map
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.markers.pages import write_pages
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.printing import PAGES, plan
+from rs_localizer.markers.prints import Board, Charuco, Chessboard
 
 # Six markers that fill a page of A4 or letter.
 _FAMILY, _GRID, _SIZE, _GAP = "4x4_50", "2x3", 0.06, 0.02

@@ -39,7 +39,7 @@ from rs_localizer.lab.scene import room
 from rs_localizer.lab.simulation import FrameSettings, simulate_frames
 from rs_localizer.lab.true_motion import TrueMotion, sampled_way
 from rs_localizer.lab.walls import SCENES
-from rs_localizer.markers.maps import write_marker_map
+from rs_localizer.markers.map_files import write_marker_map
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")

@@ -39,7 +39,7 @@ from rs_localizer.lab.recording import (
     TRUE_TWIST_TOPIC,
 )
 from rs_localizer.lab.simulation import middle_stamp
-from rs_localizer.markers.maps import read_marker_map
+from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import build, load_params_file
 
 _LEAST_MARKERS = 3

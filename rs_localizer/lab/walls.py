@@ -13,7 +13,8 @@ from rs_localizer.lab.true_motion import TrueState
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.prints import Marker, Pose
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Marker
 
 _FAMILY = "4x4_250"  # few cells: the largest that a far or slanted marker can show
 # Texels along a cell of a marker: corners lie between texels, so that nothing is rounded.

@@ -20,7 +20,8 @@ from rs_localizer.core.so3 import Array
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.dictionaries import Gray
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import Chessboard, Pose
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Chessboard
 
 Picture = NDArray[np.uint8]
 

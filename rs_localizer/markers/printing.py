@@ -1,11 +1,6 @@
-"""Pages to print, true to scale, of markers and boards."""
+"""Markers and boards laid out on pages to print, true to scale."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,44 +8,15 @@ from numpy.typing import NDArray
 from rs_localizer.core.so3 import Array
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.pages import MARGIN, Figure, Page, PrintError
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
 
 # Upright, in mm.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-_MARGIN = 10.0  # mm: printers leave about 5 white
 _TEXT_HEIGHT = 12.0  # mm, at the foot of a page
-_BAR = 100.0  # mm, to be measured
 _MM = 1000.0  # in a metre
-_INCH = 25.4  # mm
-_FONT = 7.0  # pt
 # Prints lie in one plane and face the same way to within this.
 _FLAT = 1e-6
-_PNG_DPI = 300
-
-
-class PrintError(ValueError):
-    """Something that cannot be printed; the message says why."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Figure:
-    """Something on a page: black rectangles, and what it needs around them."""
-
-    black: Array  # (n,4) mm: left, bottom, width, height, from its lower left corner
-    width: float  # mm, with the white rim
-    height: float
-    rim: float  # mm, white, inside the width and height
-    label: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Page:
-    """Figures by their lower left corners in mm."""
-
-    width: float
-    height: float
-    figures: tuple[tuple[float, float, _Figure], ...]
-    note: str
 
 
 def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
@@ -71,35 +37,11 @@ def plan(marker_map: MarkerMap, page: str = "a4") -> list[Page]:
     return pages
 
 
-def write_pages(pages: Sequence[Page], path: Path) -> list[Path]:
-    """Write a PDF, or a PNG for each page (by the path's ending); the files.
-
-    Raises:
-        PrintError: for another ending.
-        OSError: when a file cannot be written.
-    """
-    count = len(pages)
-    figures = [_draw(page, f"page {k + 1} of {count}") for k, page in enumerate(pages)]
-    if path.suffix == ".pdf":
-        from matplotlib.backends.backend_pdf import PdfPages
-
-        with PdfPages(path) as file:
-            for figure in figures:
-                file.savefig(figure)
-        return [path]
-    if path.suffix != ".png":
-        raise PrintError(f"{path} must end in .pdf or .png")
-    names = [path] if count == 1 else [path.with_stem(f"{path.stem}_{k + 1}") for k in range(count)]
-    for figure, name in zip(figures, names, strict=True):
-        figure.savefig(name, dpi=_PNG_DPI)
-    return names
-
-
 # -- layout -------------------------------------------------------------------------------------
 
 
 def _room(size: tuple[float, float]) -> tuple[float, float]:
-    return size[0] - 2 * _MARGIN, size[1] - 2 * _MARGIN - _TEXT_HEIGHT
+    return size[0] - 2 * MARGIN, size[1] - 2 * MARGIN - _TEXT_HEIGHT
 
 
 def _turned(size: tuple[float, float], width: float, height: float) -> tuple[float, float] | None:
@@ -177,29 +119,29 @@ def _apart(markers: tuple[Marker, ...], size: tuple[float, float], page: str) ->
 
 def _middle(
     way: tuple[float, float],
-    figures: list[tuple[float, float, _Figure]],
+    figures: list[tuple[float, float, Figure]],
     width: float,
     height: float,
     note: str,
 ) -> Page:
     room = _room(way)
-    x = _MARGIN + 0.5 * (room[0] - width)
-    y = _MARGIN + _TEXT_HEIGHT + 0.5 * (room[1] - height)
+    x = MARGIN + 0.5 * (room[0] - width)
+    y = MARGIN + _TEXT_HEIGHT + 0.5 * (room[1] - height)
     return Page(*way, tuple((x + a, y + b, figure) for a, b, figure in figures), note)
 
 
 # -- figures ------------------------------------------------------------------------------------
 
 
-def _marker_figure(marker: Marker) -> _Figure:
+def _marker_figure(marker: Marker) -> Figure:
     cell = marker.size * _MM / marker.family.cells
     black = _rectangles(pattern(marker.family, marker.id), cell) + np.array([cell, cell, 0.0, 0.0])
     side = cell * (marker.family.cells + 2)
     label = f"{marker.family.name}  id {marker.id}  {marker.size * _MM:g} mm"
-    return _Figure(black, side, side, cell, label)
+    return Figure(black, side, side, cell, label)
 
 
-def _board_figure(board: Board) -> _Figure:
+def _board_figure(board: Board) -> Figure:
     square = board.square * _MM
     if isinstance(board, Chessboard):
         columns, rows = board.columns + 1, board.rows + 1
@@ -219,7 +161,7 @@ def _board_figure(board: Board) -> _Figure:
             inside = _rectangles(pattern(board.family, board.first_id + index), cell)
             x, y = column * square + rim, (rows - 1 - row) * square + rim
             black.append(inside + np.array([x, y, 0.0, 0.0]))
-    return _Figure(np.concatenate(black), columns * square, rows * square, 0.0, label)
+    return Figure(np.concatenate(black), columns * square, rows * square, 0.0, label)
 
 
 def _white_cells(board: Board, columns: int, rows: int) -> list[tuple[int, int]]:
@@ -237,58 +179,3 @@ def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:
         for start, end in edges.reshape(-1, 2).tolist():
             found.append([start * cell, (rows - 1 - row) * cell, (end - start) * cell, cell])
     return np.array(found, np.float64).reshape(-1, 4)
-
-
-# -- drawing ------------------------------------------------------------------------------------
-
-
-def _draw(page: Page, number: str) -> Any:
-    from matplotlib.figure import Figure
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path as Outline
-
-    figure = Figure(figsize=(page.width / _INCH, page.height / _INCH))
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, page.width), ylim=(0.0, page.height))
-    axes.set_axis_off()
-    vertices, codes = [], []
-    for x, y, item in page.figures:
-        for left, bottom, width, height in item.black + np.array([x, y, 0.0, 0.0]):
-            right, top = left + width, bottom + height
-            corners = [(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)]
-            vertices += corners
-            codes += [Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY]
-        if item.rim > 0.0:
-            _add_rim(axes, x, y, item)
-    # One path: between several, a viewer would show hairlines. Snapped to pixels, sizes are wrong.
-    axes.add_patch(
-        PathPatch(Outline(vertices, codes), facecolor="black", edgecolor="none", snap=False)
-    )
-    _foot(axes, page, number)
-    return figure
-
-
-def _add_rim(axes: Any, x: float, y: float, item: _Figure) -> None:
-    """Where to cut, and which marker it is."""
-    from matplotlib.patches import Rectangle
-
-    axes.add_patch(
-        Rectangle((x, y), item.width, item.height, fill=False, edgecolor="0.8", linewidth=0.25)
-    )
-    # At the edge of the white rim, where it is far from the marker.
-    small = {"fontsize": 0.5 * _FONT, "color": "0.5"}
-    axes.text(x + 1.0, y + 0.8, item.label, va="bottom", **small)
-    right, top = x + item.width - 1.0, y + item.height - 0.8
-    axes.text(right, top, "top", ha="right", va="top", **small)
-
-
-def _foot(axes: Any, page: Page, number: str) -> None:
-    y = _MARGIN
-    axes.plot([_MARGIN, _MARGIN + _BAR], [y, y], color="black", linewidth=0.5)
-    for k in range(11):
-        x = _MARGIN + 0.1 * _BAR * k
-        axes.plot([x, x], [y, y + (2.0 if k % 5 else 3.0)], color="black", linewidth=0.5)
-    told = f"print at 100 % (actual size): this bar is {_BAR:.0f} mm long"
-    axes.text(_MARGIN, y + 4.0, told, fontsize=_FONT)
-    right = "; ".join(text for text in (page.note, number) if text)
-    axes.text(page.width - _MARGIN, y, right, fontsize=0.8 * _FONT, ha="right")

@@ -15,7 +15,7 @@ from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.marker_frames import Detected
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.overlay import CameraPath, Picture, draw_detections, draw_world
-from rs_localizer.markers.prints import rotation_of_quaternion
+from rs_localizer.markers.poses import rotation_of_quaternion
 
 # Images that wait for a pose; those without one are shown without cubes.
 _WAITING = 3

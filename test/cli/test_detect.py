@@ -21,7 +21,8 @@ from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.lab.recording import make_camera_info
 from rs_localizer.marker_frames import FrameDetector, correspondences
 from rs_localizer.markers.dictionaries import pattern
-from rs_localizer.markers.maps import MarkerMap, wall, write_marker_map
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.settings import build, load_params_file
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.cli.main import main
-from rs_localizer.markers.maps import read_marker_map
+from rs_localizer.markers.map_files import read_marker_map
 
 
 def make(out: Path, *words: str) -> int:

@@ -15,7 +15,7 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.markers.maps import read_marker_map
+from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import load_params_file
 
 TURN = ("--angular-velocity", "0.4", "0.8", "-0.5", "--linear-velocity", "1", "0.5", "0")

@@ -12,7 +12,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.lab.animation import gif, side_by_side
 from rs_localizer.lab.cube import corner_pixels, cube_on, draw_cube
-from rs_localizer.markers.prints import Marker, Pose
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Marker
 
 CAMERA = Camera(
     640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),

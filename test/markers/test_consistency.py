@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.markers.consistency import MapCheck, problems
+from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.families import family
+from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker
 
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z of the print along -y of the map
 SIDEWAYS = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # z of the print along x of the map

@@ -13,7 +13,8 @@ from rs_localizer.markers.dictionaries import DictionaryError, pattern
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.prints import Charuco, Chessboard, Marker, Pose
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker
 
 SIZE = 0.1
 

@@ -27,7 +27,8 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.lab.recording import make_camera_info
 from rs_localizer.marker_frames import FrameDetector, correspondences
 from rs_localizer.markers.dictionaries import pattern
-from rs_localizer.markers.maps import MarkerMap, wall, write_marker_map
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.ros.conversion import copy_message, make_message
 
 RUN = "import sys; from rs_localizer.ros.main import marker_detector; sys.exit(marker_detector())"

@@ -24,7 +24,8 @@ from rs_localizer.io.messages import MessageError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum
 from rs_localizer.lab.fuzzing import seeds
 from rs_localizer.lab.fuzzing.mutations import damaged, damaged_message
-from rs_localizer.markers.maps import MarkerMapError, read_marker_map
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMapError
 from rs_localizer.settings import build, load_params_file, parse_assignment
 
 _PARAMS = b"""

@@ -1,0 +1,232 @@
+"""Files of marker maps: YAML, for instance
+
+    map_frame: map                 # frame of all that follows; lengths in metres
+    markers:
+      - family: 4x4_50             # or any name of rs_localizer.markers.families
+        id: 3
+        size: 0.16                 # side of the black square
+        position: [0.0, 0.0, 1.5]  # of its middle
+        quaternion: [0.5, 0.5, 0.5, 0.5]  # x y z w; or rotation: three rows of a matrix
+      - family: apriltag_36h11
+        id: 0
+        corners: [[0, 1, 2], [0, 1.2, 2], [0, 1.2, 1.8], [0, 1, 1.8]]
+    boards:
+      - type: chessboard
+        columns: 6                 # inner corners
+        rows: 4
+        square: 0.03
+        position: [0.0, 0.0, 0.0]
+        quaternion: [0.0, 0.0, 0.0, 1.0]
+      - type: charuco
+        columns: 5                 # squares
+        rows: 7
+        square: 0.04
+        marker: 0.03
+        family: 5x5_100
+        first_id: 0                # optional
+        legacy: false              # optional: drawn by OpenCV before 4.6
+        position: [1.0, 0.0, 0.0]
+        quaternion: [0.0, 0.0, 0.0, 1.0]
+
+A pose is that of the print's frame: origin in its middle, x to the right, y up, z toward the
+viewer (the identity is a print that lies on the floor of a map whose z points up). Corners go from
+the top left one clockwise, as seen from the front.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rs_localizer.core import so3
+from rs_localizer.core.so3 import Array
+from rs_localizer.markers.families import family
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.poses import rotation_of_quaternion as _rotation
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
+
+# A pose stands for corners that it gives to within this share of a side.
+_SAME = 1e-9
+# Of a size that is given beside the corners.
+_SIZE_TOLERANCE = 0.05
+
+
+def read_marker_map(path: Path | str) -> MarkerMap:
+    """Read a map file (see the module).
+
+    Raises:
+        MarkerMapError: for anything that cannot be used, saying where and what was found.
+    """
+    path = Path(path)
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise MarkerMapError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
+    try:
+        return _map(tree)
+    except ValueError as error:
+        raise MarkerMapError(f"{path}: {error}") from error
+
+
+def _map(tree: Any) -> MarkerMap:
+    entry = _Entry(tree, "the map")
+    markers = [_marker(item) for item in entry.entries("markers", "marker")]
+    boards = [_board(item) for item in entry.entries("boards", "board")]
+    frame = entry.take("map_frame", str)
+    entry.finish()
+    return MarkerMap(tuple(markers), tuple(boards), frame)
+
+
+class _EntryError(ValueError):
+    """Says already which entry it is about."""
+
+
+class _Entry:
+    """A mapping of the file whose keys are taken one after the other; the rest is unknown."""
+
+    def __init__(self, tree: Any, where: str) -> None:
+        self.where = where
+        if not isinstance(tree, dict):
+            raise _EntryError(f"{where} must be a mapping, found {tree!r}")
+        self._left = dict(tree)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._left
+
+    def take(self, name: str, kind: type | tuple[type, ...], *default: Any) -> Any:
+        if name not in self._left and default:
+            return default[0]
+        if name not in self._left:
+            found = ", ".join(map(str, self._left)) or "nothing else"
+            raise _EntryError(f"{self.where} has no {name}; it has {found}")
+        value = self._left.pop(name)
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise _EntryError(f"{self.where}: {name} cannot be {value!r}")
+        return value
+
+    def number(self, name: str) -> float:
+        return float(self.take(name, (int, float)))
+
+    def entries(self, name: str, one: str) -> list[_Entry]:
+        listed = self.take(name, (list, type(None)), None) or []
+        return [_Entry(item, f"{one} {index + 1}") for index, item in enumerate(listed)]
+
+    def finish(self) -> None:
+        if self._left:
+            raise _EntryError(f"{self.where} has the unknown {', '.join(map(str, self._left))}")
+
+    @contextlib.contextmanager
+    def named(self) -> Iterator[None]:
+        """Faults within are about this entry."""
+        try:
+            yield
+        except _EntryError:
+            raise
+        except ValueError as error:
+            raise _EntryError(f"{self.where}: {error}") from error
+
+
+def _marker(entry: _Entry) -> Marker:
+    name, number = entry.take("family", str), entry.take("id", int)
+    entry.where += f" ({name} {number})"
+    if "corners" not in entry:
+        size, pose = entry.number("size"), _pose(entry)
+        entry.finish()
+        with entry.named():
+            return Marker.at(name, number, size, pose)
+    corners = entry.take("corners", list)
+    told = entry.number("size") if "size" in entry else None
+    entry.finish()
+    with entry.named():
+        marker = Marker(family(name), number, corners)
+        if told is not None and abs(marker.size - told) > _SIZE_TOLERANCE * abs(told):
+            raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {told:g}")
+        return marker
+
+
+def _board(entry: _Entry) -> Board:
+    kind = entry.take("type", str)
+    entry.where += f" ({kind})"
+    columns, rows = entry.take("columns", int), entry.take("rows", int)
+    square, pose = entry.number("square"), _pose(entry)
+    if kind == "chessboard":
+        entry.finish()
+        with entry.named():
+            return Chessboard(columns, rows, square, pose)
+    if kind != "charuco":
+        raise _EntryError(f"{entry.where}: type must be chessboard or charuco")
+    marker, name = entry.number("marker"), entry.take("family", str)
+    first_id, legacy = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
+    entry.finish()
+    with entry.named():
+        return Charuco(columns, rows, square, marker, family(name), first_id, legacy, pose)
+
+
+def _pose(entry: _Entry) -> Pose:
+    position = entry.take("position", list)
+    with entry.named():
+        if "rotation" not in entry:
+            return Pose(position, _rotation(entry.take("quaternion", list)))
+        if "quaternion" in entry:
+            raise ValueError("there are both a rotation and a quaternion")
+        return Pose(position, entry.take("rotation", list))
+
+
+def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
+    """Write a map file that :func:`read_marker_map` reads."""
+    tree: dict[str, Any] = {"map_frame": marker_map.map_frame}
+    if marker_map.markers:
+        tree["markers"] = [_marker_entry(marker) for marker in marker_map.markers]
+    if marker_map.boards:
+        tree["boards"] = [_board_entry(board) for board in marker_map.boards]
+    text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100)
+    Path(path).write_text(text, encoding="utf-8")
+
+
+def _marker_entry(marker: Marker) -> dict[str, Any]:
+    entry: dict[str, Any] = {"family": marker.family.name, "id": marker.id}
+    square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
+    if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
+        return entry | {"corners": _numbers(marker.corners)}
+    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose)
+
+
+def _board_entry(board: Board) -> dict[str, Any]:
+    sizes = {"columns": board.columns, "rows": board.rows, "square": float(board.square)}
+    if isinstance(board, Chessboard):
+        return {"type": "chessboard"} | sizes | _pose_entry(board.pose)
+    return (
+        {"type": "charuco"}
+        | sizes
+        | {
+            "marker": float(board.marker),
+            "family": board.family.name,
+            "first_id": board.first_id,
+            "legacy": board.legacy,
+        }
+        | _pose_entry(board.pose)
+    )
+
+
+def _pose_entry(pose: Pose) -> dict[str, Any]:
+    quaternion = so3.quaternion(np.ascontiguousarray(pose.rotation))
+    return {"position": _numbers(pose.position), "quaternion": _numbers(quaternion)}
+
+
+def _numbers(values: Array) -> Any:
+    if values.ndim > 1:
+        return [_numbers(row) for row in values]
+    return [_rounded(value) for value in values]
+
+
+def _rounded(value: float) -> float:
+    """Without the rounding errors of a fitted pose: 0.16 and not 0.16000000000000003."""
+    return round(float(value), 12) + 0.0
