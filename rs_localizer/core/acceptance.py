@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.jit import kernel
 from rs_localizer.core.posterior import Posterior
 from rs_localizer.core.ransac import Observations
 from rs_localizer.core.so3 import Array
@@ -99,7 +98,7 @@ def refusal(
     return None
 
 
-@kernel
 def _median(values: Array, chosen: BoolArray) -> float:
-    median: float = np.median(values[chosen])
-    return median
+    of = values[chosen]
+    middle = len(of) // 2
+    return float(np.partition(of, middle)[middle])

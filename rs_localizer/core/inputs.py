@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.jit import kernel
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray
 
@@ -39,11 +38,11 @@ def checked(
     return points, pixels, scores
 
 
-@kernel
 def median_point(points: Array, chosen: BoolArray) -> Array:
     """Median (3,) of each coordinate over some of the points (n,3); zero if there are none."""
-    median = np.zeros(3)
-    if np.any(chosen):
-        for k in range(3):
-            median[k] = np.median(points[:, k][chosen])
+    of = points[chosen]
+    if len(of) == 0:
+        return np.zeros(3)
+    middle = len(of) // 2
+    median: Array = np.partition(of, middle, axis=0)[middle]  # np.median takes three times as long
     return median

@@ -208,7 +208,9 @@ def weigh_against_rest(
     # As seen from the moving estimate: rest lies one step away, the average a part of it.
     step = step_between(posterior.state, state)
     covariance = moving * posterior.covariance + moving * resting * np.outer(step, step)
-    covariance[:6, :6] += resting * posterior.variance * invert_information(information[:6, :6])[0]
+    covariance[:6, :6] += resting * posterior.variance * invert_information(
+        np.ascontiguousarray(information[:6, :6])
+    )[0]
     covariance[_VELOCITIES, _VELOCITIES] += resting * spread
     average = apply_step(posterior.state, resting * step)
     return replace(

@@ -214,14 +214,46 @@ def add_prior(
                 for j in range(6, 12):
                     information[i, j] += weight * prior[i, j]
             continue
-        jacobian = np.eye(12)
-        jacobian[0:3, 0:3] = by_turn
-        jacobian[3:6, 3:6] = by_move
-        information += weight * (jacobian.T @ prior @ jacobian)
-        slope += jacobian.T @ pulled
+        _add_posed(prior, pulled, by_turn, by_move, weight, information, slope)
     if gravity[6] > 0.0:
         cost += _add_gravity(gravity, state, weight, information, slope)
     return cost
+
+
+@kernel
+def _add_posed(
+    prior: Array,
+    pulled: Array,
+    by_turn: Array,
+    by_move: Array,
+    weight: float,
+    information: Array,
+    slope: Array,
+) -> None:
+    """Add J^T P J and J^T p, where J is the identity but for the blocks of turn and move."""
+    half = prior.copy()  # P J
+    for i in range(12):
+        for j in range(3):
+            turned, moved = 0.0, 0.0
+            for k in range(3):
+                turned += prior[i, k] * by_turn[k, j]
+                moved += prior[i, 3 + k] * by_move[k, j]
+            half[i, j], half[i, 3 + j] = turned, moved
+    for i in range(3):
+        for j in range(12):
+            turned, moved = 0.0, 0.0
+            for k in range(3):
+                turned += by_turn[k, i] * half[k, j]
+                moved += by_move[k, i] * half[3 + k, j]
+            information[i, j] += weight * turned
+            information[3 + i, j] += weight * moved
+            information[6 + i, j] += weight * half[6 + i, j]
+            information[9 + i, j] += weight * half[9 + i, j]
+        for k in range(3):
+            slope[i] += by_turn[k, i] * pulled[k]
+            slope[3 + i] += by_move[k, i] * pulled[3 + k]
+        slope[6 + i] += pulled[6 + i]
+        slope[9 + i] += pulled[9 + i]
 
 
 @kernel

@@ -220,17 +220,27 @@ def invert_information(information: Array) -> tuple[Array, float]:
     finite, the inverse is NaN.
     """
     size = len(information)
-    nothing = np.full((size, size), np.nan)
-    diagonal = np.diag(information)
-    if not np.all(np.isfinite(information)) or not np.all(diagonal > 0.0):
-        return nothing, 0.0
-    scale = 1.0 / np.sqrt(diagonal)
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    smallest = values[0]
-    if not smallest > 0.0:
-        return nothing, smallest
-    half = np.empty((size, size))
+    inverse = np.empty((size, size))
+    inverse[:] = np.nan
+    scale = np.empty(size)
+    scaled = np.empty((size, size))
+    for i in range(size):
+        if not information[i, i] > 0.0:
+            return inverse, 0.0
+        scale[i] = 1.0 / np.sqrt(information[i, i])
     for i in range(size):
         for j in range(size):
-            half[i, j] = scale[i] * vectors[i, j] / np.sqrt(values[j])
-    return half @ half.T, smallest
+            scaled[i, j] = information[i, j] * scale[i] * scale[j]
+            if not np.isfinite(scaled[i, j]):
+                return inverse, 0.0
+    values, vectors = np.linalg.eigh(scaled)
+    smallest = values[0]
+    if not smallest > 0.0:
+        return inverse, smallest
+    for i in range(size):
+        for j in range(size):
+            total = 0.0
+            for k in range(size):
+                total += vectors[i, k] * vectors[j, k] / values[k]
+            inverse[i, j] = scale[i] * scale[j] * total
+    return inverse, smallest

@@ -41,7 +41,8 @@ def best_models(
     no model takes have infinite cost.
     """
     states = np.zeros((keep, STATE_SIZE))
-    costs = np.full(keep, np.inf)
+    costs = np.empty(keep)
+    costs[:] = np.inf
     solutions, _, count = models.shape
     for h in range(count):
         for s in range(solutions):
