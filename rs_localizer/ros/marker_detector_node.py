@@ -13,25 +13,21 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-import cv2
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from rs_localizer.config import DetectorConfig, ImageTransport
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.messages import MessageError, make_header
-from rs_localizer.marker_frames import Detected, FrameDetector, correspondences
-from rs_localizer.markers.overlay import Picture
+from rs_localizer.io.messages import MessageError
+from rs_localizer.marker_frames import Detected, FrameDetector
 from rs_localizer.ros import parameters
-from rs_localizer.ros.conversion import make_message
 from rs_localizer.ros.detector_debug import DebugPictures
 from rs_localizer.ros.detector_health import Condition, Sight, diagnose
+from rs_localizer.ros.detector_outputs import DetectorOutputs
 from rs_localizer.ros.diagnostics import Diagnostics
 from rs_localizer.ros.health import Health
 from rs_localizer.ros.inputs import Inputs, Topic
@@ -43,10 +39,8 @@ from rs_localizer.settings import DETECTOR_NAME, NODE_NAME
 
 RAW, COMPRESSED = "image", "image/compressed"
 _IMAGES = {RAW: Image, COMPRESSED: CompressedImage}
-_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
 # How often the node looks whether somebody listens, in s.
 _LOOK_PERIOD = 0.2
-_JPEG_QUALITY = 85
 
 
 class DetectorStatistics(Statistics):
@@ -98,9 +92,7 @@ class MarkerDetectorNode(RobustLifecycleNode):
         )
         # From configuring to cleaning up.
         self._worker: Worker | None = None
-        self._clouds: Any = None
-        self._pictures: Any = None
-        self._jpegs: Any = None
+        self._outputs: DetectorOutputs | None = None
         self._work: _Work | None = None
         # From activating to deactivating; inputs only while somebody listens.
         self._timer: Timer | None = None
@@ -124,10 +116,9 @@ class MarkerDetectorNode(RobustLifecycleNode):
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
-        self._clouds = self._publisher(PointCloud2, "correspondences")
-        self._pictures = self._publisher(Image, "~/debug_image")
-        self._jpegs = self._publisher(CompressedImage, "~/debug_image/compressed")
-        self._work = _Work(detector, config, DebugPictures(self._show, self.refusals.notice))
+        self._outputs = DetectorOutputs(self)
+        debug = DebugPictures(self._outputs.show, self.refusals.notice)
+        self._work = _Work(detector, config, debug)
         self._worker = Worker(
             self._work,
             self._publish,
@@ -144,7 +135,7 @@ class MarkerDetectorNode(RobustLifecycleNode):
         self.get_logger().info(
             f"active with {len(found.markers)} markers and {len(found.boards)} boards in "
             f"{found.map_frame}; listening to images while somebody listens to "
-            f"{self._clouds.topic_name} or {self._pictures.topic_name}"
+            f"{' or '.join(self._outputs.topics)}"
         )
         return super().on_activate(state)
 
@@ -178,18 +169,9 @@ class MarkerDetectorNode(RobustLifecycleNode):
         if self._worker is not None:
             self._worker.close()
             self._worker = self._work = None
-        for publisher in (self._clouds, self._pictures, self._jpegs):
-            if publisher is not None:
-                self.destroy_lifecycle_publisher(publisher)
-        self._clouds = self._pictures = self._jpegs = None
-
-    def _publisher(self, kind: type, topic: str) -> Any:
-        return self.create_lifecycle_publisher(
-            kind,
-            topic,
-            QoSProfile(**_QOS),  # a new one each: overrides are written into it
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        if self._outputs is not None:
+            self._outputs.close()
+            self._outputs = None
 
     # -- settings ---------------------------------------------------------------------------
 
@@ -210,16 +192,12 @@ class MarkerDetectorNode(RobustLifecycleNode):
 
     def _look(self) -> None:
         """Listen to what is needed just now."""
-        debug = self._debug_wanted()
-        if not debug and self._clouds.get_subscription_count() == 0:
+        debug = self._outputs.pictures_wanted()
+        if not debug and not self._outputs.clouds_wanted():
             self._listen(())
             return
         others = ("camera_info", f"{NODE_NAME}/pose", f"{NODE_NAME}/odometry") if debug else ()
         self._listen((*others, self._image_topic()))
-
-    def _debug_wanted(self) -> bool:
-        publishers = (self._pictures, self._jpegs)
-        return any(p is not None and p.get_subscription_count() > 0 for p in publishers)
 
     def _image_topic(self) -> str:
         """The topic of the images; where none has a publisher, the one so far."""
@@ -285,38 +263,9 @@ class MarkerDetectorNode(RobustLifecycleNode):
     # -- in the worker's thread --------------------------------------------------------------
 
     def _publish(self, detected: Detected) -> None:
-        if self._clouds.get_subscription_count():
-            self._clouds.publish(correspondences(detected, make_message))
-        if self._debug_wanted():
+        self._outputs.publish(detected)
+        if self._outputs.pictures_wanted():
             self._work.debug.add(detected, self._work.detector.map, self._work.config)
-
-    def _show(self, detected: Detected, picture: Picture) -> None:
-        """Publish a debug picture."""
-        header = make_header(make_message, detected.image.stamp_ns, detected.image.frame)
-        height, width, _ = picture.shape
-        if self._pictures.get_subscription_count():
-            self._pictures.publish(
-                make_message(
-                    "sensor_msgs/msg/Image",
-                    header=header,
-                    height=height,
-                    width=width,
-                    encoding="bgr8",
-                    is_bigendian=0,
-                    step=3 * width,
-                    data=picture.ravel(),
-                )
-            )
-        if self._jpegs.get_subscription_count():
-            _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-            self._jpegs.publish(
-                make_message(
-                    "sensor_msgs/msg/CompressedImage",
-                    header=header,
-                    format="bgr8; jpeg compressed bgr8",
-                    data=jpeg.ravel(),
-                )
-            )
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text)
