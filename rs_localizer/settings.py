@@ -12,9 +12,8 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-import yaml
-
 from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.io.yaml_text import YamlError, load_yaml
 
 NODE_NAME = "rs_localizer"
 DETECTOR_NAME = "marker_detector"
@@ -107,10 +106,10 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
             without parameters for the node.
     """
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        tree = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise SettingsError(f"{path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (YamlError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
     values: dict[str, Any] = {}
     node = _NODES[kind]
@@ -134,8 +133,8 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     if not separator or not name:
         raise SettingsError(f"expected name:=value, got {text!r}")
     try:
-        return name, _checked(name, yaml.safe_load(value), text, NodeConfig)
-    except yaml.YAMLError as error:
+        return name, _checked(name, load_yaml(value), text, NodeConfig)
+    except YamlError as error:
         raise SettingsError(f"the value of {text!r} cannot be read") from error
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rs_localizer.core.camera import Camera
+from rs_localizer.io.yaml_text import YamlError, load_yaml
 
 
 class CalibrationError(ValueError):
@@ -25,10 +25,10 @@ def read_calibration(path: Path | str) -> Camera:
     """
     path = Path(path)
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        tree = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (YamlError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
     keys = set(tree) if isinstance(tree, dict) else set()
     for key, reader in (("camera_matrix", _ros), ("pinhole", _boofcv)):

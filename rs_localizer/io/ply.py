@@ -76,6 +76,8 @@ def read_vertices(path: Path) -> NDArray[Any]:
         order, elements = _header(file)
         for element in elements:
             if element.name == "vertex":
+                if not element.properties:
+                    raise PlyError("the vertices have no properties")
                 table = (_binary if order else _ascii)(file, element, order, size - file.tell())
                 return table[[item.name for item in element.properties]]
             _skip(file, element, order, size - file.tell())

@@ -321,7 +321,7 @@ LIST = XYZ + "property list uint float descriptor\n"
         (ply("9" * 4000, XYZ), "truncated: 99999999999999999999 x vertex"),
         (ply("-1", XYZ), "not understood at 'element vertex -1'"),
         (ply("1", XYZ, bytes(11)), "truncated"),
-        (ply("5", ""), "truncated: 5 x vertex"),
+        (ply("5", ""), "the vertices have no properties"),
         (ply("1", "property float x\n" * 3, bytes(12)), "make no table"),
         (ply("1", XYZ[:-17], bytes(8)), "no property z; found x, y"),
         (ply("0", XYZ), "no landmarks"),

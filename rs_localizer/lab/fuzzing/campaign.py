@@ -36,6 +36,7 @@ class Report:
     failures: list[Failure] = field(default_factory=list)
     slowest: tuple[float, str, int] = (0.0, "", 0)  # s, target, number
     peak_mb: float = 0.0  # that the process grew by
+    largest: tuple[float, str, int] = (0.0, "", 0)  # MB that one input added to it
 
     @property
     def executions(self) -> int:
@@ -48,10 +49,11 @@ class Report:
             listed = ", ".join(f"{name} {count}" for name, count in counts.most_common())
             lines.append(f"{target:18} {sum(counts.values()):9d}  {listed}")
         seconds, target, number = self.slowest
+        grown, greedy, at = self.largest
         lines.append(
             f"{self.executions} executions, {len(self.failures)} failures; the process grew by "
-            f"{self.peak_mb:.0f} MB at most, the slowest took {1e3 * seconds:.0f} ms ({target}, "
-            f"number {number})"
+            f"{self.peak_mb:.0f} MB, most of it {grown:.0f} MB ({greedy}, number {at}); the "
+            f"slowest input took {1e3 * seconds:.0f} ms ({target}, number {number})"
         )
         for failure in self.failures[:20]:
             lines.append(f"\n{failure.target}, number {failure.number}: {failure.what}")
@@ -69,10 +71,14 @@ def run(targets: Mapping[str, Target], executions: int, seed: int) -> Iterator[R
     report = Report({name: Counter() for name in targets})
     before = _peak_mb()
     for number, name in enumerate(islice(_turns(targets), executions)):
+        last = _peak_mb()
         _execute(report, name, targets[name], seed, number)
-        if number == len(targets):
-            before = _peak_mb()  # everything has been imported and tried once
-        report.peak_mb = _peak_mb() - before
+        now = _peak_mb()
+        if number <= len(targets):
+            before = now  # until everything has been imported and tried once
+        else:
+            report.peak_mb = now - before
+            report.largest = max(report.largest, (now - last, name, number))
         yield report
 
 

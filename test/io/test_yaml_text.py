@@ -1,0 +1,39 @@
+"""YAML files: those of people are read, those that are traps are refused in time."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from rs_localizer.io.yaml_text import YamlError, load_yaml
+
+# Nine lines for 9^9 values.
+LAUGHS = "\n".join(f"k{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(9))
+
+
+def test_what_people_write() -> None:
+    assert load_yaml("a: &x {b: 1}\nc: *x\nd: [1, 2.5, yes, text]\n") == {
+        "a": {"b": 1}, "c": {"b": 1}, "d": [1, 2.5, True, "text"],
+    }  # fmt: skip
+    assert load_yaml("") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("a: [1", "expected ',' or ']'"),
+        ("a: &x {b: *x}", "nests deeper than 50, or holds itself"),
+        ("[" * 60 + "]" * 60, "nests deeper than 50"),
+        ("[" * 5000, "nests deeper than 50|expected"),
+        (LAUGHS, "more than 100000 values"),
+        ("2026-99-99", "month must be in 1..12"),
+        ("9" * 5000, "limit"),
+        ("!!python/object/apply:os.system [ls]", "could not determine a constructor"),
+    ],
+)
+def test_traps(text: str, fault: str) -> None:
+    started = time.monotonic()
+    with pytest.raises(YamlError, match=fault):
+        load_yaml(text)
+    assert time.monotonic() - started < 20.0
