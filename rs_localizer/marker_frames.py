@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
+from rs_localizer.core.so3 import Array
 from rs_localizer.frames import Refusal
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_compressed_image, read_image
@@ -22,8 +23,9 @@ from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 
-# Single precision is what RViz shows: 3e-5 px at the rim of an image.
-ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "u", "v", "score")] + [("id", "<u4")])
+# Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
+# map of a kilometre. Larger ones (georeferenced) need more.
+_LARGE_MAP = 1000.0  # m
 # The map is held against every image until so many have agreed, then against one in so many.
 _AGREED, _ONE_IN = 20, 30
 
@@ -37,6 +39,7 @@ class Detected:
     image: Image
     detections: Detections
     map_frame: str
+    row: np.dtype[Any]  # of the cloud
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -55,12 +58,18 @@ def read(message: Any) -> Image | Refusal:
 def correspondences(detected: Detected, make: Make) -> Any:
     """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
     found = detected.detections
-    rows = np.empty(len(found.ids), ROW)
+    rows = np.empty(len(found.ids), detected.row)
     for column, name in enumerate("xyz"):
         rows[name] = found.points[:, column]
     rows["u"], rows["v"] = found.pixels[:, 0], found.pixels[:, 1]
     rows["score"], rows["id"] = found.scores, found.ids
     return make_cloud(make, detected.image.stamp_ns, detected.map_frame, rows)
+
+
+def _row_type(points: Array) -> np.dtype[Any]:
+    kind = "<f8" if np.abs(points).max() > _LARGE_MAP else "<f4"
+    places = [(name, kind) for name in "xyz"]
+    return np.dtype([*places, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")])
 
 
 class FrameDetector:
@@ -90,6 +99,7 @@ class FrameDetector:
         self._notice = notice
         self._detector = MarkerDetector(marker_map, config.min_side)
         self._check = MapCheck(marker_map)
+        self._row = _row_type(marker_map.points)
         self._agreed = self._images = 0
 
     def warm_up(self) -> None:
@@ -124,4 +134,4 @@ class FrameDetector:
                 self._notice("wrong_map", fault)
             elif len(found.ids):
                 self._agreed += 1
-        return Detected(image, found, self.map.map_frame)
+        return Detected(image, found, self.map.map_frame, self._row)

@@ -45,6 +45,7 @@ import yaml
 
 from rs_localizer.core import so3
 from rs_localizer.core.so3 import Array
+from rs_localizer.io.yaml_text import YamlError, load_yaml
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose
@@ -65,10 +66,10 @@ def read_marker_map(path: Path | str) -> MarkerMap:
     """
     path = Path(path)
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        tree = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (YamlError, UnicodeDecodeError) as error:
         raise MarkerMapError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
     try:
         return _map(tree)

@@ -34,6 +34,8 @@ class MarkerMap:
     def __post_init__(self) -> None:
         if not self.map_frame:
             raise MarkerMapError("map_frame is empty; it must name the frame of the poses")
+        if self.map_frame.startswith("/"):
+            raise MarkerMapError(f"map_frame must not start with '/', found {self.map_frame!r}")
         if not self.markers and not self.boards:
             raise MarkerMapError("there are neither markers nor boards")
         owners: dict[tuple[str, int], str] = {}

@@ -19,6 +19,8 @@ from rs_localizer.markers.poses import Pose, finite
 
 # Corners that were measured are no exact square. Their largest distance from one, in sides.
 _SQUARE_TOLERANCE = 0.05
+# No camera sees more.
+_MOST_SQUARES = 200
 
 _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
@@ -85,6 +87,7 @@ class Chessboard:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:  # OpenCV's own limit
             raise ValueError(f"a board needs 3x3 inner corners, got {self.columns}x{self.rows}")
+        _not_too_many(self.columns, self.rows)
         _positive(self.square, "square")
 
     @property
@@ -119,6 +122,7 @@ class Charuco:
             raise ValueError(
                 f"a ChArUco board needs 2x3 squares or more, got {self.columns}x{self.rows}"
             )
+        _not_too_many(self.columns, self.rows)
         _positive(self.square, "square")
         _positive(self.marker, "marker")
         if self.marker >= self.square:
@@ -194,3 +198,10 @@ def _square_pose(corners: Array) -> Pose:
 def _positive(value: float, name: str) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
         raise ValueError(f"{name} must be a length in metres above 0, found {value!r}")
+
+
+def _not_too_many(columns: int, rows: int) -> None:
+    if max(columns, rows) > _MOST_SQUARES:
+        raise ValueError(
+            f"a board may be {_MOST_SQUARES} squares wide and high, got {columns}x{rows}"
+        )

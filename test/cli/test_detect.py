@@ -177,6 +177,19 @@ def test_bag_of_markers(files: Any, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert detector.take(raw[2])
 
 
+def test_georeferenced_maps_keep_their_millimetres(files: Any, tmp_path: Path) -> None:
+    # UTM coordinates do not fit into single precision.
+    text = Path(files.map[1]).read_text()
+    far = text.replace("[-0.05, 0.0, 0.0]", "[691608.001, 5334764.002, 0.0]")
+    far = far.replace("[0.05, 0.0, 0.0]", "[691608.101, 5334764.002, 0.0]")
+    assert "691608.101" in far
+    Path(files.map[1]).write_text(far)
+    image_bag(tmp_path / "bag", [markers()])
+    assert detect(files, str(tmp_path / "bag"), *files.map) == 0
+    (found,) = clouds(files.out)
+    assert found.points[0] == pytest.approx([691607.966, 5334764.037, 0.0], abs=1e-6)
+
+
 def test_folder_of_images(files: Any, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()

@@ -150,6 +150,8 @@ def test_faults_of_markers(tmp_path: Path, entry: Any, text: str) -> None:
     [
         (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\): type must be chessboard or"),
         (CHESSBOARD | {"columns": 2}, "needs 3x3 inner corners, got 2x4"),
+        (CHESSBOARD | {"columns": 10**9}, "may be 200 squares wide and high, got 1000000000x4"),
+        (CHARUCO | {"rows": 10**9}, "may be 200 squares wide and high, got 3x1000000000"),
         (CHESSBOARD | {"columns": 2.5}, "columns cannot be 2.5"),
         (CHARUCO | {"marker": 0.05}, "markers of 0.05 m do not fit into squares of 0.04 m"),
         (CHARUCO | {"first_id": 95}, "needs the ids 95 to 100; 5x5_100 has 0 to 99"),
@@ -167,6 +169,7 @@ def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
         ({"map_frame": "map", "markers": []}, "neither markers nor boards"),
         ({"markers": [MARKER]}, "the map has no map_frame"),
         ({"map_frame": "", "markers": [MARKER]}, "map_frame is empty"),
+        ({"map_frame": "/map", "markers": [MARKER]}, "map_frame must not start with '/'"),
         ({"map_frame": "map", "markers": [MARKER, MARKER]}, "marker 4x4_50 3 is there twice"),
         # The small dictionaries are the beginning of the large ones.
         (
