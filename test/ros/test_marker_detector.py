@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,13 +15,10 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
-from rs_localizer.cli.main import main as command_line
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import open_bag
 from rs_localizer.lab.recording import make_camera_info
 from rs_localizer.marker_frames import FrameDetector, correspondences
 from rs_localizer.markers.dictionaries import pattern
@@ -244,54 +239,3 @@ def test_without_a_map_it_ends(start_node: Callable[..., Any]) -> None:
     assert node.process.wait(60) == 1
     assert "not configured: /nowhere.yaml cannot be read: No such file or directory" in node.log
     assert "Traceback" not in node.log
-
-
-def test_from_image_to_pose_as_offline(
-    start_node: Callable[..., Any], peer: Any, tmp_path: Path
-) -> None:
-    # A camera before three marker walls; both nodes, as they find each other by themselves.
-    walls, seen = tmp_path / "walls", tmp_path / "seen"
-    words = ["--images", "--trajectory", "tum_vi_room5", "--duration", "0.3"]
-    assert command_line(["simulate", str(walls), *words]) == 0
-    marker_map = walls / "marker_map.yaml"
-    assert command_line(["detect", str(walls), "--map", str(marker_map), "--out", str(seen)]) == 0
-    shutter = ["-p", "readout_time:=0.03"]
-    out = tmp_path / "poses"
-    assert command_line(["replay", str(seen), *shutter, "--out", str(out)]) == 0
-    with open_bag(out / "result") as bag:
-        expected = [message for _, _, message in bag.messages(["/rs_localizer/pose"])]
-    assert len(expected) == 9
-
-    start_node(
-        "-p",
-        f"marker_map:={marker_map}",
-        "-r",
-        "image:=image_raw",
-        "-r",
-        "image/compressed:=image_raw/compressed",
-        run=RUN,
-    )
-    start_node(*shutter)
-    heard: list[Any] = []
-    peer.node.create_subscription(PoseStamped, "/rs_localizer/pose", heard.append, 10)
-    images = peer.node.create_publisher(
-        CompressedImage, "/image_raw/compressed", qos_profile_sensor_data
-    )
-    infos = peer.node.create_publisher(CameraInfo, "/camera_info", qos_profile_sensor_data)
-    listening = lambda: images.get_subscription_count() and infos.get_subscription_count()  # noqa: E731
-    assert peer.spin_until(listening)
-    assert peer.spin_until(lambda: peer.node.count_publishers("/rs_localizer/pose") > 0)
-    time.sleep(0.5)  # they have to find each other, too
-    with open_bag(walls) as bag:
-        for topic, _, message in bag.messages(["/camera_info", "/image_raw/compressed"]):
-            copied = copy_message(message, message.__msgtype__)
-            if topic == "/camera_info":
-                infos.publish(copied)
-                peer.spin_until(lambda: False, 0.05)
-                continue
-            before = len(heard)
-            images.publish(copied)
-            assert peer.spin_until(lambda before=before: len(heard) > before)
-    for pose, offline in zip(heard, expected, strict=True):
-        assert pose == copy_message(offline, "geometry_msgs/msg/PoseStamped")
-    shutil.rmtree(walls)
