@@ -5,6 +5,8 @@ There is no limit of size: 50 megapixels work, they only take long.
 
 from __future__ import annotations
 
+import math
+import struct
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +59,10 @@ _FORMATS = (
     ("JPEG", b"\xff\xd8", b"\xff\xd9"),
     ("PNG", b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"),
 )
+# Pixels per byte that nothing can be packed better than: a PNG of one bit per pixel, all alike.
+_DENSEST = 8 * 1032
+# JPEG's markers of frames, by which the size is given.
+_FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 # Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.
 _AS_IT_IS = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 
@@ -122,6 +128,13 @@ def read_compressed_image(message: Any) -> Image:
             f"and its {len(data)} bytes start with {start.hex(' ') or 'nothing'}"
         )
     name, _, end = found[0]
+    if (size := _claimed_size(data.tobytes(), name)) and math.prod(size) > _DENSEST * len(data):
+        raise MessageError(
+            f"the {name} image says that it is {size[0]} x {size[1]}, of which {len(data)} bytes "
+            "cannot tell"
+        )
+    if name == "PNG" and not _has_whole_chunks(data.tobytes()):
+        raise MessageError(f"the PNG image of {len(data)} bytes has a chunk that is longer than it")
     # OpenCV fills what is missing with gray and says nothing.
     if not _ends_with(data, end):
         raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
@@ -132,6 +145,28 @@ def read_compressed_image(message: Any) -> Image:
     if decoded is None:
         raise MessageError(f"the {name} image of {len(data)} bytes cannot be decoded")
     return Image(stamp_ns(message), str(message.header.frame_id), _eight_bits(np.asarray(decoded)))
+
+
+def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
+    """Width and height by the header, which the decoder allocates at once; None: not found."""
+    if name == "PNG":
+        return struct.unpack_from(">II", data, 16) if len(data) >= 24 else None
+    position = 2
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
+        if marker in _FRAME_HEADERS:
+            height, width = struct.unpack_from(">HH", data, position + 5)
+            return width, height
+        position += 2 + length
+    return None
+
+
+def _has_whole_chunks(data: bytes) -> bool:
+    """Whether all chunks lie within a PNG; the decoder allocates them as long as they claim."""
+    position = 8
+    while position + 8 <= len(data) and data[position + 4 : position + 8] != b"IEND":
+        position += 12 + int.from_bytes(data[position : position + 4])
+    return position < len(data)
 
 
 def _ends_with(data: Gray, mark: bytes) -> bool:

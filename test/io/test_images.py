@@ -163,3 +163,17 @@ def test_rows_stay_where_the_sensor_has_them() -> None:
 def test_bad_compressed_images(data: bytes, name: str, text: str) -> None:
     with pytest.raises(MessageError, match=text):
         read_compressed_image(compressed(data, name))
+
+
+def test_sizes_that_an_image_claims() -> None:
+    """Refused before the decoder allocates them."""
+    wide = PNG[:16] + (30000).to_bytes(4) * 2 + PNG[24:]
+    with pytest.raises(MessageError, match="PNG image says that it is 30000 x 30000, of which"):
+        read_compressed_image(compressed(wide))
+    long = PNG[:33] + (2**30).to_bytes(4) + PNG[37:]
+    with pytest.raises(MessageError, match="has a chunk that is longer than it"):
+        read_compressed_image(compressed(long))
+    start = next(k for k in range(len(JPEG)) if JPEG[k : k + 2] == b"\xff\xc0")
+    tall = JPEG[: start + 5] + (65000).to_bytes(2) * 2 + JPEG[start + 9 :]
+    with pytest.raises(MessageError, match="JPEG image says that it is 65000 x 65000, of which"):
+        read_compressed_image(compressed(tall))
