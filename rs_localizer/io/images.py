@@ -128,6 +128,9 @@ def read_compressed_image(message: Any) -> Image:
             f"and its {len(data)} bytes start with {start.hex(' ') or 'nothing'}"
         )
     name, _, end = found[0]
+    # OpenCV fills what is missing with gray and says nothing.
+    if not _ends_with(data, end):
+        raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
     if (size := _claimed_size(data.tobytes(), name)) and math.prod(size) > _DENSEST * len(data):
         raise MessageError(
             f"the {name} image says that it is {size[0]} x {size[1]}, of which {len(data)} bytes "
@@ -135,9 +138,6 @@ def read_compressed_image(message: Any) -> Image:
         )
     if name == "PNG" and not _has_whole_chunks(data.tobytes()):
         raise MessageError(f"the PNG image of {len(data)} bytes has a chunk that is longer than it")
-    # OpenCV fills what is missing with gray and says nothing.
-    if not _ends_with(data, end):
-        raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
     try:
         decoded = cv2.imdecode(data, _AS_IT_IS)
     except cv2.error as error:
