@@ -44,6 +44,8 @@ from rs_localizer.settings import NODE_NAME
 _POSE, _TWIST = f"/{NODE_NAME}/pose", f"/{NODE_NAME}/twist"
 _KINDS = {_POSE: PoseStamped, _TWIST: TwistStamped}
 _QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+# The nodes' inputs are best effort, and a busy machine loses messages: here, none may be lost.
+_RELIABLE = "qos_overrides.{}.subscription.reliability:=reliable"
 _START_TIMEOUT = 300.0  # s, of a machine that compiles for the first time
 _ANSWER_TIMEOUT = 30.0
 # Nodes that have found this process may still have to find each other (s).
@@ -85,11 +87,18 @@ def fly(images: Path, replayed: Path, parameters: list[str]) -> Agreement:
             *("-p", f"marker_map:={images / MARKER_MAP}"),
             *("-r", f"image:={RAW_IMAGE_TOPIC.removesuffix('/compressed')}"),
             *("-r", f"image/compressed:={RAW_IMAGE_TOPIC}"),
+            *("-p", _RELIABLE.format(RAW_IMAGE_TOPIC)),
         ),
-        "localizer": _start("main", "--params-file", str(images / PARAMETERS), *given),
+        "localizer": _start(
+            "main",
+            *("--params-file", str(images / PARAMETERS)),
+            *("-p", _RELIABLE.format(CORRESPONDENCES_TOPIC)),
+            *("-p", _RELIABLE.format(CAMERA_INFO_TOPIC)),
+            *given,
+        ),
     }
     context = Context()
-    rclpy.init(context=context)
+    rclpy.init(args=[], context=context)
     try:
         flight = _Flight(context, processes)
         flight.wait_for_nodes()
