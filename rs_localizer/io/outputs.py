@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -63,19 +63,19 @@ class Frame:
         return True
 
 
-def messages(frame: Frame, make: Make, wanted: Collection[str] = TYPES) -> dict[str, Any]:
+def messages(frame: Frame, make: Make) -> dict[str, Any]:
     """The messages of a frame by output topic (see :data:`TYPES`), the same for node and replay.
 
     Without a twist there is no odometry either: zeros would be a claim.
-
-    Args:
-        frame: what to say.
-        make: builds the messages.
-        wanted: topics; the messages of others are not built.
     """
+    return dict(each_message(frame, make, TYPES))
+
+
+def each_message(frame: Frame, make: Make, wanted: Collection[str]) -> Iterator[tuple[str, Any]]:
+    """Those of these topics, one after the other; each is built when it is asked for."""
     parts = _Parts(frame, make)
     builders = _WITHOUT_TWIST if frame.twist is None else _BUILDERS
-    return {name: build(parts) for name, build in builders.items() if name in wanted}
+    return ((name, build(parts)) for name, build in builders.items() if name in wanted)
 
 
 class _Parts:

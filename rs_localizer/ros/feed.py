@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from rs_localizer.config import NodeConfig
@@ -32,6 +33,8 @@ _MAP_QOS = {
     "reliability": ReliabilityPolicy.RELIABLE,
     "durability": DurabilityPolicy.TRANSIENT_LOCAL,
 }
+# In a serialized message, which begins with four bytes of CDR and the stamp of its header.
+_AFTER_STAMP = 12
 # A change of settings that takes longer (s) has compiled kernels, and says so.
 _LONG_CHANGE = 0.5
 
@@ -57,13 +60,15 @@ class Feed:
         self._frames = frames
         self._refusals = refusals
         self._say = say
-        self._calibration: Calibration | None = None  # the last that was handed on
+        # The last that was handed on.
+        self._camera_info = b""
+        self._calibration: Calibration | None = None
         self.changing = False  # whether the worker compiles kernels for new settings
 
     def topics(self) -> dict[str, Topic]:
         """The inputs; what changes the state comes before the frames."""
         return {
-            "camera_info": Topic(CameraInfo, self._take_camera_info),
+            "camera_info": Topic(CameraInfo, self._take_camera_info, raw=True),
             "map_points": Topic(PointCloud2, self._take_map, _MAP_QOS, lasting=True),
             "correspondences": self._localized_by(
                 "correspondences", lambda frames, message: frames.localize(message)
@@ -87,16 +92,18 @@ class Feed:
         """A topic whose messages are frames, which the worker localizes in this way."""
         return Topic(PointCloud2, lambda message: self._worker.localize(topic, message, localize))
 
-    def _take_camera_info(self, message: CameraInfo) -> None:
+    def _take_camera_info(self, serialized: bytes) -> None:
+        # Drivers repeat it with every image, and only its stamp is new.
+        content = serialized[_AFTER_STAMP:]
+        if content == self._camera_info and self._calibration == self._frames.calibration:
+            return
         try:
-            calibration = read_camera_info(message)
+            calibration = read_camera_info(deserialize_message(serialized, CameraInfo))
         except MessageError as error:
             self._refusals.add("bad_camera_info", str(error))
             return
-        # Drivers repeat it with every image.
-        if not calibration == self._calibration == self._frames.calibration:
-            self._calibration = calibration
-            self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
+        self._camera_info, self._calibration = content, calibration
+        self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
 
     def _take_map(self, message: PointCloud2) -> None:
         # Meanwhile frames are localized by the previous one.

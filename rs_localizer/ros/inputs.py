@@ -39,6 +39,7 @@ class Topic:
     callback: Callable[[Any], None]  # runs in a thread of the inputs
     qos: Mapping[str, Any] = field(default_factory=lambda: SENSOR_DATA)
     lasting: bool = False  # one message is enough
+    raw: bool = False  # whether the callback takes serialized messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +106,7 @@ class Inputs:
             # Events of a subscription wake the executor with every message; the graph knows more.
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            raw=topic.raw,
         )
 
     def _silence(self, name: str) -> Silence:

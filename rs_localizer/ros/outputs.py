@@ -8,7 +8,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from rs_localizer.io.outputs import TYPES, Frame, messages
+from rs_localizer.io.outputs import TYPES, Frame, each_message
 from rs_localizer.ros.conversion import make_message, message_class
 
 _QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
@@ -44,7 +44,7 @@ class Outputs:
             for name, publisher in self._publishers.items()
             if publisher.get_subscription_count()
         ]
-        for name, message in messages(frame, make_message, wanted).items():
+        for name, message in each_message(frame, make_message, wanted):
             self._publishers[name].publish(message)
         if self._afterwards is not None:
             self._afterwards(frame)

@@ -34,6 +34,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 from std_msgs.msg import String
@@ -428,9 +429,9 @@ def garbage(world: World) -> str:
         if not kept:
             continue
         # Past DDS, which drops what comes faster than the node takes it.
-        world.node._inputs._subscriptions[
-            "camera_info" if number % 4 == 0 else "correspondences"
-        ].callback(message)
+        topic = "camera_info" if number % 4 == 0 else "correspondences"
+        subscription = world.node._inputs._subscriptions[topic]
+        subscription.callback(serialize_message(message) if subscription.raw else message)
         if number % 20 == 0:
             world.wait(lambda: not world.node._worker._mailbox._frames)
     growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before

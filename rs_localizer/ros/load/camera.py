@@ -39,9 +39,13 @@ class Camera:
             time.sleep(0.05)
         time.sleep(0.5)  # the other side has to find this one, too
 
-    def send(self, index: int) -> None:
+    def send(self, index: int) -> float:
+        """Publish a frame and its camera_info: time.monotonic() between the two."""
+        cloud = self._frames.cloud(index)
         self._infos.publish(self._frames.camera_info)
-        self._clouds.publish(self._frames.cloud(index))
+        now = time.monotonic()
+        self._clouds.publish(cloud)
+        return now
 
 
 def publish(camera: Camera, frames: Frames, sent: Any) -> None:
@@ -50,8 +54,7 @@ def publish(camera: Camera, frames: Frames, sent: Any) -> None:
     for index in range(len(sent)):
         while (left := start + index / frames.rate - time.monotonic()) > 0.0:
             time.sleep(left)
-        sent[index] = time.monotonic()
-        camera.send(index)
+        sent[index] = camera.send(index)
 
 
 def main(namespace: str, frames_file: str, sent_file: str) -> None:

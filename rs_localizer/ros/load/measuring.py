@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,12 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from rs_localizer.core.so3 import Array
+from rs_localizer.ros.intake import Intake, NotByExecutor
 from rs_localizer.ros.load.camera import Camera
 from rs_localizer.ros.load.frames import READOUT_TIME, Frames
 from rs_localizer.settings import NODE_NAME
@@ -65,18 +66,26 @@ class Ear:
         self.counts = {"Frames received": 0, "Frames replaced": 0, "Frames refused": 0}
         self._frames = frames
         self._name = f"{namespace.lstrip('/')}/{NODE_NAME}: localizer"
-        reliable = QoSProfile(depth=50)
         prefix = f"{namespace}/{NODE_NAME}"
-        self._pose = node.create_subscription(
-            PoseStamped, f"{prefix}/pose", self._take, reliable, raw=True
-        )
-        # Somebody listens to the twist, too: it is what this node is for.
-        node.create_subscription(Odometry, f"{prefix}/odometry", lambda _: None, reliable, raw=True)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._take_status, 10)
-
-    @property
-    def connected(self) -> bool:
-        return bool(self._pose.get_publisher_count())
+        # Taken as the node does it: an executor would be part of the latency.
+        listeners = [
+            node.create_subscription(
+                kind,
+                topic,
+                callback,
+                QoSProfile(depth=50),
+                callback_group=NotByExecutor(),
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                raw=raw,
+            )
+            for kind, topic, callback, raw in (
+                (PoseStamped, f"{prefix}/pose", self._take, True),
+                # Somebody listens to the twist, too: it is what this node is for.
+                (Odometry, f"{prefix}/odometry", lambda _: None, True),
+                (DiagnosticArray, "/diagnostics", self._take_status, False),
+            )
+        ]
+        self.close = Intake(node.context, listeners, sys.exit).close
 
     def _take(self, message: Any) -> None:
         now = time.monotonic()
@@ -93,8 +102,8 @@ class Ear:
 
 
 @contextlib.contextmanager
-def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]], Callable[[float], None]]]:
-    """That many live nodes: our own node, their namespaces and process ids, and how to listen.
+def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]]]]:
+    """That many live nodes: our own node, and their namespaces and process ids.
 
     Raises:
         ChildProcessError: when a node ends at its start, with its log.
@@ -102,14 +111,6 @@ def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]], Callable[
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     rclpy.init()
     peer = rclpy.create_node("load", namespace=f"/load_{os.getpid()}")
-    executor = SingleThreadedExecutor()
-    executor.add_node(peer)
-
-    def listen(seconds: float) -> None:
-        deadline = time.monotonic() + seconds
-        while (left := deadline - time.monotonic()) > 0.0:
-            executor.spin_once(timeout_sec=left)
-
     processes: list[subprocess.Popen[bytes]] = []
     with tempfile.TemporaryDirectory() as directory:
         try:
@@ -120,7 +121,7 @@ def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]], Callable[
                 processes.append(_start_node(namespace, log))
                 _wait_until_active(processes[-1], log)
                 nodes.append((namespace, processes[-1].pid))
-            yield peer, nodes, listen
+            yield peer, nodes
         finally:
             for process in processes:
                 process.terminate()
@@ -131,7 +132,7 @@ def running(count: int) -> Iterator[tuple[Node, list[tuple[str, int]], Callable[
 
 def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
     """Publish that many frames to each of some nodes at a steady rate, and see what comes of it."""
-    with running(cameras) as (peer, nodes, listen), tempfile.TemporaryDirectory() as directory:
+    with running(cameras) as (peer, nodes), tempfile.TemporaryDirectory() as directory:
         frames_file = Path(directory) / "frames.npz"
         frames.save(frames_file)
         ears, sents, publishers = [], [], []
@@ -145,10 +146,12 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
             )
         memory: list[list[float]] = []
         while any(publisher.poll() is None for publisher in publishers):
-            listen(1.0)
+            time.sleep(1.0)
             if sents[0][0] > 0.0:
                 memory.append([_memory(pid) for _, pid in nodes])
-        listen(_REST_TIME)
+        time.sleep(_REST_TIME)
+        for ear in ears:
+            ear.close()
         return [
             Result(
                 frames=count,
@@ -164,7 +167,7 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
 
 def fastest(frames: Frames, seconds: float) -> float:
     """Hz at which one node answers frames that are sent as soon as it has answered."""
-    with running(1) as (peer, [(namespace, _)], listen):
+    with running(1) as (peer, [(namespace, _)]):
         ear = Ear(peer, namespace, frames, 1_000_000)
         camera = Camera(peer, namespace, frames)
         camera.wait()
@@ -180,11 +183,12 @@ def fastest(frames: Frames, seconds: float) -> float:
             while sent - ear.answered < _UNDER_WAY:
                 camera.send(sent)
                 sent += 1
-            listen(0.0005)
+            time.sleep(0.0002)
             # The first frames are on the way while both sides still discover each other.
             if not start and ear.answered > frames.rate:
                 start, first = now, ear.answered
             if start and now - start > seconds:
+                ear.close()
                 return (ear.answered - first) / (now - start)
 
 
