@@ -128,7 +128,7 @@ def test_maps_that_are_late_replaced_and_bad(
     # Without a map.
     assert not talk.send(talk.keypoints(frames[0]), 0.3)
     assert peer.spin_until(lambda: talk.status.get("State") == "waiting for a map")
-    assert "/map_points" in talk.status["message"]
+    assert peer.spin_until(lambda: "/map_points: it has 1 publisher" in talk.status["message"])
     node.wait_for_log("no_map: no usable map has come yet, on map_points or as map_file")
     # It comes.
     talk.send_map(LANDMARKS)
