@@ -275,7 +275,7 @@ def test_map_files(tmp_path: Path, frames: list[SimulatedFrame], make_camera_inf
     write_map_file(path, Map(POINTS, None, None, "map"))
     with pytest.raises(MapError, match="neither ids nor descriptors"):
         node.load_map()
-    with pytest.raises(MapError, match="map_file: .* No such file"):
+    with pytest.raises(MapError, match=r"map_file: .* No such file"):
         localizer(make_camera_info, map_file=str(tmp_path / "none.ply")).load_map()
     localizer(make_camera_info).load_map()
     with pytest.raises(ValueError, match="map_frame must not be empty"):
