@@ -65,13 +65,15 @@ def test_results_on_disk(tmp_path: Path) -> None:
     fell = judge("flight.fish", "paper", "fish fly", "up", "0 m", False, "no wings")
     result = Result(
         "Flight", "In air.", [held, fell], {"flight": Table(("x", "name"), [(1 / 3, "a")])},
-        {"flight": Figure()}, ["line\nline"],
+        {"flight": Figure()}, ["line\nline"], {"flight.gif": b"GIF89a"},
     )  # fmt: skip
     write_result(tmp_path, result)
     write_summary(tmp_path, {"flight": result}, {"flight": 1.25}, trials=7, seed=3)
     assert (tmp_path / "flight.csv").read_text() == "x,name\n0.333333,a\n"
     assert (tmp_path / "flight.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "flight.gif").read_bytes() == b"GIF89a"
     text = (tmp_path / "summary.md").read_text()
+    assert "![flight.gif](flight.gif)" in text
     assert "| birds \\| fly | paper | up | 3 m | held |" in text
     assert "**did not hold**" in text
     assert "no wings" in text
