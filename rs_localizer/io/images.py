@@ -163,10 +163,11 @@ def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
 
 def _has_whole_chunks(data: bytes) -> bool:
     """Whether all chunks lie within a PNG; the decoder allocates them as long as they claim."""
-    position = 8
-    while position + 8 <= len(data) and data[position + 4 : position + 8] != b"IEND":
+    position, kind = 8, b""
+    while position + 12 <= len(data) and kind != b"IEND":
+        kind = data[position + 4 : position + 8]
         position += 12 + int.from_bytes(data[position : position + 4])
-    return position < len(data)
+    return position <= len(data) and kind == b"IEND"
 
 
 def _ends_with(data: Gray, mark: bytes) -> bool:

@@ -67,7 +67,7 @@ def write_npz(path: Path, landmarks: Map) -> None:
     if landmarks.descriptors is not None:
         arrays["descriptors"] = landmarks.descriptors
     with path.open("wb") as file:  # given a name, NumPy would append a suffix
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(file, **arrays)
 
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

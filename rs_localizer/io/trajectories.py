@@ -70,7 +70,8 @@ def read_tum(path: Path | str) -> Trajectory:
     """
     path = Path(path)
     stamps_ns, values = _read_table(path, ("x", "y", "z", "qx", "qy", "qz", "qw"))
-    norms = np.linalg.norm(values[:, 3:], axis=1)
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(values[:, 3:], axis=1)
     wrong = np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE)
     if len(wrong):
         raise TrajectoryError(
