@@ -19,7 +19,8 @@ from rs_localizer.core.prior import (
     held_terms,
     state_in,
     velocity_terms,
-    with_prior,
+    with_measurements,
+    with_motion,
 )
 from rs_localizer.core.ransac import Candidate, Observations
 from rs_localizer.core.refine import step_between
@@ -113,7 +114,7 @@ class Localizer:
         points, pixels, scores = checked(points, pixels, scores)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
-        rays = self.camera.rays(pixels)
+        rays, by_ray = self.camera.rays_and_jacobian(pixels)
         seen = np.isfinite(rays[:, 0])
         centre = median_point(points, seen)
         with np.errstate(over="ignore"):
@@ -125,7 +126,7 @@ class Localizer:
                 f"{len(usable)} usable points of {len(points)}, "
                 f"{self.config.min_inliers} are needed",
             )
-        frame = self._frame(points, pixels, rays, usable, centre, scores, prior)
+        frame = self._frame(points, pixels, rays, by_ray, usable, centre, scores, prior)
         if prior is not None and prior.motion is not None:
             tracked = self._track(frame, prior, expected_share)
             if tracked:
@@ -142,6 +143,7 @@ class Localizer:
         points: Array,
         pixels: Array,
         rays: Array,
+        by_ray: Array,
         usable: IntArray,
         centre: Array,
         scores: Array | None,
@@ -152,7 +154,7 @@ class Localizer:
             points[usable] - centre,
             rays[usable],
             self.camera.row_time(pixels[usable]),
-            self.camera.pixel_jacobian(rays[usable]),
+            by_ray[usable],
             self.camera.row_time_gradient,
         )
         return Frame(
@@ -161,7 +163,7 @@ class Localizer:
             len(points),
             centre,
             None if scores is None else np.argsort(-scores[usable], kind="stable"),
-            terms if prior is None else with_prior(terms, prior.without_motion(), centre),
+            terms if prior is None else with_measurements(terms, prior),
             generator(self.config.seed),
         )
 
@@ -170,7 +172,7 @@ class Localizer:
         assert prior.motion is not None
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, frame.centre)
-        terms = with_prior(frame.terms, prior.motion_only(), frame.centre)
+        terms = with_motion(frame.terms, prior, frame.centre)
         best = self._search.optimize(frame, predicted, _PREDICTION_SCALE * threshold, terms)
         start = Candidate(predicted, best.cost)
         posterior = self._final(frame, best, terms)

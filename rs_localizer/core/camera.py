@@ -49,8 +49,6 @@ _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-1
 _LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e9
 # A pixel that does not come back to itself has no bearing: it lies beyond the model's range.
 _ROUND_TRIP_TOLERANCE = 1e-3
-# Step of the numerical derivative of the distortion, in normalized image coordinates.
-_DERIVATIVE_STEP = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,40 +209,35 @@ class Camera:
 
         NaN where the distortion model has no bearing for the pixel.
         """
+        return self.rays_and_jacobian(pixels)[0]
+
+    def rays_and_jacobian(self, pixels: Array) -> tuple[Array, Array]:
+        """Bearings (n,2) of raw pixels (n,2), see :meth:`rays`, and the derivatives (n,2,2) of the
+        pixel by the bearing there.
+        """
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         sensor = pixels * self.binning + self._offset()
-        if len(sensor) == 0:
-            return np.zeros((0, 2))
-        if len(self.D) == 0:
+        if len(self.D) == 0 or len(sensor) == 0:
             plain: Array = (sensor - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
-            return plain
+            return plain, self.pixel_jacobian(plain)
         usable = np.all(np.isfinite(sensor), axis=1)
         rays = np.full(sensor.shape, np.nan)
         if np.any(usable):
             rays[usable] = self._undistort(sensor[usable])
-        back = self._distort(rays)
+        back, jacobian = self._distort(rays)
         lost = ~(np.abs(back - pixels).max(axis=1) < _ROUND_TRIP_TOLERANCE)
         rays[lost] = np.nan
-        return rays
+        return rays, jacobian
 
     def project(self, points: Array) -> Array:
         """Raw pixels (n,2) of points (n,3) in the camera frame; NaN behind the camera."""
         points = np.asarray(points, float)
         depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-        return self._distort(points[:, :2] / depth[:, None])
+        return self._distort(points[:, :2] / depth[:, None])[0]
 
     def pixel_jacobian(self, rays: Array) -> Array:
         """Derivatives (n,2,2) of the raw pixel by the ray at rays (n,2)."""
-        rays = np.asarray(rays, float)
-        if len(self.D) == 0:
-            scale = np.diag([self.K[0, 0], self.K[1, 1]]) / np.array(self.binning)[:, None]
-            return np.broadcast_to(scale, (len(rays), 2, 2)).copy()
-        step = _DERIVATIVE_STEP
-        offsets = np.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
-        pixels = self._distort((rays[None] + offsets[:, None]).reshape(-1, 2))
-        ahead, behind = pixels.reshape(4, -1, 2)[0::2], pixels.reshape(4, -1, 2)[1::2]
-        # Contiguous: kernels are compiled for one layout of their arguments.
-        return np.ascontiguousarray(np.moveaxis((ahead - behind) / (2.0 * step), 0, 2))
+        return self._distort(np.asarray(rays, float))[1]
 
     def inside(self, pixels: Array) -> NDArray[np.bool_]:
         """Which raw pixels (n,2) lie in the delivered image."""
@@ -262,14 +255,23 @@ class Camera:
             rays = cv2.undistortPoints(points, K, D, criteria=_UNDISTORT_CRITERIA)
         return np.asarray(rays[:, 0], np.float64)
 
-    def _distort(self, rays: Array) -> Array:
-        if len(self.D) == 0:
-            sensor = rays * (self.K[0, 0], self.K[1, 1]) + self.K[:2, 2]
-        elif self.distortion_model == DistortionModel.EQUIDISTANT:
-            sensor = cv2.fisheye.distortPoints(rays[:, None], self.K, self.D)[:, 0]
+    def _distort(self, rays: Array) -> tuple[Array, Array]:
+        """Raw pixels (n,2) of rays (n,2), and their derivatives (n,2,2) by the ray."""
+        count = len(rays)
+        if len(self.D) == 0 or count == 0:
+            focal = np.array([self.K[0, 0], self.K[1, 1]])
+            sensor = rays * focal + self.K[:2, 2]
+            jacobian = np.broadcast_to(np.diag(focal), (count, 2, 2))
         else:
-            bearings = np.column_stack([rays, np.ones(len(rays))])
-            zero = np.zeros(3)
-            sensor = cv2.projectPoints(bearings[:, None], zero, zero, self.K, self.D)[0][:, 0]
+            # Of a point at depth 1 the derivative by its place is that by the ray.
+            bearings, zero = np.column_stack([rays, np.ones(count)])[:, None], np.zeros(3)
+            if self.distortion_model == DistortionModel.EQUIDISTANT:
+                first = 11  # behind focal lengths, centre, distortion and rotation
+                found = cv2.fisheye.projectPoints(bearings, zero, zero, self.K, self.D)
+            else:
+                first = 3  # behind the rotation
+                found = cv2.projectPoints(bearings, zero, zero, self.K, self.D)
+            sensor = found[0][:, 0]
+            jacobian = found[1].reshape(count, 2, -1)[:, :, first : first + 2]
         pixels: Array = (sensor - self._offset()) / self.binning
-        return pixels
+        return pixels, np.ascontiguousarray(jacobian / np.array(self.binning)[:, None])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -68,14 +68,6 @@ class Prior:
                     f"got {deviation}"
                 )
 
-    def without_motion(self) -> Prior:
-        """The same but for the motion."""
-        return replace(self, motion=None, covariance=None)
-
-    def motion_only(self) -> Prior:
-        """Nothing but the motion."""
-        return Prior(motion=self.motion, covariance=self.covariance)
-
 
 class PriorTerms(NamedTuple):
     """A prior as the kernels take it: a sum of Gaussians, and a direction."""
@@ -129,17 +121,15 @@ def _single(information: Array, reference: Array) -> PriorTerms:
     return PriorTerms(information[None], reference[None].copy(), _NO_GRAVITY)
 
 
-def with_prior(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
-    """The terms and a prior given in the map frame, for points taken relative to ``centre``."""
-    informations, references, gravity = [*terms.informations], [*terms.references], terms.gravity
-    if prior.motion is not None and prior.covariance is not None:
-        informations.append(_inverse(prior.covariance))
-        references.append(state_in(prior.motion, centre))
+def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
+    """The terms and what a prior says but for the motion: angular velocity and gravity."""
+    informations, references, gravity = terms
     if prior.angular_velocity is not None:
         information = np.zeros((12, 12))
         information[6:9, 6:9] = np.eye(3) / prior.angular_velocity_deviation**2
-        informations.append(information)
-        references.append(np.concatenate([_STILL[:12], prior.angular_velocity, np.zeros(3)]))
+        reference = np.concatenate([_STILL[:12], prior.angular_velocity, np.zeros(3)])
+        informations = np.concatenate([informations, information[None]])
+        references = np.concatenate([references, reference[None]])
     if prior.gravity is not None:
         gravity = np.concatenate(
             [
@@ -148,7 +138,21 @@ def with_prior(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
                 [prior.gravity_deviation**-2],
             ]
         )
-    return PriorTerms(np.array(informations), np.array(references), gravity)
+    return PriorTerms(informations, references, gravity)
+
+
+def with_motion(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
+    """The terms and a prior's motion in the map frame, for points relative to ``centre`` (3,).
+
+    Its term is the last one.
+    """
+    if prior.motion is None or prior.covariance is None:
+        return terms
+    return PriorTerms(
+        np.concatenate([terms.informations, _inverse(prior.covariance)[None]]),
+        np.concatenate([terms.references, state_in(prior.motion, centre)[None]]),
+        terms.gravity,
+    )
 
 
 def state_in(motion: Motion, centre: Array) -> Array:

@@ -10,7 +10,8 @@ from rs_localizer.core.prior import (
     held_terms,
     state_in,
     velocity_terms,
-    with_prior,
+    with_measurements,
+    with_motion,
 )
 from rs_localizer.core.refine import apply_step
 from rs_localizer.core.shutter import Motion
@@ -36,11 +37,11 @@ def evaluate(terms, state, weight=1.0):
 NOTHING = velocity_terms(0.0, 0.0)
 PRIORS = {
     "velocity": velocity_terms(0.2, 0.1),
-    "motion": with_prior(NOTHING, Prior(motion=motion(), covariance=covariance()), CENTRE),
-    "gyroscope": with_prior(
-        NOTHING, Prior(angular_velocity=[0.1, 0.2, 0.3], angular_velocity_deviation=0.01), CENTRE
+    "motion": with_motion(NOTHING, Prior(motion=motion(), covariance=covariance()), CENTRE),
+    "gyroscope": with_measurements(
+        NOTHING, Prior(angular_velocity=[0.1, 0.2, 0.3], angular_velocity_deviation=0.01)
     ),
-    "gravity": with_prior(NOTHING, Prior(gravity=[1.0, 2.0, 0.5], gravity_deviation=0.05), CENTRE),
+    "gravity": with_measurements(NOTHING, Prior(gravity=[1.0, 2.0, 0.5], gravity_deviation=0.05)),
 }
 
 
@@ -77,7 +78,7 @@ def test_the_information_is_the_curvature_at_the_minimum(name):
 
 def test_a_motion_prior_costs_the_mahalanobis_distance():
     mean, spread = motion(), covariance()
-    terms = with_prior(NOTHING, Prior(motion=mean, covariance=spread), CENTRE)
+    terms = with_motion(NOTHING, Prior(motion=mean, covariance=spread), CENTRE)
     step = 0.5 * np.random.default_rng(3).normal(size=12)
     cost, _, _ = evaluate(terms, apply_step(state_in(mean, CENTRE), step))
     assert cost == pytest.approx(step @ np.linalg.solve(spread, step), rel=1e-9)
@@ -85,7 +86,7 @@ def test_a_motion_prior_costs_the_mahalanobis_distance():
 
 def test_infinite_variances_leave_parameters_free():
     spread = np.diag(np.concatenate([np.full(6, np.inf), np.full(6, 0.01)]))
-    terms = with_prior(NOTHING, Prior(motion=motion(), covariance=spread), CENTRE)
+    terms = with_motion(NOTHING, Prior(motion=motion(), covariance=spread), CENTRE)
     _, information, _ = evaluate(terms, state_in(motion(5), CENTRE))
     np.testing.assert_allclose(information, np.diag([0.0] * 6 + [100.0] * 6))
 
