@@ -61,7 +61,7 @@ def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
 
 def write_npz(path: Path, landmarks: Map) -> None:
     """Write a map; what is read back is the same to the last bit."""
-    arrays: dict[str, NDArray[Any]] = {"points": landmarks.points}
+    arrays: dict[str, Any] = {"points": landmarks.points}
     if landmarks.ids is not None:
         arrays["ids"] = landmarks.ids
     if landmarks.descriptors is not None:
