@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.acceptance import refusal
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.inputs import checked, median_point
+from rs_localizer.core.inputs import checked, distinct, median_point
 from rs_localizer.core.mirror import settle
 from rs_localizer.core.posterior import Posterior
 from rs_localizer.core.prior import (
@@ -119,7 +119,7 @@ class Localizer:
         centre = median_point(points, seen)
         with np.errstate(over="ignore"):
             within = np.abs(points - centre).max(axis=1, initial=0.0) < _FARTHEST_POINT
-        usable = np.flatnonzero(seen & within)
+        usable = distinct(points, pixels, np.flatnonzero(seen & within))
         if len(usable) < self.config.min_inliers:
             return Failure(
                 Reason.TOO_FEW_POINTS,

@@ -220,7 +220,8 @@ def test_random_matches_have_no_pose():
 
 @pytest.mark.parametrize("count", [0, 1, 11])
 def test_too_few_points_are_a_failure_and_no_error(count):
-    result = rsl.Localizer(camera()).localize(np.zeros((count, 3)), np.zeros((count, 2)))
+    points = np.arange(3.0 * count).reshape(count, 3)
+    result = rsl.Localizer(camera()).localize(points, np.arange(2.0 * count).reshape(count, 2))
     assert not result
     assert result.reason == rsl.Reason.TOO_FEW_POINTS
     assert f"{count} usable points of {count}, 12 are needed" in str(result)
@@ -330,3 +331,15 @@ def test_the_larger_of_two_moving_groups_wins():
         )
         wrong += not (result and result.inliers[:100].mean() > 0.95)
     assert wrong <= 1
+
+
+@pytest.mark.parametrize("distinct", [6, 20])
+def test_copies_of_points_are_no_further_evidence(distinct):
+    points, pixels, _ = frame(camera(), Path(), count=distinct, noise=1.0)
+    localizer = rsl.Localizer(camera())
+    once = localizer.localize(points, pixels)
+    copied = localizer.localize(np.repeat(points, 10, axis=0), np.repeat(pixels, 10, axis=0))
+    assert bool(copied) == bool(once) == (distinct > 12)
+    if once and copied:
+        np.testing.assert_allclose(copied.covariance, once.covariance, rtol=1e-9)
+        assert np.array_equal(copied.inliers[::10], once.inliers)

@@ -137,3 +137,19 @@ def test_a_prediction_says_which_of_both_poses_it_is(small_planes):
             assert not tracked or turn_between(tracked, true) < 10.0
             helped += bool(tracked)
     assert helped > 5
+
+
+def test_gravity_levels_a_camera_at_rest():
+    """The average with the resting camera must know of gravity, too."""
+    localizer, alone, levelled = rsl.Localizer(CAMERA), [], []
+    for seed in range(20):
+        points, pixels, true = plane_frame(seed, 30.0, 0.0, 0.0, 0.3)
+        down = true.rotation @ [0.0, 0.0, -1.0]
+        measured = down + 1e-4 * np.random.default_rng(seed).normal(size=3)
+        prior = rsl.Prior(gravity=measured, gravity_deviation=1e-4)
+        for errors, known in ((alone, None), (levelled, prior)):
+            estimate = localizer.localize(points, pixels, prior=known)
+            assert estimate
+            errors.append(np.linalg.norm(estimate.rotation @ [0.0, 0.0, -1.0] - down))
+    assert np.median(alone) > 2e-3
+    assert np.median(levelled) < 3e-4

@@ -19,8 +19,9 @@ _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
 # does so fits anything. See :meth:`Observations.row_paces`.
 _LEAST_PACE = 0.25
-# A mirrored pose nearer than this (rad) is within what the covariance can say.
-_MOST_MIRRORED_TURN = 0.2
+# How far away (rad) a mirrored pose that fits as well may be: what the covariance speaks for may be
+# farther away than what it does not.
+_MOST_MIRRORED_TURN, _MOST_COVERED_TURN = 0.2, 0.35
 
 
 def refusal(
@@ -88,7 +89,9 @@ def refusal(
             f"{depth:.3g} m away",
         )
     mirror = posterior.mirror
-    if mirror is not None and mirror.turn > _MOST_MIRRORED_TURN:
+    if mirror is not None and mirror.turn > (
+        _MOST_COVERED_TURN if mirror.covered else _MOST_MIRRORED_TURN
+    ):
         return Failure(
             Reason.MIRRORED,
             f"the points lie on a plane, and the pose mirrored on it, "

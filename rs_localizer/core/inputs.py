@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_localizer.core.sampling import IntArray
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray
 
@@ -46,3 +47,13 @@ def median_point(points: Array, chosen: BoolArray) -> Array:
     middle = len(of) // 2
     median: Array = np.partition(of, middle, axis=0)[middle]  # np.median takes three times as long
     return median
+
+
+def distinct(points: Array, pixels: Array, chosen: IntArray) -> IntArray:
+    """The chosen correspondences without those that repeat another one: a copy says nothing new."""
+    places = np.ascontiguousarray(pixels[chosen]).view(np.complex128)[:, 0]
+    if len(np.unique(places)) == len(chosen):  # nearly always, and fast
+        return chosen
+    pairs = np.hstack([points[chosen], pixels[chosen]])
+    first = np.unique(pairs, axis=0, return_index=True)[1]
+    return chosen[np.sort(first)]

@@ -8,21 +8,20 @@ PAMI 2006). A minimum that was found says nothing of the other one, so it is loo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.posterior import (
-    EVIDENCE_OF_MOTION,
     Mirror,
     Posterior,
+    evidence_of_motion,
     fit,
     maximum_a_posteriori,
-    weigh_against_mirror,
     weigh_against_rest,
 )
-from rs_localizer.core.prior import PriorTerms, held_terms
+from rs_localizer.core.prior import PriorTerms, held_beside
 from rs_localizer.core.ransac import Observations
 from rs_localizer.core.refine import step_between
 from rs_localizer.core.so3 import Array
@@ -87,13 +86,13 @@ def settle(
     modes, rest = moving, None
     if moving and may_rest:
         still = np.concatenate([posterior.state[:12], np.zeros(6)])
-        resting = _pair(observations, posterior, still, held_terms())
+        resting = _pair(observations, posterior, still, held_beside(terms))
         rest = min(resting, key=lambda mode: mode.cost).state if resting else None
-        modes = [*(_Mode(m.state, m.cost + EVIDENCE_OF_MOTION) for m in moving), *resting]
+        needed = evidence_of_motion(posterior, terms)
+        modes = [*(_Mode(m.state, m.cost + needed) for m in moving), *resting]
     if may_rest:
-        posterior = weigh_against_rest(observations, posterior, rest)
-    mirror = _other(posterior, modes)
-    return posterior if mirror is None else weigh_against_mirror(posterior, mirror)
+        posterior = weigh_against_rest(observations, posterior, terms, rest)
+    return _weigh(posterior, modes) if modes else posterior
 
 
 def _pair(
@@ -112,20 +111,21 @@ def _mode(
     return _Mode(state, cost / posterior.noise**2)
 
 
-def _other(posterior: Posterior, modes: list[_Mode]) -> Mirror | None:
-    """The best of the modes that are not the estimate, unless it is clearly worse."""
-    if not modes:
-        return None
+def _weigh(posterior: Posterior, modes: list[_Mode]) -> Posterior:
+    """The posterior with the covariance that the modes leave possible, and the other pose."""
     # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
     deviation = math.sqrt(np.linalg.eigvalsh(posterior.covariance[:3, :3])[-1])
-    steps = [step_between(posterior.state, mode.state) for mode in modes]
-    others = [
-        (mode.cost, step)
-        for mode, step in zip(modes, steps, strict=True)
-        if np.linalg.norm(step[:3]) > _COVERED * deviation
-    ]
-    if not others:
-        return None
-    cost, step = min(others, key=lambda other: other[0])
-    evidence = cost - min(mode.cost for mode in modes)
-    return Mirror(step, evidence) if evidence < _CLEARLY_WORSE else None
+    steps = np.array([step_between(posterior.state, mode.state) for mode in modes])
+    costs = np.array([mode.cost for mode in modes])
+    evidence = costs - costs.min()
+    probability = np.exp(-0.5 * evidence)
+    probability /= probability.sum()
+    # The better of each pair is in the covariance already.
+    pairs = costs.reshape(-1, 2)
+    probability[(pairs == pairs.min(axis=1, keepdims=True)).ravel()] = 0.0
+    covariance = posterior.covariance + np.einsum("k,ki,kj->ij", probability, steps, steps)
+    # The farthest of those that are not out of the question.
+    turns = np.where(evidence < _CLEARLY_WORSE, np.linalg.norm(steps[:, :3], axis=1), 0.0)
+    far = int(np.argmax(turns))
+    mirror = Mirror(steps[far], float(evidence[far]), bool(turns[far] < _COVERED * deviation))
+    return replace(posterior, covariance=covariance, mirror=mirror)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.jit import kernel
-from rs_localizer.core.prior import PriorTerms, held_terms
+from rs_localizer.core.prior import PriorTerms, gravity_cost, held_beside
 from rs_localizer.core.ransac import Observations
 from rs_localizer.core.refine import (
     apply_step,
@@ -40,8 +40,8 @@ _NOISE_ROUNDS = 20
 _VELOCITIES = slice(6, 12)
 # Rest fits worse than this, in noise variances, once in a hundred frames: the 99 % quantile of the
 # chi-squared distribution with six degrees of freedom.
-EVIDENCE_OF_MOTION = 16.8
-_CLEARLY_MOVING = 4.0 * EVIDENCE_OF_MOTION
+_EVIDENCE_OF_MOTION = 16.8
+_CLEARLY_MOVING = 4.0 * _EVIDENCE_OF_MOTION
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +50,7 @@ class Mirror:
 
     step: Array  # (12,) from the estimate to it
     evidence: float  # noise variances by which it fits worse
+    covered: bool  # the covariance speaks for it
 
     @property
     def turn(self) -> float:
@@ -179,18 +180,34 @@ def maximum_a_posteriori(
     return Posterior(state, covariance, noise, inflation, smallest, inliers, errors)
 
 
+def evidence_of_motion(posterior: Posterior, terms: PriorTerms) -> float:
+    """By how many noise variances motion has to fit better than rest to be as probable.
+
+    What the points tell of the velocities beyond the prior (the Occam factor: MacKay, "Bayesian
+    interpolation", 1992), and at most what chance explains in one frame of a hundred: where they
+    tell nothing, motion and rest are equally probable.
+    """
+    prior = np.diag(terms.informations[0])[6:]
+    if not np.all(prior > 0.0):
+        return _EVIDENCE_OF_MOTION
+    learnt = -np.log(prior).sum() - np.linalg.slogdet(posterior.covariance[6:, 6:])[1]
+    return float(np.clip(learnt, 0.0, _EVIDENCE_OF_MOTION))
+
+
 def weigh_against_rest(
-    observations: Observations, posterior: Posterior, rest: Array | None
+    observations: Observations, posterior: Posterior, terms: PriorTerms, rest: Array | None
 ) -> Posterior:
     """The average of the moving and the resting camera, by what the points say for either.
 
     A camera at rest deserves the six-parameter estimate, which is several times better. The six
-    velocities have to lower the squared errors by :data:`EVIDENCE_OF_MOTION` noise variances to
-    count more than rest; mean and covariance are those of the mixture of both, so that nothing
-    jumps between them. The covariance of the velocities stays what the moving model found: that a
-    slow motion was not seen does not mean that there was none.
+    velocities have to lower the squared errors by as many noise variances as chance does in one
+    frame of a hundred to count more than rest; the mean is that of the mixture of both, so that
+    nothing jumps between them. That a slow motion was not seen does not mean that there was none:
+    the covariance is that of the mixture by their probabilities (:func:`evidence_of_motion`), and
+    that of the velocities what the moving model found.
 
     Args:
+        terms: velocity prior and, if known, the direction of gravity.
         rest: state (18,) of the pose at rest, if it is not the one next to the moving one.
     """
     velocities = posterior.state[12:]
@@ -200,19 +217,21 @@ def weigh_against_rest(
         return posterior
     noise = posterior.noise
     start = np.concatenate([posterior.state[:12], np.zeros(6)]) if rest is None else rest
-    state, information, cost, _ = fit(observations, start, posterior.inliers, held_terms(), noise)
+    state, information, cost, _ = fit(
+        observations, start, posterior.inliers, held_beside(terms), noise
+    )
     moving_cost = float(posterior.squared_errors[posterior.inliers].sum())
-    gained = (cost - moving_cost) / noise**2
-    moving = 1.0 / (1.0 + math.exp(0.5 * (EVIDENCE_OF_MOTION - gained)))
-    resting = 1.0 - moving
+    gained = (cost - moving_cost) / noise**2 - gravity_cost(terms, posterior.state)
+    resting = 1.0 - _logistic(gained - _EVIDENCE_OF_MOTION)
+    possible = _logistic(gained - evidence_of_motion(posterior, terms))
     # As seen from the moving estimate: rest lies one step away, the average a part of it.
     step = step_between(posterior.state, state)
-    covariance = moving * posterior.covariance + moving * resting * np.outer(step, step)
-    covariance[:6, :6] += resting * posterior.variance * invert_information(
-        np.ascontiguousarray(information[:6, :6])
-    )[0]
-    covariance[_VELOCITIES, _VELOCITIES] += resting * spread
     average = apply_step(posterior.state, resting * step)
+    offsets = possible * resting**2 + (1.0 - possible) * (1.0 - resting) ** 2
+    covariance = possible * posterior.covariance + offsets * np.outer(step, step)
+    at_rest = posterior.variance * invert_information(np.ascontiguousarray(information[:6, :6]))[0]
+    covariance[:6, :6] += (1.0 - possible) * at_rest
+    covariance[_VELOCITIES, _VELOCITIES] += (1.0 - possible) * spread
     return replace(
         posterior,
         state=average,
@@ -221,11 +240,9 @@ def weigh_against_rest(
     )
 
 
-def weigh_against_mirror(posterior: Posterior, mirror: Mirror) -> Posterior:
-    """The posterior with the covariance that the other pose leaves possible."""
-    probability = 1.0 / (1.0 + math.exp(0.5 * mirror.evidence))
-    covariance = posterior.covariance + probability * np.outer(mirror.step, mirror.step)
-    return replace(posterior, covariance=covariance, mirror=mirror)
+def _logistic(evidence: float) -> float:
+    """Probability of a model for which this many noise variances speak."""
+    return 1.0 / (1.0 + math.exp(min(-0.5 * evidence, 700.0)))
 
 
 def fit(

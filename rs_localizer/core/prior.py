@@ -83,6 +83,12 @@ _STILL = np.concatenate([np.eye(3).ravel(), np.zeros(9)])
 
 def _check_motion(motion: Motion) -> None:
     for name in ("rotation", "translation", "angular_velocity", "linear_velocity"):
+        shape = (3, 3) if name == "rotation" else (3,)
+        if np.shape(getattr(motion, name)) != shape:
+            raise ValueError(
+                f"the prior motion's {name} must be of shape {shape}, "
+                f"got {np.shape(getattr(motion, name))}"
+            )
         if not np.all(np.abs(getattr(motion, name)) < _MOST):
             raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
     rotation = np.asarray(motion.rotation)
@@ -95,6 +101,8 @@ def _check_covariance(covariance: Array) -> None:
     if covariance.shape != (12, 12):
         raise ValueError(f"covariance must be (12,12), got {covariance.shape}")
     known = ~np.isinf(np.diag(covariance))
+    if not np.any(known):
+        return  # everything is free: the motion is only a first guess
     block = covariance[np.ix_(known, known)]
     if not np.all(np.isfinite(block)):
         raise ValueError("covariance must be finite where its diagonal is")
@@ -115,6 +123,18 @@ def velocity_terms(angular: float, linear: float) -> PriorTerms:
 def held_terms() -> PriorTerms:
     """A global shutter: velocities are zero."""
     return _single(np.diag(np.concatenate([np.zeros(6), np.full(6, _HOLDING)])), _STILL)
+
+
+def held_beside(terms: PriorTerms) -> PriorTerms:
+    """A camera at rest, of which the direction of gravity is known as in other terms."""
+    return held_terms()._replace(gravity=terms.gravity)
+
+
+def gravity_cost(terms: PriorTerms, state: Array) -> float:
+    """What a state (18,) costs by the measured direction of gravity, in noise variances."""
+    gravity = terms.gravity
+    error = state[:9].reshape(3, 3) @ gravity[:3] - gravity[3:6]
+    return float(gravity[6] * (error @ error))
 
 
 def _single(information: Array, reference: Array) -> PriorTerms:
@@ -157,9 +177,10 @@ def with_motion(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
 
 def state_in(motion: Motion, centre: Array) -> Array:
     """State (18,) of a motion for points taken relative to ``centre`` (3,)."""
-    translation = motion.translation + motion.rotation @ centre
+    rotation = np.asarray(motion.rotation, float)
+    translation = motion.translation + rotation @ centre
     return np.concatenate(
-        [motion.rotation.ravel(), translation, motion.angular_velocity, motion.linear_velocity]
+        [rotation.ravel(), translation, motion.angular_velocity, motion.linear_velocity]
     )
 
 

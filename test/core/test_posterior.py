@@ -59,7 +59,7 @@ def distances(scene, speed, frames, parts, weigh=False):
         observations, truth = observe(scene, speed, 0.5, 60, seed)
         posterior = maximum_a_posteriori(observations, truth, PRIOR, 2.0)
         if weigh:
-            posterior = weigh_against_rest(observations, posterior, None)
+            posterior = weigh_against_rest(observations, posterior, PRIOR, None)
         error = step_between(posterior.state, truth)[parts]
         result.append(error @ np.linalg.solve(posterior.covariance[parts, parts], error))
     return np.array(result)
@@ -78,7 +78,7 @@ def test_at_rest_the_pose_is_as_good_as_with_six_parameters(scene):
     assert 0.88 < np.mean(squared < 12.59) < 0.99
     observations, truth = observe(scene, 0.0, 0.5, 60, 0)
     moving = maximum_a_posteriori(observations, truth, PRIOR, 2.0)
-    resting = weigh_against_rest(observations, moving, None)
+    resting = weigh_against_rest(observations, moving, PRIOR, None)
     ratio = np.diag(resting.covariance)[:6] / np.diag(moving.covariance)[:6]
     assert ratio.min() < 0.7
     assert ratio.max() < 1.0
@@ -89,7 +89,7 @@ def test_at_rest_the_pose_is_as_good_as_with_six_parameters(scene):
 def test_a_clear_motion_is_left_alone(scene):
     observations, truth = observe(scene, 0.1, 0.5, 60, 1)
     moving = maximum_a_posteriori(observations, truth, PRIOR, 2.0)
-    assert weigh_against_rest(observations, moving, None) is moving
+    assert weigh_against_rest(observations, moving, PRIOR, None) is moving
 
 
 def test_slow_motions_are_averaged_without_a_jump_and_covered(scene):

@@ -123,3 +123,31 @@ def test_velocity_terms_are_precisions_and_none_for_zero():
 def test_an_impossible_prior_is_refused_with_what_was_found(arguments, said):
     with pytest.raises(ValueError, match=said):
         Prior(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("rotation", np.eye(3).ravel()),
+        ("translation", 0.0),
+        ("translation", np.zeros(2)),
+        ("angular_velocity", np.zeros((3, 1))),
+    ],
+)
+def test_a_prior_motion_of_the_wrong_shape_is_refused(part, value):
+    with pytest.raises(ValueError, match=f"the prior motion's {part} must be of shape"):
+        Prior(motion=replace(motion(), **{part: value}), covariance=np.eye(12))
+
+
+def test_a_motion_of_which_nothing_is_known_adds_nothing():
+    prior = Prior(motion=motion(), covariance=np.diag(np.full(12, np.inf)))
+    terms = with_motion(NOTHING, prior, CENTRE)
+    cost, information, _ = evaluate(terms, state_in(motion(5), CENTRE))
+    assert cost == 0.0
+    assert not information.any()
+
+
+def test_a_motion_may_be_given_in_lists():
+    listed = Motion(*(getattr(motion(), name).tolist() for name in (
+        "rotation", "translation", "angular_velocity", "linear_velocity")))  # fmt: skip
+    np.testing.assert_array_equal(state_in(listed, CENTRE), state_in(motion(), CENTRE))
