@@ -33,7 +33,7 @@ demo: $(ready)
 	@$(python) -m rs_localizer demo --out $(OUT)
 
 test: lint
-	@$(python) -m pytest -q
+	@$(python) -m pytest -q -n 2 --dist loadfile
 
 lint: $(ready)
 	@$(python) -m ruff check --quiet --output-format concise .

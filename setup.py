@@ -57,6 +57,7 @@ setup(
             "mypy==2.4.*",  # pinned, as is Ruff: what passes today passes with the next release
             "pytest",
             "pytest-timeout",
+            "pytest-xdist",
             "ruff==0.17.*",
             "setuptools>=70.1",  # the first that builds wheels on its own
         ],

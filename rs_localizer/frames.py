@@ -86,8 +86,9 @@ class FrameLocalizer:
         config: settings; assigning :attr:`config` changes them from the next frame on.
         notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
             (a recording that starts over), ``map_changed`` (another frame of the points),
-            ``map_replaced``, ``map_incomplete`` and ``too_many_keypoints``. Frames are localized
-            all the same.
+            ``map_replaced``, ``map_incomplete``, ``map_is_camera`` (points in the camera's own
+            frame), ``camera_changed`` and ``too_many_keypoints``. Frames are localized all the
+            same.
         transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
 
@@ -173,7 +174,14 @@ class FrameLocalizer:
         """
         if calibration != self._calibration:  # drivers repeat it with every image
             self._camera, self._localizer, self._tracker = _build(calibration, self._config)
-            self._calibration = calibration
+            before, self._calibration = self._calibration, calibration
+            if before is not None:
+                self._notice(
+                    "camera_changed",
+                    f"camera_info changed from {before.frame!r}, {before.width} x {before.height}, "
+                    f"to {calibration.frame!r}, {calibration.width} x {calibration.height}; the "
+                    "previous frames are forgotten (if it goes to and fro, two cameras publish it)",
+                )
 
     def load_map(self) -> None:
         """Use the map of the setting ``map_file``, if there is one.
@@ -232,7 +240,10 @@ class FrameLocalizer:
         except MessageError as error:
             return Refusal("bad_cloud", str(error))
         self._follow(cloud.stamp_ns, cloud.frame)
-        return self._localize(cloud)
+        result = self._localize(cloud)
+        if result:
+            self._lacks_map = False  # who sends correspondences needs none
+        return result
 
     def localize_keypoints(self, message: Any) -> Frame | Refusal:
         """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
@@ -286,6 +297,12 @@ class FrameLocalizer:
     def _localize(self, cloud: Correspondences) -> Frame | Refusal:
         if self._calibration is None:
             return Refusal("no_camera_info", "no usable camera_info has come yet")
+        if cloud.frame == self._calibration.frame:
+            self._notice(
+                "map_is_camera",
+                f"the points are given in {cloud.frame!r}, which is the camera's own frame: "
+                "header.frame_id of the cloud (or map) must name the frame of x, y, z",
+            )
         given = (cloud.points, cloud.pixels, cloud.scores)
         if self._tracker is None:
             result = self._localizer.localize(*given)

@@ -25,8 +25,9 @@ SUFFIXES = (".jpg", ".jpeg", ".png")
 
 # A time of 0 means "none" to ROS.
 _START_NS = 1_000_000_000
-# Names of image files that are a time in ns, as EuRoC's and TUM-VI's: later than 1970-01-12.
-_EARLIEST_NS = 10**15
+# Names of image files that are a time in ns, as EuRoC's and TUM-VI's: from 1973 (before, a name
+# may be a time of today in us) to what a stamp of ROS can hold.
+_EARLIEST_NS, _LATEST_NS = 10**17, 2**31 * 10**9
 
 
 class SourceError(ValueError):
@@ -85,7 +86,8 @@ def image_files(folder: Path) -> list[Path]:
 
 def have_times(files: list[Path]) -> bool:
     """Whether the names of image files are times in ns."""
-    return all(file.stem.isdecimal() and int(file.stem) >= _EARLIEST_NS for file in files)
+    names = [file.stem for file in files]
+    return all(n.isdecimal() and _EARLIEST_NS <= int(n) < _LATEST_NS for n in names)
 
 
 def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option: str) -> str:
@@ -115,7 +117,9 @@ def from_bag(
     latest: Any = None
     if info_topic is not None:
         topics.append(info_topic)
-        latest = next(message for _, _, message in bag.messages([info_topic]))
+        latest = next((message for _, _, message in bag.messages([info_topic])), None)
+        if latest is None:
+            raise SourceError(f"{bag.path} has no message on {info_topic}; give --calibration")
     for topic, _, message in bag.messages(topics):
         if topic == info_topic:
             latest = message

@@ -232,13 +232,20 @@ def test_a_solver_that_sees_no_motion_gives_no_twist(
 def test_a_new_camera_counts_from_the_next_frame_on(
     cloud: SimpleNamespace, make_camera_info: Make, mock: type[MockLocalizer]
 ) -> None:
-    frames = FrameLocalizer(NodeConfig(readout_time=READOUT_TIME, scan_direction="left_to_right"))
+    notices: list[tuple[str, str]] = []
+    frames = FrameLocalizer(
+        NodeConfig(readout_time=READOUT_TIME, scan_direction="left_to_right"),
+        lambda *words: notices.append(words),
+    )
     frames.take_camera_info(make_camera_info())
     made = len(mock.made)
     frames.take_camera_info(make_camera_info())  # the same again
     assert len(mock.made) == made
+    assert notices == []
     other = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="right_eye")
     frames.take_camera_info(make_camera_info(header=other, width=320))
+    assert [name for name, _ in notices] == ["camera_changed"]
+    assert "to 'right_eye', 320 x 480" in notices[0][1]
     assert mock.made[-1].camera.width == 320
     assert mock.made[-1].camera.readout_time == READOUT_TIME
     assert mock.made[-1].camera.scan_direction == "left_to_right"
@@ -294,6 +301,19 @@ def test_a_jump_of_time_and_another_map_start_afresh(
     frames.reset()  # who asks for it is not told
     assert not tracked(1, 0, "map")
     assert len(notices) == 2
+
+
+def test_points_in_the_frame_of_the_camera_are_said(
+    mock: type[MockLocalizer], cloud: SimpleNamespace, make_camera_info: Make
+) -> None:
+    notices: list[tuple[str, str]] = []
+    frames = FrameLocalizer(NodeConfig(), lambda *words: notices.append(words))
+    frames.take_camera_info(make_camera_info())
+    localized(frames.localize(cloud))
+    assert notices == []
+    cloud.header.frame_id = frames.camera_frame  # a header that was copied from the image
+    localized(frames.localize(cloud))
+    assert [name for name, _ in notices] == ["map_changed", "map_is_camera"]
 
 
 def simulated(direction: str, **settings: Any) -> list[tuple[Any, Any]]:

@@ -143,6 +143,19 @@ def test_a_map_that_is_missing_and_comes_late(
     assert notices == []
 
 
+def test_correspondences_need_no_map(
+    frames: list[SimulatedFrame], make_camera_info: Any
+) -> None:
+    node = localizer(make_camera_info)
+    assert refused(node.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_map"
+    assert node.missing == ("a map",)
+    rows = np.empty(len(frames[1].points), [(name, "<f8") for name in "xyzuv"])
+    for name, column in zip("xyzuv", [*frames[1].points.T, *frames[1].pixels.T], strict=True):
+        rows[name] = column
+    localized(node.localize(make_cloud(make_message, frames[1].stamp_ns, "map", rows)), frames[1])
+    assert node.missing == ()
+
+
 def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     notices = Notices()
     node = localizer(make_camera_info, notices)

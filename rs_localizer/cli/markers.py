@@ -13,7 +13,7 @@ from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.pages import write_pages
+from rs_localizer.markers.pages import page_files, write_pages
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.printing import PAGES, plan
 from rs_localizer.markers.prints import Board, Charuco, Chessboard
@@ -103,7 +103,7 @@ def _make(args: argparse.Namespace) -> None:
     target = Path(f"{args.out}.{args.format}")
     map_file = Path(f"{args.out}.yaml")
     pages = plan(marker_map, args.page)
-    for path in (target, map_file):
+    for path in (*page_files(target, len(pages)), map_file):
         if path.exists() and not args.overwrite:
             raise ValueError(f"{path} exists already; it is replaced with --overwrite")
     files = write_pages(pages, target)

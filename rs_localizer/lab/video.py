@@ -17,6 +17,8 @@ _START, _END, _SCAN = 0xD8, 0xD9, 0xDA
 _LONELY = {0x01, _START, *range(0xD0, 0xD8)}
 # For videos that are not JPEG already; artefacts stay below the noise of a corner.
 _QUALITY = 95
+# Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.
+_AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 class VideoError(ValueError):
@@ -47,13 +49,14 @@ def read_video(path: Path | str) -> Iterator[tuple[bytes, Image]]:
 
 def _from_stream(path: Path) -> Iterator[tuple[bytes, Image]]:
     for jpeg in split_jpegs(path.read_bytes()):
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_IT_IS)
         if image is not None:
             yield jpeg, np.asarray(image, np.uint8)
 
 
 def _from_container(path: Path) -> Iterator[tuple[bytes, Image]]:
     video = cv2.VideoCapture(str(path))
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as with _AS_IT_IS
     try:
         while True:
             read, color = video.read()

@@ -19,6 +19,8 @@ _SMOOTHING = 1.0  # px
 # none, the search takes 50 ms in 640x480, and its time grows with more than the area.
 # (cv2.checkChessboard and the flag for it are fast, and overlook small boards.)
 _LARGEST_SEARCH = 1024
+# OpenCV's search fails in smaller ones (px), which cannot show a board.
+_SMALLEST_SEARCH = 16
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 
 
@@ -33,6 +35,8 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
         None when the whole board is not seen.
     """
     small, scale = _shrunk(image)
+    if min(small.shape) < _SMALLEST_SEARCH:
+        return None
     found, corners = cv2.findChessboardCorners(small, (board.columns, board.rows))
     if not found:
         return None
@@ -85,7 +89,7 @@ def _shrunk(image: Gray) -> tuple[Gray, int]:
     if scale == 1:
         return image, 1
     # A pixel becomes of scale x scale whole ones: pixel centres stay exact.
-    size = (width // scale, height // scale)
+    size = (max(1, width // scale), max(1, height // scale))
     whole = image[: size[1] * scale, : size[0] * scale]
     return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 

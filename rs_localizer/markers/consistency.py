@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations
 
 import numpy as np
 
@@ -23,7 +22,7 @@ def problems(marker_map: MarkerMap) -> list[str]:
     """What is wrong with a map that could be read; empty if nothing is."""
     return [
         *_other_units(marker_map.markers),
-        *(text for a, b in combinations(_plates(marker_map), 2) for text in _pair(a, b)),
+        *(text for a, b in _near(_plates(marker_map)) for text in _pair(a, b)),
     ]
 
 
@@ -41,11 +40,23 @@ class _Plate:
             width, height = (item.columns + more) * item.square, (item.rows + more) * item.square
             self.side = self.rim = item.square
         x, y = 0.5 * width, 0.5 * height
+        # What :func:`_pair` looks at is within the reaches of both.
+        self.reach = float(np.hypot(x, y)) + 2.0 * self.side
         self.corners = self.pose(np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]]))
 
 
 def _plates(marker_map: MarkerMap) -> list[_Plate]:
     return [_Plate(item) for item in (*marker_map.markers, *marker_map.boards)]
+
+
+def _near(plates: list[_Plate]) -> Iterator[tuple[_Plate, _Plate]]:
+    """Pairs that may have to do with each other: of a thousand markers, few."""
+    middles = np.array([plate.pose.position for plate in plates])
+    reaches = np.array([plate.reach for plate in plates])
+    for k, plate in enumerate(plates):
+        apart = np.linalg.norm(middles[k + 1 :] - middles[k], axis=1)
+        for other in np.flatnonzero(apart <= reaches[k + 1 :] + reaches[k]).tolist():
+            yield plate, plates[k + 1 + other]
 
 
 def _other_units(markers: tuple[Marker, ...]) -> Iterator[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rs_localizer.core.so3 import Array
@@ -11,12 +13,16 @@ from rs_localizer.markers.prints import Marker
 
 # Markers within this distance of a plane (in sides) and this angle are in one.
 _SAME_PLANE, _PARALLEL = 0.2, np.cos(np.radians(5.0))
-# How far corners may be from where the others of their plane put them, in sides of the markers.
-# The homography takes in most of what the shutter and the lens do; a marker that is elsewhere, or
-# mirrored, is off by about a side.
+# How far corners may be from where their neighbours put them, in sides of the markers. Among few
+# neighbours the projection takes in what the shutter and even a fisheye lens do; a marker that is
+# elsewhere, or mirrored, is off by about a side.
 _FITS, _MISFITS = 0.1, 0.25
 # A projection of space can be told of so many markers that fill it to this share of their extent.
 _ENOUGH, _SOLID = 5, 0.1
+# So many neighbours in the image are compared: of a plane, and where planes meet.
+_NEIGHBOURS, _AROUND = 3, 8
+# What is farther away than this (in sides) is none: there a fisheye lens counts.
+_FAR = 6.0
 _MISFIT_TEXT = (
     "the map does not fit the image: {} do not lie as it says; a position, a size or an id is wrong"
 )
@@ -38,12 +44,12 @@ class MapCheck:
         """What is wrong with the map according to this image; None if nothing can be said."""
         whole = _whole(seen, 4 * len(self._names))
         for plane in sorted({self._planes[m] for m in whole}):
-            text = self._flat(
-                seen, {m: rows for m, rows in whole.items() if self._planes[m] == plane}
-            )
-            if text is not None:
-                return text
-        return self._solid(seen, whole)
+            flat = {m: rows for m, rows in whole.items() if self._planes[m] == plane}
+            for some in _neighbourhoods(seen, flat):
+                text = self._flat(seen, some)
+                if text is not None:
+                    return text
+        return self._solid(seen, self._meeting(seen, whole))
 
     def _flat(self, seen: Detections, whole: dict[int, IntArray]) -> str | None:
         """Markers that the map puts into one plane."""
@@ -64,6 +70,18 @@ class MapCheck:
                 "clockwise as seen from the front; frames are right-handed)"
             )
         return _MISFIT_TEXT.format(names)
+
+    def _meeting(self, seen: Detections, whole: dict[int, IntArray]) -> dict[int, IntArray]:
+        """The markers around where two of different planes are nearest to each other."""
+        markers, apart = _apart(seen, whole)
+        planes = np.array([self._planes[m] for m in markers])
+        other = np.where(planes[:, None] == planes, np.inf, apart)
+        if not np.isfinite(other).any():
+            return {}
+        pair = np.unravel_index(np.argmin(other), other.shape)
+        nearest = apart[list(pair)].min(axis=0)
+        chosen = np.argsort(nearest, kind="stable")[:_AROUND].tolist()
+        return {markers[k]: whole[markers[k]] for k in sorted(chosen)}
 
     def _solid(self, seen: Detections, whole: dict[int, IntArray]) -> str | None:
         """All markers together: in a mirrored map, planes at an angle fit, each by itself."""
@@ -110,6 +128,24 @@ def _whole(seen: Detections, end: int) -> dict[int, IntArray]:
     markers = sorted({id_ // 4 for id_ in place})
     corners = {m: [place.get(4 * m + k, -1) for k in range(4)] for m in markers}
     return {m: np.array(rows) for m, rows in corners.items() if min(rows) >= 0}
+
+
+def _apart(seen: Detections, whole: dict[int, IntArray]) -> tuple[list[int], Array]:
+    """The markers, and the distances (m,m) of their middles, px."""
+    middles = np.array([seen.pixels[rows].mean(axis=0) for rows in whole.values()]).reshape(-1, 2)
+    return list(whole), np.linalg.norm(middles[:, None] - middles, axis=2)
+
+
+def _neighbourhoods(seen: Detections, whole: dict[int, IntArray]) -> Iterator[dict[int, IntArray]]:
+    """Each marker with those that are nearest to it in the image, each set once."""
+    markers, apart = _apart(seen, whole)
+    sets = set()
+    for m, distances in enumerate(apart):
+        limit = _FAR * _mean_side(seen.pixels[whole[markers[m]]])
+        near = np.argsort(distances, kind="stable")[:_NEIGHBOURS]
+        sets.add(tuple(sorted(k for k in near.tolist() if distances[k] < limit)))
+    for some in sorted(sets):
+        yield {markers[k]: whole[markers[k]] for k in some}
 
 
 def _normalized(values: Array) -> tuple[Array, Array]:

@@ -62,10 +62,17 @@ def write_pages(pages: Sequence[Page], path: Path) -> list[Path]:
         return [path]
     if path.suffix != ".png":
         raise PrintError(f"{path} must end in .pdf or .png")
-    names = [path] if count == 1 else [path.with_stem(f"{path.stem}_{k + 1}") for k in range(count)]
+    names = page_files(path, count)
     for figure, name in zip(figures, names, strict=True):
         figure.savefig(name, dpi=_PNG_DPI)
     return names
+
+
+def page_files(path: Path, count: int) -> list[Path]:
+    """Where so many pages are written to: one PDF, or a PNG for each."""
+    if count == 1 or path.suffix == ".pdf":
+        return [path]
+    return [path.with_stem(f"{path.stem}_{k + 1}") for k in range(count)]
 
 
 def _draw(page: Page, number: str) -> Any:
@@ -117,4 +124,5 @@ def _foot(axes: Any, page: Page, number: str) -> None:
     told = f"print at 100 % (actual size): this bar is {_BAR:.0f} mm long"
     axes.text(MARGIN, y + 4.0, told, fontsize=_FONT)
     right = "; ".join(text for text in (page.note, number) if text)
-    axes.text(page.width - MARGIN, y, right, fontsize=0.8 * _FONT, ha="right")
+    # Above the bar, which it must not cover.
+    axes.text(page.width - MARGIN, y + 8.0, right, fontsize=0.8 * _FONT, ha="right")

@@ -19,6 +19,8 @@ from rs_localizer.markers.poses import rotation_of_quaternion
 
 # Images that wait for a pose; those without one are shown without cubes.
 _WAITING = 3
+# Poses that wait for an image.
+_MOST_POSES = 100
 
 Show = Callable[[Detected, Picture], None]
 
@@ -54,6 +56,8 @@ class DebugPictures:
         """A geometry_msgs/PoseStamped; of use where no odometry comes, without a twist."""
         still = np.zeros(3)
         self._poses[stamp_ns(message)] = _path(message, message.pose, still, still)
+        while len(self._poses) > _MOST_POSES:
+            del self._poses[next(iter(self._poses))]
 
     def take_odometry(self, message: Any, config: DetectorConfig) -> None:
         """A nav_msgs/Odometry, of the camera in the map: show the image that it belongs to."""

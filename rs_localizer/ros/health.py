@@ -13,6 +13,10 @@ from rs_localizer.ros.statistics import WINDOW, Percentiles, Summary
 _LOST = 5
 # Share of the frames that may be refused or replaced before it is worth a warning.
 _SOME = 0.05
+# What a node that is not active needs, by the label of its state.
+_STEPS = {"unconfigured": "configure and activate it", "finalized": "start it again"}
+# Refusals of what a frame cannot be localized without.
+_UNUSABLE = {"camera_info": "bad_camera_info", "a map": "bad_map"}
 # A frame that is worked on for longer (s) holds up the others.
 _LONG_WORK = 1.0
 
@@ -77,8 +81,11 @@ def diagnose(condition: Condition, summary: Summary) -> Health:
 
 
 def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
+    if condition.life_cycle == "configuring":
+        return Level.WARN, "compiling", "the node is being configured: kernels are compiled"
     if condition.life_cycle != "active":
-        return Level.STALE, "inactive", f"the node is {condition.life_cycle}: activate it"
+        steps = _STEPS.get(condition.life_cycle, "activate it")
+        return Level.STALE, "inactive", f"the node is {condition.life_cycle}: {steps}"
     if condition.changing:
         return Level.WARN, "compiling", "the kernels for the new settings are being compiled"
     if summary.busy is not None and summary.busy > _LONG_WORK:
@@ -88,6 +95,9 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
         level = Level.WARN if silent else Level.ERROR
         what = " and ".join(condition.missing)
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
+        for reason in (_UNUSABLE[name] for name in condition.missing if name in _UNUSABLE):
+            if count := summary.refusals.get(reason):
+                causes.append(f"{count} came and cannot be used: {reason} in the log says why")
         if any(item.mismatch for item in condition.silence.values()):
             level = Level.ERROR
         return level, f"waiting for {what}", "; ".join([f"waiting for {what}", *causes])
@@ -151,6 +161,8 @@ def _values(condition: Condition, summary: Summary) -> dict[str, str]:
         "Frames replaced": str(summary.replaced),
         "Frames refused": str(summary.refused),
     }
+    if summary.dropped:
+        values["Frames dropped"] = str(summary.dropped)
     values |= {f"Refused: {reason}": str(n) for reason, n in sorted(summary.refusals.items())}
     values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
     return values

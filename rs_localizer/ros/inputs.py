@@ -12,6 +12,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import (
     QoSCompatibility,
+    QoSPolicyKind,
     QoSProfile,
     ReliabilityPolicy,
     qos_check_compatible,
@@ -26,6 +27,9 @@ from rs_localizer.ros.refusals import Refusals
 # As qos_profile_sensor_data, with more room: what comes while this process does not get the CPU
 # shall be counted by the mailbox, which keeps the newest, and not be lost unseen.
 SENSOR_DATA = {"depth": 20, "reliability": ReliabilityPolicy.BEST_EFFORT}
+
+# rclpy's default policies.
+_OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
 # A topic without a message for so long (s) is silent.
 _LONG = 2.0
@@ -69,7 +73,13 @@ class Inputs:
         self._created = time.monotonic()
         self._heard: dict[str, float] = {}
         self._lasting = {name for name, topic in topics.items() if topic.lasting}
-        self._subscriptions = {name: self._subscribe(name, topic) for name, topic in topics.items()}
+        self._subscriptions: dict[str, Subscription] = {}
+        try:
+            for name, topic in topics.items():
+                self._subscriptions[name] = self._subscribe(name, topic)
+        except Exception:
+            self._destroy()
+            raise
         self._intake = Intake(
             node.context,
             tuple(self._subscriptions.values()),
@@ -88,6 +98,9 @@ class Inputs:
     def close(self) -> None:
         """Take no more messages."""
         self._intake.close()
+        self._destroy()
+
+    def _destroy(self) -> None:
         for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions = {}
@@ -105,7 +118,10 @@ class Inputs:
             callback_group=self._group,
             # Events of a subscription wake the executor with every message; the graph knows more.
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            qos_overriding_options=QoSOverridingOptions(
+                # Of what is latched also the durability: not everybody latches maps.
+                _OVERRIDABLE + (QoSPolicyKind.DURABILITY,) * topic.lasting
+            ),
             raw=topic.raw,
         )
 

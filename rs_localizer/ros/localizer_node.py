@@ -22,6 +22,7 @@ from rs_localizer.io.maps import MapError
 from rs_localizer.ros import parameters, transforms
 from rs_localizer.ros.broadcaster import Broadcaster
 from rs_localizer.ros.diagnostics import Diagnostics
+from rs_localizer.ros.errors import describe
 from rs_localizer.ros.feed import FRAME_TOPICS, Feed, described, warm_up
 from rs_localizer.ros.health import Condition, Health, diagnose, of_interest
 from rs_localizer.ros.inputs import Inputs
@@ -82,15 +83,16 @@ class LocalizerNode(RobustLifecycleNode):
                 seconds = warm_up(frames)
             self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
             self._broadcaster.configure(config)
+            self._outputs = Outputs(
+                self, afterwards=lambda frame: self._broadcaster.publish(frame, frames.config)
+            )
         except MapError as error:
             self.get_logger().error(f"not configured: {error}")
             return TransitionCallbackReturn.FAILURE
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
+            self._close_outputs()
             return TransitionCallbackReturn.FAILURE
-        self._outputs = Outputs(
-            self, afterwards=lambda frame: self._broadcaster.publish(frame, frames.config)
-        )
         self._localizer = frames
         self._worker = Worker(
             frames,
@@ -103,7 +105,14 @@ class LocalizerNode(RobustLifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._inputs = Inputs(self, self._feed.topics(), self.refusals)
+        # Before a frame can come: publishers that are not active yet drop its messages.
+        result = super().on_activate(state)
+        try:
+            self._inputs = Inputs(self, self._feed.topics(), self.refusals)
+        except Exception as error:  # rclpy would hide it; QoS overrides that make no QoS
+            self.get_logger().error(f"not activated: {describe(error)}")
+            super().on_deactivate(state)
+            return TransitionCallbackReturn.FAILURE
         config = parameters.read(self)
         if config.readout_time == 0.0:
             self._warn(
@@ -112,7 +121,7 @@ class LocalizerNode(RobustLifecycleNode):
         self.get_logger().info(
             f"active with solver {config.solver}, listening to {' and '.join(self._inputs.topics)}"
         )
-        return super().on_activate(state)
+        return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._close_inputs()

@@ -64,11 +64,15 @@ class Mailbox(Generic[State, Item]):
             frame = None if oldest is None else self._frames.pop(oldest)
             return Work(updates.values(), frame, self._session)
 
-    def drop_frames(self) -> None:
-        """Forget the frames that wait, and end the session of the one that is worked on."""
+    def drop_frames(self) -> int:
+        """Forget the frames that wait, how many there are, and end the session of the one that is
+        worked on.
+        """
         with self._changed:
+            dropped = len(self._frames)
             self._frames.clear()
             self._session += 1
+            return dropped
 
     def is_current(self, work: Work[State, Item]) -> bool:
         """Whether its result is still wanted."""

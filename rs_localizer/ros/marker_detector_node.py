@@ -110,13 +110,13 @@ class MarkerDetectorNode(RobustLifecycleNode):
             detector = FrameDetector(config, self.refusals.notice)
             with self._compiling():
                 detector.warm_up()
+            self._outputs = DetectorOutputs(self)
         except ValueError as error:
             self.get_logger().error(f"not configured: {error}")
             return TransitionCallbackReturn.FAILURE
         except Exception:  # rclpy would hide it
             self.get_logger().error(f"not configured:\n{traceback.format_exc()}")
             return TransitionCallbackReturn.FAILURE
-        self._outputs = DetectorOutputs(self)
         debug = DebugPictures(self._outputs.show, self.refusals.notice)
         self._work = _Work(detector, config, debug)
         self._worker = Worker(

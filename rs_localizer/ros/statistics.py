@@ -45,6 +45,7 @@ class Summary:
     received: dict[str, int]  # frames since the start, by topic
     answered: int
     replaced: int
+    dropped: int  # because the node was deactivated
     refused: int
     refusals: dict[str, int]  # also of messages that are no frames, by reason
     rate_in: float  # Hz
@@ -79,7 +80,7 @@ class Statistics:
         self._clock = clock
         self._lock = threading.Lock()
         self._received: Counter[str] = Counter()
-        self._answered = self._replaced = self._refused = self._in_a_row = 0
+        self._answered = self._replaced = self._refused = self._dropped = self._in_a_row = 0
         self._last: Any = None
         self._started: float | None = None
         # Times of what happened, and what is told of each answer.
@@ -98,6 +99,11 @@ class Statistics:
         with self._lock:
             self._replaced += 1
             self._replaced_at.append(self._clock())
+
+    def dropped(self, count: int) -> None:
+        """The node was deactivated before these frames were answered."""
+        with self._lock:
+            self._dropped += count
 
     def started(self) -> None:
         """The worker has taken a frame."""
@@ -147,6 +153,7 @@ class Statistics:
                 received=dict(self._received),
                 answered=self._answered,
                 replaced=self._replaced,
+                dropped=self._dropped,
                 refused=self._refused,
                 refusals=dict(self._refusals.counts),
                 rate_in=_rate([when for when in self._in if when >= since]),

@@ -39,7 +39,8 @@ class Worker:
         frames: localizes; from now on only through updates and arrivals.
         publish: called in the thread with each localized frame, never after :meth:`pause`.
         statistics: told what becomes of each frame.
-        failed: told in one sentence of errors that nobody foresaw; the thread goes on.
+        failed: told in one sentence of errors in updates that nobody foresaw; the thread goes on.
+            Those in frames are refusals, ``internal_error``.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class Worker:
     def pause(self) -> None:
         """Forget the frames so far, the one that is worked on included."""
         with self._publishing:
-            self._mailbox.drop_frames()
+            self._statistics.dropped(self._mailbox.drop_frames())
 
     def close(self) -> None:
         """End the thread after the frame that it works on, of which nothing is published."""
@@ -87,7 +88,7 @@ class Worker:
             for update in work.updates:
                 self._guarded(update, self._frames)
             if work.frame is not None:
-                self._guarded(self._localize, work, work.frame)
+                self._localize(work, work.frame)
 
     def _guarded(self, function: Callable[..., None], *arguments: Any) -> None:
         try:
@@ -96,19 +97,33 @@ class Worker:
             self._failed(describe(error))
 
     def _localize(self, work: Work[FrameLocalizer, Arrival], arrival: Arrival) -> None:
+        try:
+            result = self._answer(work, arrival)
+        except Exception as error:  # of one message: the others go on
+            result = Refusal("internal_error", describe(error))
+        if isinstance(result, Refusal):
+            self._statistics.refused(result)
+        elif result is None:
+            self._statistics.dropped(1)
+        else:
+            self._statistics.answered(result, arrival.received)
+
+    def _answer(
+        self, work: Work[FrameLocalizer, Arrival], arrival: Arrival
+    ) -> Frame | Refusal | None:
+        """What was published, or why nothing was; None: nobody wants it any more."""
         self._statistics.started()
         try:
             result = arrival.localize(self._frames, arrival.message)
         finally:
             self._statistics.ended()
         if not result:
-            self._statistics.refused(result)
-            return
+            return result
         with self._publishing:
             if not self._mailbox.is_current(work):
-                return
+                return None
             self._publish(result)
-        self._statistics.answered(result, arrival.received)
+        return result
 
 
 def wait_for_workers(seconds: float) -> bool:

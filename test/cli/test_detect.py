@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.main import main
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.image_sources import SourceError, from_bag
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
@@ -193,10 +194,21 @@ def test_georeferenced_maps_keep_their_millimetres(files: Any, tmp_path: Path) -
 def test_folder_of_images(files: Any, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
-    for name in ("9000000000000000.png", "10000000000000000.jpg"):
+    for name in ("900000000000000000.png", "1000000000000000000.jpg"):
         cv2.imwrite(str(folder / name), markers())
     assert detect(files, str(folder), *files.map, *files.calibration) == 0
-    assert [cloud.stamp_ns for cloud in clouds(files.out)] == [9 * 10**15, 10**16]
+    assert [cloud.stamp_ns for cloud in clouds(files.out)] == [9 * 10**17, 10**18]
+
+
+@pytest.mark.parametrize("name", ["1650000000000000", "1" + 29 * "0"])
+def test_other_numbers_are_no_times(
+    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    """Microseconds, and what no stamp can hold."""
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), markers())
+    assert detect(files, str(tmp_path / "images"), *files.map, *files.calibration) == 2
+    assert "the names of the files are no times in ns" in capsys.readouterr().err
 
 
 def test_nothing_is_left_where_nothing_was_seen(
@@ -235,6 +247,9 @@ def test_faults_end_the_command(
     image_bag(tmp_path / "bag", [markers()], info=False)
     assert detect(files, str(tmp_path / "bag"), *files.map) == 1
     assert "no topic of type sensor_msgs/msg/CameraInfo: none" in capsys.readouterr().err
+    silent = SimpleNamespace(path=tmp_path / "bag", messages=lambda topics: iter(()))
+    with pytest.raises(SourceError, match="bag has no message on /info; give --calibration"):
+        next(from_bag(silent, "/image", "/info", None))  # type: ignore[arg-type]
     assert detect(files, str(tmp_path / "bag"), "--map", str(tmp_path / "none.yaml")) == 1
     assert "none.yaml cannot be read: No such file" in capsys.readouterr().err
     assert not files.out.exists()

@@ -52,6 +52,17 @@ def test_large_markers_come_on_pages_of_their_own(
     assert "mount each where the map has it" in said
 
 
+def test_pages_of_others_are_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wall_2.png").write_text("a photograph")
+    words = ["--size", "0.13", "--grid", "2x1", "--format", "png"]
+    assert make(tmp_path / "wall", *words) == 1
+    assert "wall_2.png exists already" in capsys.readouterr().err
+    assert (tmp_path / "wall_2.png").read_text() == "a photograph"
+    assert not (tmp_path / "wall_1.png").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [

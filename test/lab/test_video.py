@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -65,6 +66,32 @@ def test_stream_and_container(tmp_path: Path) -> None:
     read = list(read_video(tmp_path / "a.avi"))
     assert [round(float(image.mean()), -1) for _, image in read] == [50, 100, 150, 200]
     assert all(cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0) is not None for jpeg, _ in read)
+
+
+def test_rows_stay_as_the_sensor_read_them(tmp_path: Path) -> None:
+    # Orientation 3 of EXIF: to be shown turned by half.
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03" + bytes(7)
+    plain = jpegs(1)[0]
+    (tmp_path / "a.mjpeg").write_bytes(with_segment(plain, exif))
+    ((_, image),) = read_video(tmp_path / "a.mjpeg")
+    np.testing.assert_array_equal(image, cv2.imdecode(np.frombuffer(plain, np.uint8), 0))
+
+    writer = cv2.VideoWriter(
+        str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (64, 48)
+    )
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:24] = 200
+    writer.write(picture)
+    writer.release()
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    matrix = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    assert data.count(matrix) == 2  # of the movie, then of its track
+    half = struct.pack(">9i", -1 << 16, 0, 0, 0, -1 << 16, 0, 64 << 16, 48 << 16, 1 << 30)
+    at = data.rfind(matrix)
+    data[at : at + len(half)] = half
+    (tmp_path / "a.mp4").write_bytes(data)
+    ((_, image),) = read_video(tmp_path / "a.mp4")
+    assert image[:20].mean() > 150 > image[28:].mean()
 
 
 def test_what_is_no_video_is_refused(tmp_path: Path) -> None:

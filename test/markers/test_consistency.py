@@ -61,6 +61,21 @@ def test_true_maps_have_no_fault() -> None:
         assert shown(true, true) is None
 
 
+def test_a_fisheye_lens_is_no_fault_of_the_map() -> None:
+    back = wall("4x4_250", 11, 7, 0.3, 0.1, pose=Pose(np.array([0.5, 1.2, 0.1]), UPRIGHT))
+    left = wall(
+        "4x4_250", 3, 7, 0.3, 0.1, first_id=100, pose=Pose(np.array([-1.5, 0.5, 0.1]), SIDEWAYS)
+    )
+    told = MarkerMap((*back, *left))
+    x, z, y = (told.points - np.array([0.5, -0.3, 0.1])).T
+    y = -y
+    side = np.hypot(x, y)
+    pixels = 300.0 * (np.arctan2(side, z) / side * np.array([x, y])).T + [320, 240]
+    ids = np.arange(len(pixels))
+    image = Detections(ids, told.points, pixels, np.ones(len(ids)), (), (), (), ())
+    assert MapCheck(told).fault(image) is None
+
+
 def test_mirrored_corners_show_in_an_image() -> None:
     true = corner()
     told = changed(true, lambda corners: corners[[1, 0, 3, 2]])
@@ -79,6 +94,15 @@ def test_a_marker_at_another_place_shows_in_an_image() -> None:
     moved = [*true.markers]
     moved[2] = Marker(moved[2].family, moved[2].id, moved[2].corners + np.array([0, 0, 0.4]))
     assert "does not fit the image" in str(shown(MarkerMap(tuple(moved)), true))
+
+
+def test_a_few_markers_of_many_at_another_place_show_in_an_image() -> None:
+    true = MarkerMap(
+        wall("4x4_250", 9, 6, 0.12, 0.04, pose=Pose(np.array([0.5, 2.0, 0.0]), UPRIGHT))
+    )
+    places = iter(range(54))
+    told = changed(true, lambda corners: corners + np.array([0, 0, 0.12 * (next(places) == 20)]))
+    assert "do not lie as it says" in str(shown(told, true))
 
 
 def test_corners_that_were_not_found_say_nothing() -> None:

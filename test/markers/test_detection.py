@@ -285,3 +285,9 @@ def test_charuco_corners_are_those_of_opencvs_board(
     found = detector.detect(render([(cells, outline)], pose))
     assert 3 <= len(found.ids) < 3 * (rows - 1)
     np.testing.assert_allclose(found.pixels, project(board.points[found.ids], pose), atol=0.15)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (8, 8), (2, 70_000), (70_000, 2), (40, 33_000)])
+def test_tiny_and_narrow_images_show_no_chessboard(shape: tuple[int, int]) -> None:
+    detector = MarkerDetector(MarkerMap(boards=(Chessboard(6, 4, 0.03),)))
+    assert len(detector.detect(np.zeros(shape, np.uint8)).ids) == 0

@@ -62,6 +62,19 @@ def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path: Path)
     assert len(page.figures) == 4
 
 
+@pytest.mark.parametrize("name", ["a4", "letter"])
+def test_notes_do_not_cover_the_bar(name: str, tmp_path: Path) -> None:
+    family_ = family("apriltag_36h11")
+    (page,) = plan(MarkerMap(boards=(Charuco(5, 7, 0.03, 0.0225, family_),)), name)
+    write_pages([page], tmp_path / "page.png")
+    image = cv2.imread(str(tmp_path / "page.png"), cv2.IMREAD_GRAYSCALE)
+    # Right of the bar's last tick, along the bar, nothing is printed, nor on the last tenth of it.
+    mm = 300 / 25.4
+    row = image.shape[0] - round(10.0 * mm)
+    assert image[row - round(3.5 * mm) : row + round(mm), round(110.5 * mm) :].min() == 255
+    assert image[row - round(3.5 * mm) : row - 5, round(101 * mm) : round(109 * mm)].min() == 255
+
+
 def test_pdf_has_the_size_of_the_paper(tmp_path: Path) -> None:
     pages = plan(MarkerMap(wall("4x4_50", 3, 1, 0.12, 0.1)), "letter")
     (file,) = write_pages(pages, tmp_path / "wall.pdf")

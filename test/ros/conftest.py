@@ -69,6 +69,7 @@ class Peer:
         self.node = rclpy.create_node("peer", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def spin_until(self, condition: Callable[[], Any], timeout: float = TIMEOUT) -> bool:
         deadline = time.monotonic() + timeout
@@ -79,11 +80,15 @@ class Peer:
         return True
 
     def call(self, service_type: Any, name: str, request: Any) -> Any:
-        client = self.node.create_client(service_type, name)
-        assert self.spin_until(client.service_is_ready), f"no service {name}"
-        future = client.call_async(request)
+        if name not in self._clients:
+            client = self.node.create_client(service_type, name)
+            assert self.spin_until(client.service_is_ready), f"no service {name}"
+            # The client knows the service; that the service knows the client, nothing tells, and
+            # until then its answer is lost.
+            self.spin_until(lambda: False, 0.3)
+            self._clients[name] = client
+        future = self._clients[name].call_async(request)
         assert self.spin_until(future.done), f"no answer from {name}"
-        self.node.destroy_client(client)
         return future.result()
 
     def close(self) -> None:

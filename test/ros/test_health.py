@@ -144,6 +144,13 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
     ("change", "level", "state", "message"),
     [
         ({"life_cycle": "inactive"}, Level.STALE, "inactive", "the node is inactive: activate it"),
+        ({"life_cycle": "configuring"}, Level.WARN, "compiling", "the node is being configured"),
+        (
+            {"life_cycle": "unconfigured"},
+            Level.STALE,
+            "inactive",
+            "the node is unconfigured: configure and activate it",
+        ),
         ({"changing": True}, Level.WARN, "compiling", "the kernels for the new settings are"),
         # Frames come, so that the other one is what is wrong.
         (
@@ -204,6 +211,15 @@ def test_what_is_missing_comes_first(
     health = world.diagnose(replace(GOOD, **change))
     assert (health.level, health.state) == (level, state)
     assert health.message.startswith(message)
+
+
+def test_what_is_missing_came_and_cannot_be_used(world: World) -> None:
+    for _ in range(3):
+        world.refusals.add("bad_camera_info", "the camera is not calibrated: K[0] is 0")
+    health = world.diagnose(replace(GOOD, missing=("camera_info",)))
+    assert health.message == (
+        "waiting for camera_info; 3 came and cannot be used: bad_camera_info in the log says why"
+    )
 
 
 def test_a_frame_that_takes_long(world: World) -> None:

@@ -172,6 +172,20 @@ def test_a_latched_map_and_a_map_file(
     assert peer.spin_until(lambda: talk.status.get("State") in ("tracking", "localized"))
 
 
+def test_a_map_that_is_not_latched(
+    start_node: Callable[..., Any], peer: Any, flight: tuple[Any, list[SimulatedFrame]]
+) -> None:
+    info, frames = flight
+    override = "qos_overrides./map_points.subscription.durability:=volatile"
+    start_node("-p", f"readout_time:={READOUT_TIME}", "-p", override)
+    talk = Talk(peer, info)
+    volatile = peer.node.create_publisher(PointCloud2, "map_points", 1)
+    talk.connect()
+    assert peer.spin_until(volatile.get_subscription_count)
+    volatile.publish(make_cloud(make_message, 0, LANDMARKS.frame, map_rows(LANDMARKS)))
+    talk.localize(frames[0])
+
+
 def test_a_map_file(
     tmp_path: Path,
     start_node: Callable[..., Any],

@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, PointCloud2
@@ -28,7 +30,10 @@ from rs_localizer.lab.recording import write_simulated
 from rs_localizer.lab.scene import room
 from rs_localizer.lab.simulation import FrameSettings, simulate_frames
 from rs_localizer.lab.true_motion import ConstantVelocity
+from rs_localizer.ros import localizer_node
 from rs_localizer.ros.conversion import copy_message, message_class
+from rs_localizer.ros.inputs import Inputs
+from rs_localizer.ros.localizer_node import LocalizerNode
 
 READOUT_TIME = 0.03
 SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
@@ -465,6 +470,44 @@ def test_started_with_bad_parameters(
     assert len(fatal) == 1
     assert re.search(text, fatal[0])
     assert "Traceback" not in node.log
+
+
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [
+        ("/correspondences.subscription.reliability:=foo", "not activated: .*reliability.*foo"),
+        ("/correspondences.subscription.depth:=ten", "not activated: .*ten"),
+        ("/rs_localizer/pose.publisher.depth:=ten", "not configured:"),
+    ],
+)
+def test_qos_overrides_that_make_no_qos(start_node: Start, override: str, text: str) -> None:
+    node = start_node("-p", f"qos_overrides.{override}")
+    assert node.process.wait(60.0) == 1
+    errors = [line for line in node.log.splitlines() if line.startswith("[ERROR]")]
+    assert len(errors) == 1
+    assert re.search(text, errors[0], re.IGNORECASE)
+
+
+def test_publishers_are_active_before_a_frame_can_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    active: list[bool] = []
+
+    class Early(Inputs):
+        def __init__(self, node: LocalizerNode, *arguments: Any) -> None:
+            publishers = node._outputs._publishers.values()
+            active.extend(publisher.is_activated for publisher in publishers)
+            super().__init__(node, *arguments)
+
+    monkeypatch.setattr(localizer_node, "Inputs", Early)
+    context = Context()
+    rclpy.init(context=context)
+    node = LocalizerNode(context=context)
+    try:
+        node.trigger_configure()
+        node.trigger_activate()
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+    assert active == [True] * len(TYPES)
 
 
 def test_what_it_says_at_start(start_node: Start, tmp_path: Path) -> None:

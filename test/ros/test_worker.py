@@ -51,6 +51,7 @@ class Fake:
         assert self.go_on.acquire(timeout=PATIENCE)
         assert self.settings == before
         if frame == "bug":
+            self.done.release()
             raise TypeError("a bug")
         if frame == "dark":
             self.done.release()
@@ -140,9 +141,10 @@ def test_errors_and_refusals_are_told_and_it_goes_on(fake: Fake) -> None:
     fake.worker.update("settings", fail)
     fake.wait(fake.done)
     assert fake.published == ["light old"]
-    assert fake.refusals.counts == {"dark": 1}
-    assert fake.errors[0].startswith("TypeError('a bug') in _localize, ")
-    assert fake.errors[1].startswith("ValueError('no such setting') in fail, ")
+    assert fake.refusals.counts == {"internal_error": 1, "dark": 1}
+    summary = fake.statistics.summary()
+    assert summary.refused == 2
+    assert fake.errors[0].startswith("ValueError('no such setting') in fail, ")
 
 
 def test_nothing_is_published_after_a_pause(fake: Fake) -> None:
@@ -154,6 +156,7 @@ def test_nothing_is_published_after_a_pause(fake: Fake) -> None:
     fake.go_on.release(2)
     fake.wait(fake.done)
     assert fake.published == ["three old"]
+    assert fake.statistics.summary().dropped == 2  # none is lost unseen
 
 
 def test_the_end_waits_for_the_last_frame_but_not_for_ever(fake: Fake) -> None:

@@ -102,7 +102,7 @@ def draw_clip(
         pictures.append(_picture(image, cube, found, off))
         for name, value in off.items():
             errors[name].append(value)
-    return Clip(gif(pictures[::_EVERY], RATE / _EVERY), {k: np.array(v) for k, v in errors.items()})
+    return Clip(gif(pictures[::_EVERY], _SHOWN_RATE), {k: np.array(v) for k, v in errors.items()})
 
 
 def cube_errors(
