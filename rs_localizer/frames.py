@@ -80,7 +80,8 @@ class FrameLocalizer:
     """Localizes correspondences, or keypoints by a map, with the latest camera and settings.
 
     With ``tracking``, a readout time and a rolling-shutter solver it remembers the previous frame;
-    new settings, a new camera, another map and a time before the last one start it afresh.
+    new settings, a new camera, points in another frame and a time before the last one start it
+    afresh.
 
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.

@@ -110,6 +110,8 @@ def main(
         return _fail(name, str(error), 2)
     except (ValueError, OSError) as error:
         return _fail(name, str(error), 1)
+    except MemoryError as error:
+        return _fail(name, f"the memory does not suffice: {error}", 1)
     except KeyboardInterrupt:
         return _fail(name, "interrupted", 1)
     return 0

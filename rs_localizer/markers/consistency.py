@@ -14,8 +14,9 @@ from rs_localizer.markers.prints import Board, Chessboard, Marker
 
 # Prints within this distance of a plane (in sides of the marker) and this angle are in one.
 _SAME_PLANE, _PARALLEL = 0.2, np.cos(np.radians(5.0))
-# A marker this many times larger than the median has its size in another unit.
-_OTHER_UNIT = 20.0
+# A marker this many times larger than the median has its size in another unit, and so have all of
+# them if they are larger than any that is printed (m).
+_OTHER_UNIT, _LARGEST = 20.0, 5.0
 
 
 def problems(marker_map: MarkerMap) -> list[str]:
@@ -63,6 +64,8 @@ def _other_units(markers: tuple[Marker, ...]) -> Iterator[str]:
     if not markers:
         return
     usual = float(np.median([marker.size for marker in markers]))
+    if usual > _LARGEST:
+        yield f"markers of {usual:g} m: are sizes and positions, given in metres, in another unit?"
     for marker in markers:
         if not usual / _OTHER_UNIT <= marker.size <= usual * _OTHER_UNIT:
             yield (

@@ -19,6 +19,8 @@ from rs_localizer.markers.poses import rotation_of_quaternion
 
 # Images that wait for a pose; those without one are shown without cubes.
 _WAITING = 3
+# After so many images without an answer nobody localizes, and none waits.
+_PATIENCE = 10
 # Poses that wait for an image.
 _MOST_POSES = 100
 
@@ -39,11 +41,13 @@ class DebugPictures:
         self._calibration: Calibration | None = None
         self._waiting: deque[tuple[Detected, MarkerMap]] = deque()
         self._poses: dict[int, CameraPath] = {}  # without a twist, by stamp
+        self._unanswered = _PATIENCE
 
     def add(self, detected: Detected, marker_map: MarkerMap, config: DetectorConfig) -> None:
         """Take an image; the oldest that still waits is shown as it is."""
         self._waiting.append((detected, marker_map))
-        while len(self._waiting) > _WAITING:
+        self._unanswered += 1
+        while len(self._waiting) > (_WAITING if self._unanswered <= _PATIENCE else 0):
             oldest = self._waiting.popleft()
             self._finish(oldest, self._pose_of(oldest[0], config), config)
         for stamp in [s for s in self._poses if s < detected.image.stamp_ns - 10**9]:
@@ -54,6 +58,7 @@ class DebugPictures:
 
     def take_pose(self, message: Any) -> None:
         """A geometry_msgs/PoseStamped; of use where no odometry comes, without a twist."""
+        self._unanswered = 0
         still = np.zeros(3)
         self._poses[stamp_ns(message)] = _path(message, message.pose, still, still)
         while len(self._poses) > _MOST_POSES:
@@ -68,6 +73,7 @@ class DebugPictures:
                 f"({self._calibration.frame}): no cubes are drawn",
             )
             return
+        self._unanswered = 0
         twist = message.twist.twist
         path = _path(message, message.pose.pose, _vector(twist.linear), _vector(twist.angular))
         for item in self._waiting:

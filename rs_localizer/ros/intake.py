@@ -7,6 +7,7 @@ comes. This costs more than to take the message, and holds the GIL, which the wo
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -70,7 +71,14 @@ class Intake:
 
     def _run(self) -> None:
         while not self._closed and self._context.ok():
-            for subscription in self._ready():
+            try:
+                ready = self._ready()
+            except Exception as error:  # without messages for once: the thread goes on
+                if not self._closed and self._context.ok():
+                    self._failed(describe(error))
+                    time.sleep(1e-9 * _CONTEXT_PERIOD)
+                continue
+            for subscription in ready:
                 try:
                     # Also what cannot be deserialized raises.
                     taken = subscription.handle.take_message(

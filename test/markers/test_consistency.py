@@ -131,6 +131,7 @@ BEHIND = np.diag([-1.0, 1.0, -1.0])
         ([marker(0, 0), marker(1, 0.105)], [], "are 0.005 m apart: each needs a white rim"),
         ([marker(0, 0), marker(1, 0.2, rotation=BEHIND)], [], "face opposite ways: one of them"),
         ([marker(k, 0.5 * k) for k in range(3)] + [marker(3, 9.0, 4.0)], [], "another unit"),
+        ([marker(0, 0, 60.0), marker(1, 90.0, 60.0)], [], "markers of 60 m: are sizes"),
         ([marker(0, 0)], [Chessboard(6, 4, 0.03)], "and chessboard 6x4 overlap by"),
         ([marker(0, 0)], [Charuco(5, 7, 0.03, 0.02, family("5x5_50"))], "5x5_50 overlap by"),
     ],
