@@ -5,6 +5,10 @@
 ``flight`` is what ``simulate --images`` wrote, ``poses`` what ``replay`` made of its markers with
 the same parameters. Each image is sent when the one before has been answered, so that none is
 dropped: then the nodes have to say the same, bit for bit.
+
+    python -m rs_localizer.ros.image_flight flight --rate 30
+
+sends the images at a camera's pace instead, and tells how long the poses take.
 """
 
 from __future__ import annotations
@@ -15,12 +19,14 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.context import Context
@@ -51,6 +57,7 @@ _ANSWER_TIMEOUT = 30.0
 # Nodes that have found this process may still have to find each other (s).
 _ACQUAINTANCE = 1.0
 _STOP_TIMEOUT = 20.0
+_LAST_ANSWERS = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +87,44 @@ def fly(images: Path, replayed: Path, parameters: list[str]) -> Agreement:
         ValueError: when a node ends or does not answer.
     """
     offline = _offline(replayed)
+    with _flight(images, parameters) as flight:
+        count = flight.send(images, offline)
+        live = flight.heard
+    return Agreement(
+        count,
+        {topic: len(found) for topic, found in live.items()},
+        {topic: len(found) for topic, found in offline.items()},
+        {
+            topic: sum(live[topic].get(stamp) == message for stamp, message in found.items())
+            for topic, found in offline.items()
+        },
+    )
+
+
+def latencies(images: Path, rate: float, parameters: list[str]) -> tuple[int, list[float]]:
+    """Start both nodes and send them the images at a steady rate, as a camera does.
+
+    Args:
+        images: directory with the bag, the marker map and the parameters.
+        rate: Hz.
+        parameters: further ones of the localizer, ``name:=value``; poses must keep the stamps.
+
+    Returns:
+        how many images were sent, and the seconds from sending an image to hearing its pose, of
+        those that were answered.
+
+    Raises:
+        ValueError: when a node ends.
+    """
+    with _flight(images, parameters) as flight:
+        sent = flight.pace(images, rate)
+        answered = flight.arrivals
+    return len(sent), [answered[stamp] - sent[stamp] for stamp in answered.keys() & sent.keys()]
+
+
+@contextmanager
+def _flight(images: Path, parameters: list[str]) -> Iterator[_Flight]:
+    """Both nodes, started and ready, until the end."""
     given = [word for parameter in parameters for word in ("-p", parameter)]
     processes = {
         "marker_detector": _start(
@@ -102,23 +147,13 @@ def fly(images: Path, replayed: Path, parameters: list[str]) -> Agreement:
     try:
         flight = _Flight(context, processes)
         flight.wait_for_nodes()
-        count = flight.send(images, offline)
-        live = flight.heard
+        yield flight
     finally:
         rclpy.shutdown(context=context)
         for process in processes.values():
             process.terminate()
         for process in processes.values():
             process.wait(_STOP_TIMEOUT)
-    return Agreement(
-        count,
-        {topic: len(found) for topic, found in live.items()},
-        {topic: len(found) for topic, found in offline.items()},
-        {
-            topic: sum(live[topic].get(stamp) == message for stamp, message in found.items())
-            for topic, found in offline.items()
-        },
-    )
 
 
 def _offline(replayed: Path) -> dict[str, dict[int, Any]]:
@@ -146,15 +181,20 @@ class _Flight:
         self._infos = self._node.create_publisher(CameraInfo, CAMERA_INFO_TOPIC, _QOS)
         self._detected: set[int] = set()
         self.heard: dict[str, dict[int, Any]] = {topic: {} for topic in _KINDS}
+        self.arrivals: dict[int, float] = {}  # of poses, time.monotonic() by stamp
         for topic, kind in _KINDS.items():
             self._node.create_subscription(kind, topic, self._listener(self.heard[topic]), _QOS)
         self._node.create_subscription(
             PointCloud2, CORRESPONDENCES_TOPIC, lambda m: self._detected.add(stamp_ns(m)), _QOS
         )
 
-    @staticmethod
-    def _listener(heard: dict[int, Any]) -> Callable[[Any], None]:
-        return lambda message: heard.update({stamp_ns(message): message})
+    def _listener(self, heard: dict[int, Any]) -> Callable[[Any], None]:
+        def hear(message: Any) -> None:
+            if heard is self.heard[_POSE]:
+                self.arrivals[stamp_ns(message)] = time.monotonic()
+            heard[stamp_ns(message)] = message
+
+        return hear
 
     def wait_for_nodes(self) -> None:
         self._wait(
@@ -196,6 +236,27 @@ class _Flight:
                     bar.update()
         return count
 
+    def pace(self, images: Path, rate: float) -> dict[int, float]:
+        """All images of a bag at a steady rate: time.monotonic() of each, by its stamp."""
+        with open_bag(images) as bag:
+            messages = [
+                copy_message(message, message.__msgtype__)
+                for _, _, message in bag.messages([CAMERA_INFO_TOPIC, RAW_IMAGE_TOPIC])
+            ]
+        sent: dict[int, float] = {}
+        start = time.monotonic()
+        for message in messages:
+            if isinstance(message, CameraInfo):
+                self._infos.publish(message)
+                continue
+            due = start + len(sent) / rate
+            self._wait(lambda due=due: time.monotonic() >= due, _ANSWER_TIMEOUT, "")
+            sent[stamp_ns(message)] = time.monotonic()
+            self._images.publish(message)
+        end = time.monotonic() + _LAST_ANSWERS
+        self._wait(lambda: time.monotonic() > end, _ANSWER_TIMEOUT, "")
+        return sent
+
     def _answered(self, image: int, pose: int | None, topics: list[str]) -> bool:
         return image in self._detected and all(pose in self.heard[topic] for topic in topics)
 
@@ -207,7 +268,7 @@ class _Flight:
                     raise ValueError(f"{name} ended with exit code {process.returncode}")
             if time.monotonic() > deadline:
                 raise ValueError(f"{fault} for {timeout:.0f} s")
-            self._executor.spin_once(timeout_sec=0.02)
+            self._executor.spin_once(timeout_sec=0.002)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -218,14 +279,27 @@ def main(arguments: list[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("images", type=Path, help="directory that simulate --images wrote")
-    parser.add_argument("replayed", type=Path, help="directory that replay wrote")
+    parser.add_argument("replayed", type=Path, nargs="?", help="directory that replay wrote")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="of the images, to time the poses")
     parser.add_argument(
         "-p", dest="parameters", action="append", default=[], metavar="NAME:=VALUE",
         help="parameter of the localizer, as for replay",
     )  # fmt: skip
     options = parser.parse_args(arguments)
+    if (options.replayed is None) == (options.rate is None):
+        parser.error("give either what replay wrote or --rate")
     # Nobody else's nodes shall hear these images.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if options.rate is not None:
+        sent, taken = latencies(options.images, options.rate, options.parameters)
+        if not taken:
+            raise ValueError(f"none of {sent} images was answered")
+        middle, most = 1e3 * np.quantile(taken, [0.5, 0.95])
+        sys.stdout.write(
+            f"{len(taken)} poses of {sent} images at {options.rate:g} Hz, from image to pose: "
+            f"p50 {middle:.1f} ms, p95 {most:.1f} ms\n"
+        )
+        return 0
     found = fly(options.images, options.replayed, options.parameters)
     sys.stdout.write(f"{found.images} images\n")
     for topic in _KINDS:
