@@ -29,7 +29,8 @@ def test_nodes_and_replay_agree(tmp_path: Path, capsys: pytest.CaptureFixture[st
     # At a camera's pace some may be left out on a busy machine.
     assert image_flight.main([images, "--rate", "10"]) == 0
     told = re.fullmatch(
-        r"(\d+) poses of 21 images at 10 Hz, from image to pose: p50 ([\d.]+) ms, p95 ([\d.]+) ms\n",
+        r"(\d+) poses of 21 images at 10 Hz, from image to pose: "
+        r"p50 ([\d.]+) ms, p95 ([\d.]+) ms\n",
         capsys.readouterr().out,
     )
     assert told
