@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -51,8 +53,9 @@ def median_point(points: Array, chosen: BoolArray) -> Array:
 
 def distinct(points: Array, pixels: Array, chosen: IntArray) -> IntArray:
     """The chosen correspondences without those that repeat another one: a copy says nothing new."""
-    places = np.ascontiguousarray(pixels[chosen]).view(np.complex128)[:, 0]
-    if len(np.unique(places)) == len(chosen):  # nearly always, and fast
+    # Equal pixels have equal keys; nearly always there are none, and one sort says so.
+    keys = np.sort(pixels[chosen, 0] + math.pi * pixels[chosen, 1])
+    if np.all(keys[1:] != keys[:-1]):
         return chosen
     pairs = np.hstack([points[chosen], pixels[chosen]])
     first = np.unique(pairs, axis=0, return_index=True)[1]

@@ -50,7 +50,8 @@ def mirrored(points: Array, state: Array) -> Array | None:
     if len(points) == 0:
         return None
     centre = points.mean(axis=0)
-    extents, axes = np.linalg.eigh((points - centre).T @ (points - centre))
+    offsets = points - centre
+    extents, axes = np.linalg.eigh(offsets.T @ offsets)
     if not extents[0] < _PLANE**2 * extents[1]:
         return None
     rotation, translation = state[:9].reshape(3, 3), state[9:12]
@@ -99,8 +100,11 @@ def _pair(
     observations: Observations, posterior: Posterior, state: Array, terms: PriorTerms
 ) -> list[_Mode]:
     """The minimum next to a state and the mirrored one; nothing if there is no such pair."""
+    points = observations.points[posterior.inliers]
+    if mirrored(points, state) is None:  # mostly: most scenes are no planes
+        return []
     first = _mode(observations, posterior, state, terms)
-    start = mirrored(observations.points[posterior.inliers], first.state)
+    start = mirrored(points, first.state)
     return [] if start is None else [first, _mode(observations, posterior, start, terms)]
 
 
