@@ -22,10 +22,20 @@ from rclpy.executors import SingleThreadedExecutor
 
 # Nobody else's nodes, neither on this machine nor in its network.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randint(1, 100))
 
 TIMEOUT = 60.0  # s, of a machine that is busy
 RUN = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain() -> None:
+    """Each file its own: of nodes that another one killed DDS believes for a while that they listen.
+
+    The processes of pytest-xdist take the odd and the even numbers.
+    """
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    number = 2 * random.SystemRandom().randint(1, 50) - worker % 2
+    os.environ["ROS_DOMAIN_ID"] = str(number)
 
 
 class NodeProcess:
