@@ -29,7 +29,7 @@ RUN = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 
 @pytest.fixture(scope="module", autouse=True)
 def domain() -> None:
-    """Each file its own: of nodes that another one killed DDS believes for a while that they listen.
+    """Each file its own: DDS believes for a while that nodes which another one killed still listen.
 
     The processes of pytest-xdist take the odd and the even numbers.
     """
