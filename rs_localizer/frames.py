@@ -53,7 +53,7 @@ _STILL = Estimate(
     linear_velocity=np.zeros(3),
     inliers=np.zeros(0, dtype=np.bool_),
     residuals=np.zeros(0),
-    covariance=np.zeros((12, 12)),
+    joint_covariance=np.zeros((18, 18)),
     global_shutter_inliers=0,
     iterations=0,
 )
@@ -395,4 +395,4 @@ def _build(
         and config.readout_time > 0.0
         and find_solver(config.solver).rolling_shutter
     )
-    return camera, localizer, Tracker(localizer, config.acceleration) if follows else None
+    return camera, localizer, Tracker(localizer) if follows else None

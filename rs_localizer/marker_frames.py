@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.frames import Refusal
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_compressed_image, read_image

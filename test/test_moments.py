@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate
 from rs_localizer.moments import pose_at, twist_at
 

@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer import data
-from rs_localizer.config import Acceleration
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.prior import PriorTerms, state_in
 from rs_localizer.core.ransac import Observations
@@ -115,7 +114,7 @@ def test_the_reversed_scan_direction_makes_it_worse_than_a_global_shutter(record
 
 def test_the_tracked_twist_is_that_of_the_poses(recording):
     calibration, clouds = recording
-    tracker = Tracker(rsl.Localizer(calibration.camera(READOUT, "top_to_bottom")), Acceleration())
+    tracker = Tracker(rsl.Localizer(calibration.camera(READOUT, "top_to_bottom")))
     results = [
         tracker.localize(cloud.stamp_ns + round(READOUT / 2 * 1e9), cloud.points, cloud.pixels)
         for cloud in clouds

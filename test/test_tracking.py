@@ -68,7 +68,7 @@ def error(result, truth):
 def compare(points, count, frames=90, outliers=0.0):
     """Errors (frames,2) of single frames and of tracked ones, and which were tracked."""
     hand, localizer = Hand(), rsl.Localizer(CAMERA, min_inliers=10)
-    tracker = Tracker(localizer, Acceleration())
+    tracker = Tracker(localizer)
     alone, together, tracked = [], [], []
     for t in times(frames):
         data, truth = hand.frame(t, count, points, outliers=outliers), hand.motion(t)
@@ -100,7 +100,7 @@ def test_tracking_never_harms_rich_frames():
 
 def test_the_prediction_is_covered_by_its_covariance():
     hand = Hand()
-    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+    tracker = Tracker(rsl.Localizer(CAMERA))
     distances = []
     for t in times(90):
         prior = tracker.prediction(ns(t))
@@ -171,7 +171,7 @@ def test_accelerations_add_what_white_noise_adds_up_to():
 def test_sharp_poses_do_not_make_the_velocity_ring():
     """Without noise nothing but the filter itself could swing from frame to frame."""
     hand = Hand()
-    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+    tracker = Tracker(rsl.Localizer(CAMERA))
     off = []
     for t in times(60):
         result = tracker.localize(ns(t), *hand.frame(t, 30, WALL, noise=0.02))
@@ -183,7 +183,7 @@ def test_sharp_poses_do_not_make_the_velocity_ring():
 
 def test_a_gap_a_jump_and_a_bag_that_starts_over_need_a_search_and_are_localized():
     hand = Hand()
-    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+    tracker = Tracker(rsl.Localizer(CAMERA))
 
     def step(t, shown=None):
         return tracker.localize(ns(t), *hand.frame(t if shown is None else shown, 100))
@@ -204,7 +204,7 @@ def test_a_gap_a_jump_and_a_bag_that_starts_over_need_a_search_and_are_localized
 
 def test_failures_in_a_row_lose_the_track_and_single_ones_do_not():
     hand = Hand()
-    tracker = Tracker(rsl.Localizer(CAMERA), Acceleration())
+    tracker = Tracker(rsl.Localizer(CAMERA))
     nothing = np.zeros((0, 3)), np.zeros((0, 2))
     assert tracker.localize(ns(0.0), *hand.frame(0.0, 100))
     assert not tracker.localize(ns(0.033), *nothing)
@@ -217,13 +217,13 @@ def test_failures_in_a_row_lose_the_track_and_single_ones_do_not():
 
 def test_a_global_shutter_has_nothing_to_track_with():
     with pytest.raises(ValueError, match="tracking needs velocities, which solver p3p"):
-        Tracker(rsl.Localizer(CAMERA, solver="p3p"), Acceleration())
+        Tracker(rsl.Localizer(CAMERA, solver="p3p"))
 
 
 def test_without_a_readout_time_there_is_nothing_to_track_with():
     blind = rsl.Camera(640, 480, K)
     with pytest.raises(ValueError, match="tracking needs the readout time"):
-        Tracker(rsl.Localizer(blind), Acceleration())
+        Tracker(rsl.Localizer(blind))
 
 
 @pytest.mark.parametrize("kind", ["gyroscope", "gravity"])

@@ -18,6 +18,7 @@ from rs_localizer.broadcasts import broadcast
 from rs_localizer.cli import UsageError
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, open_bag
 from rs_localizer.io.outputs import Frame, messages
@@ -259,7 +260,7 @@ def _write_texts(out: Path, frames: list[Frame]) -> int:
     return len(frames) - len(once)
 
 
-def _quaternion(frame: Frame) -> so3.Array:
+def _quaternion(frame: Frame) -> Array:
     return so3.quaternion(np.ascontiguousarray(frame.pose.rotation))
 
 

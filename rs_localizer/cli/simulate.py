@@ -20,7 +20,7 @@ from rs_localizer.cli.simulated_camera import (
     option,
     stamps_of,
 )
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.io.map_files import write_map_file
 from rs_localizer.lab.image_sequence import FORMATS, Encoding, rendered_frames

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.observations import Observations
 from rs_localizer.core.posterior import Posterior
-from rs_localizer.core.ransac import Observations
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray, Failure, Reason
+from rs_localizer.core.types import Failure, Reason
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5

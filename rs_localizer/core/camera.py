@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 
 class ScanDirection(StrEnum):
@@ -203,6 +203,12 @@ class Camera:
             (self.width, self.height) if self.roi is None else (self.roi.width, self.roi.height)
         )
         return width // self.binning[0], height // self.binning[1]
+
+    @property
+    def focal_length(self) -> float:
+        """Geometric mean of the two focal lengths, in delivered pixels."""
+        K, binning = self.K, self.binning
+        return math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1])
 
     def rays(self, pixels: Array) -> Array:
         """Undistorted bearings (n,2), ``x/z, y/z``, of raw pixels (n,2).

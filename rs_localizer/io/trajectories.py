@@ -18,7 +18,7 @@ from typing import Literal, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
 _QUATERNION_TOLERANCE = 0.01

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import Make, make_header
 
 # How far the squared norm of a quaternion may be from one; tf2 ignores those that are farther.

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from numpy.lib.stride_tricks import sliding_window_view
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.metrics import Errors, Stamps
 from rs_localizer.lab.video import Image

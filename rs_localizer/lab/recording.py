@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import make_header

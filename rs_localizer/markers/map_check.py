@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.detection import Detections, IntArray
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker

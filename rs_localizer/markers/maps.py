@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.dictionaries import Gray
 from rs_localizer.markers.maps import MarkerMap

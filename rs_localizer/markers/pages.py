@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 MARGIN = 10.0
 """mm: printers leave about 5 white."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 _ROTATION_TOLERANCE = 1e-3
 

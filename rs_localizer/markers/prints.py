@@ -13,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.families import Family, family
 from rs_localizer.markers.poses import Pose, finite
 

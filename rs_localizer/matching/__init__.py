@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.config import MatchBy, Matching
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.prior import Prior
-from rs_localizer.core.sampling import IntArray
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps import Descriptors, Ids, Map

@@ -12,8 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.maps import Descriptors
 from rs_localizer.matching.kernels import (
     nearest_binary,

@@ -12,8 +12,8 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
-from rs_localizer.core.so3 import Array
 
 _BLOCK = 256  # landmarks whose words stay in the first cache
 _FAR = 1 << 30

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.prior import Prior, state_in
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.matching.descriptors import Visible
 from rs_localizer.matching.kernels import in_view
 
@@ -32,8 +32,7 @@ def predict_landmarks(camera: Camera, prior: Prior, points: Array, least_gate: f
     assert prior.covariance is not None
     low, high = _bearings(camera)
     widest = 0.5 * math.hypot(*camera.size)
-    K, binning = camera.K, camera.binning
-    focal = math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1])
+    focal = camera.focal_length
     slack = min(2.0 * least_gate, widest) / focal
     depths = np.empty(len(points))
     in_view(points, state_in(prior.motion, np.zeros(3)), low - slack, high + slack, depths)

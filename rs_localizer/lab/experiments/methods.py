@@ -14,11 +14,11 @@ from itertools import combinations
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.prior import velocity_terms
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments.errors import angles
 from rs_localizer.lab.experiments.kernels import best_solutions, refine_frames
 from rs_localizer.lab.experiments.trials import POINTS, Motions, Trials, camera
+from rs_localizer.localizer import assumptions
 from rs_localizer.solvers import SOLVERS, find_solver, solve_minimal
 
 _SIX = 6
@@ -106,10 +106,11 @@ def plausible_triplet(trials: Trials) -> Motions:
 
 
 def states(motions: Motions) -> Array:
-    """Model B states (h,18) of the reprojection kernels: ``omega = -w``, ``v = w x C - t``."""
+    """Model B states (h,24) of the reprojection kernels: ``omega = -w``, ``v = w x C - t``."""
     velocity = np.cross(motions.w, motions.translation) - motions.t
     rotation = motions.rotation.reshape(-1, 9)
-    return np.hstack([rotation, motions.translation, -motions.w, velocity])
+    still = np.zeros((len(rotation), 6))
+    return np.hstack([rotation, motions.translation, -motions.w, velocity, still])
 
 
 def _models(method: Method, trials: Trials, initial: Array) -> Array:
@@ -156,8 +157,7 @@ def _best(models: Array, trials: Trials, scale: float) -> Array:
 
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
-    deviations = LocalizerConfig().velocity_prior
-    prior = velocity_terms(deviations.angular, deviations.linear)
+    prior, _ = assumptions(camera(), LocalizerConfig(), find_solver("r6p_vcwt"))
     found = refine_frames(
         np.ascontiguousarray(models), *view_arguments(trials), threshold, prior
     )

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import ORIENTATION, POSITION, T, W

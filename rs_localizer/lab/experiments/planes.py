@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rs_localizer.config import VelocityPrior
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.posterior import maximum_a_posteriori
-from rs_localizer.core.prior import state_in, velocity_terms
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.prior import motion_terms, state_in
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.errors import angles
@@ -21,7 +21,9 @@ from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.views import View, synthetic_views
 from rs_localizer.localizer import Localizer
 
-_PRIOR = VelocityPrior(angular=float(np.radians(10.0)), linear=0.1)
+# 10 degrees and 0.1 m in a readout of 30 ms, which is assumed without one.
+_PRIOR = VelocityPrior(angular=float(np.radians(10.0)) / 0.03, linear=0.1 / 0.03)
+_NO_PRIOR = motion_terms((0.0, 0.0), (0.001, 0.001))
 # A pose that fits none of the rows but all of them roughly needs every point.
 _WIDE = 100.0  # px
 # One takes some steps only, and the valley is long and flat: at rest it has no end.
@@ -96,7 +98,7 @@ def _unaided_error(view: View) -> float:
     observations = observe(view.camera, view.points, view.pixels)
     state = start
     for _ in range(_REFINEMENTS):
-        state = maximum_a_posteriori(observations, state, velocity_terms(0.0, 0.0), _WIDE).state
+        state = maximum_a_posteriori(observations, state, _NO_PRIOR, _WIDE).state
     return float(angles(state[:9].reshape(3, 3), view.motion.rotation))
 
 

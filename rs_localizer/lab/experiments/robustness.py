@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments.errors import METRICS, motion_errors
 from rs_localizer.lab.experiments.methods import Method, available, estimate
 from rs_localizer.lab.experiments.results import Context, Table

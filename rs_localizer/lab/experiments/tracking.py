@@ -9,9 +9,8 @@ from itertools import islice
 import numpy as np
 from matplotlib.figure import Figure
 
-from rs_localizer.config import Acceleration
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
@@ -142,7 +141,7 @@ def _map(case: Case, motion: RecordedMotion, rng: np.random.Generator) -> Array:
 
 def _run(camera: Camera, frames: Sequence[SimulatedFrame], context: Context) -> Run:
     localizer = Localizer(camera)
-    tracker = Tracker(localizer, Acceleration())
+    tracker = Tracker(localizer)
     tracked, untracked, followed = [], [], []
     for frame in context.track(frames, len(frames)):
         result = tracker.localize(frame.middle_ns, frame.points, frame.pixels)
@@ -201,7 +200,7 @@ def _one_start(runs: Mapping[str, Run]) -> Claim:
 
 
 def _after_a_gap(camera: Camera, frames: Sequence[SimulatedFrame]) -> Claim:
-    tracker = Tracker(Localizer(camera), Acceleration())
+    tracker = Tracker(Localizer(camera))
     found = []
     for start in range(0, len(frames) - _GAP - 1, _BETWEEN_GAPS):
         for frame in (frames[start], frames[start + 1], frames[start + 1 + _GAP]):

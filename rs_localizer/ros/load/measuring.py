@@ -22,7 +22,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.ros.intake import Intake, NotByExecutor
 from rs_localizer.ros.load.camera import Camera
 from rs_localizer.ros.load.frames import READOUT_TIME, Frames

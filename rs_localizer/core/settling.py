@@ -1,0 +1,285 @@
+"""From the best motion of a frame to the whole of what its points leave possible.
+
+The best motion is one point of a posterior that need not look like a Gaussian about it:
+
+* the camera may shake, and map and lens may be a little off (:mod:`rs_localizer.core.model_error`);
+* the points may hardly tell a slow camera from a resting one, and before a plane motions of
+  very different speed fit alike, along a curved valley: the typical speed is an unknown of its own;
+* a plane may lean the other way (:mod:`rs_localizer.core.mirror`).
+
+Every combination that is possible is fitted, becomes one Gaussian, and counts by its probability;
+what goes out is one Gaussian with the mean and the covariance of them all.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.mirror import mirrored
+from rs_localizer.core.model_error import Examined, Sizes, examine
+from rs_localizer.core.observations import Observations
+from rs_localizer.core.posterior import Mirror, Posterior, fit, maximum_a_posteriori
+from rs_localizer.core.prior import PriorTerms, held_beside, slower_terms
+from rs_localizer.core.refine import apply_step, inverted, step_between
+from rs_localizer.core.shaking import AGREEMENT, follow
+from rs_localizer.core.state import PARAMETERS, VELOCITIES
+
+# Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
+_SPEEDS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
+# Odds by which motion must explain the points better than rest, to count in the estimate: what
+# explains little is often a slightly wrong map or lens. The covariance allows for it at even odds.
+_ODDS_AGAINST_MOTION = 100.0
+# Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
+# which the prior knows less than this part.
+_CLEARLY_MOVING = 67.0
+_LITTLE_OF_THE_PRIOR = 0.05
+# Degree of the polynomials of the shaking that are looked for in every frame: a cycle in one
+# readout. What they find, or what neighbouring rows agree on beside them, is followed closer.
+_SHAKE_DEGREE = 6
+_SHAKING = 0.05
+# Sizes to try, as multiples of the least, and the probability that there is no more than that.
+_SHAKE_SIZES = 10.0 ** np.arange(0.0, 5.6, 0.5)
+_NO_SHAKE = 0.7
+_FIELD_SIZES = 10.0 ** np.arange(0.0, 2.1, 0.5)
+# Lenses and maps are never better than this, px: a hundredth; whose errors are a pixel, are rare.
+_LEAST_FIELD = 0.01
+_FIELD_PRIOR = np.array([0.5, 0.25, 0.2, 0.048, 0.002])
+# Points nearer than this (m) would make any map useless.
+_NEAREST = 1e-6
+# Logarithm of the odds of a typical speed beside a better one, beyond which none is tried.
+_FAR_LESS_PROBABLE = 7.0
+# A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
+_CLEARLY_WORSE = 9.2
+# The covariance speaks for poses within so many standard deviations of the orientation.
+_COVERED = 4.0
+
+
+_SHAKE_PRIOR = np.full(len(_SHAKE_SIZES), (1.0 - _NO_SHAKE) / (len(_SHAKE_SIZES) - 1))
+_SHAKE_PRIOR[0] = _NO_SHAKE
+
+
+@dataclass(frozen=True, slots=True)
+class Assumed:
+    """What is assumed of a camera and its map, beside the prior of the motion."""
+
+    shake: float  # rad, of each polynomial: as much as the jerk of an ordinary motion
+    map_deviation: float  # m
+    focal_length: float  # px
+    may_rest: bool  # nothing speaks for a motion but the points
+    rolling: bool  # velocities are estimated
+
+    def field_sizes(self, depth: float) -> Array:
+        """Standard deviations (k,) of the field to try, px, of points so far away (m)."""
+        least = math.hypot(_LEAST_FIELD, self.map_deviation * self.focal_length / depth)
+        sizes: Array = least * _FIELD_SIZES
+        return sizes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mode:
+    """One combination: a Gaussian and the logarithm of its probability, but for a constant."""
+
+    state: Array  # (24,)
+    covariance: Array  # (18,18)
+    evidence: float
+    speed: float
+    field: float  # px
+
+
+class _Frame:
+    """The inliers of one frame and what is the same for all combinations."""
+
+    def __init__(
+        self, observations: Observations, best: Posterior, terms: PriorTerms, assumed: Assumed
+    ) -> None:
+        self.observations, self.terms, self.assumed = observations, terms, assumed
+        self.inliers, self.noise, self.inflation = best.inliers, best.noise, best.inflation
+        depths = (observations.points @ best.state[6:9] + best.state[11])[best.inliers]
+        count = len(depths)
+        depth = float(np.partition(depths, count // 2)[count // 2]) if count else 1.0
+        self.field_sizes = assumed.field_sizes(max(depth, _NEAREST))
+        self.freedom = max(2.0 * count - 6.0, 1.0)
+
+    def fitted(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
+        """State (24,) and cost of the best motion near a state."""
+        found = fit(self.observations, start, self.inliers, terms, self.noise)
+        return found[0], found[2]
+
+    def examined(self, state: Array, terms: PriorTerms, degree: int) -> Examined:
+        """Shaking, up to a degree (0: none), and field at the best motion."""
+        observations = self.observations
+        found: Examined = examine(
+            observations.packed, state, observations.row_time_gradient, observations.rays,
+            observations.tau, self.inliers, terms, degree, self.freedom, self.noise,
+            self.assumed.shake * _SHAKE_SIZES, _SHAKE_PRIOR, self.field_sizes, _FIELD_PRIOR,
+        )  # fmt: skip
+        return found
+
+    def mode(self, start: Array, terms: PriorTerms, speed: float) -> _Mode:
+        """The Gaussian about the best motion of a typical speed."""
+        state, _ = self.fitted(start, terms)
+        examined = self.examined(state, terms, 0)
+        known = np.diag(terms.informations[0])
+        volume = np.log(known[known > 0.0]).sum() - examined.determined
+        return _Mode(
+            state,
+            self.inflation * examined.covariance,
+            examined.sizes.evidence + 0.5 * volume,
+            speed,
+            examined.sizes.field,
+        )
+
+
+def settle(
+    observations: Observations,
+    start: Array,
+    terms: PriorTerms,
+    threshold: float,
+    assumed: Assumed,
+) -> Posterior:
+    """What the points leave possible, near a first motion.
+
+    Args:
+        start: state (24,).
+        terms: what is known of the motion beside the points.
+        threshold: px, of inliers.
+        assumed: of the camera.
+    """
+    best = maximum_a_posteriori(observations, start, terms, threshold)
+    if not best.determined:
+        return best
+    frame = _Frame(observations, best, terms, assumed)
+    other = mirrored(observations.points, best.inliers, best.state)
+    if other is not None:
+        state, cost = frame.fitted(other, terms)
+        if cost < frame.fitted(best.state, terms)[1] - best.noise**2:
+            best = maximum_a_posteriori(observations, state, terms, threshold)
+            if not best.determined:
+                return best
+            frame = _Frame(observations, best, terms, assumed)
+    examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
+    sizes = examined.sizes
+    if assumed.rolling and (sizes.no_shake < _SHAKING or examined.agreement > AGREEMENT):
+        shaken = _followed(frame, best, sizes)
+        if shaken.noise < sizes.noise:
+            return shaken
+    found = replace(
+        best,
+        state=apply_step(best.state, examined.step[:PARAMETERS]),
+        covariance=best.inflation * examined.covariance,
+        shake=examined.step[PARAMETERS:].reshape(-1, 3),
+        model_error=sizes.field,
+        agreement=examined.agreement,
+    )
+    planar = other is not None
+    if planar or (assumed.may_rest and not _clearly_moving(found, terms)):
+        return _weighed(frame, found, planar)
+    return found
+
+
+def _followed(frame: _Frame, best: Posterior, sizes: Sizes) -> Posterior:
+    """The posterior of a camera that shakes."""
+    observations = frame.observations
+    shaken = follow(
+        observations, best.state, best.inliers, frame.terms, sizes.noise, sizes.shake,
+        frame.assumed.shake,
+    )  # fmt: skip
+    # In pixels: what the shaking moves the points by, which no longer is an error.
+    return replace(
+        best,
+        state=shaken.state,
+        covariance=best.inflation * shaken.covariance,
+        noise=shaken.noise,
+        squared_errors=shaken.squared_errors,
+        shake=shaken.coefficients,
+        agreement=shaken.agreement,
+    )
+
+
+def _clearly_moving(found: Posterior, terms: PriorTerms) -> bool:
+    """Whether neither rest nor another typical speed would change anything."""
+    spread = found.covariance[VELOCITIES, VELOCITIES]
+    information = inverted(np.ascontiguousarray(spread))
+    velocities = found.state[12:18]
+    # The trace is as much as the largest eigenvalue could be.
+    part = float(np.diag(terms.informations[0])[VELOCITIES] @ np.diag(spread))
+    return bool(
+        part < _LITTLE_OF_THE_PRIOR and velocities @ information @ velocities > _CLEARLY_MOVING
+    )
+
+
+def _weighed(frame: _Frame, found: Posterior, planar: bool) -> Posterior:
+    """The average of all combinations, and the mirrored pose if it cannot be ruled out."""
+    modes = _modes(frame, found, planar)
+    evidence = np.array([mode.evidence for mode in modes])
+    at_rest = np.array([mode.speed == 0.0 for mode in modes])
+    possible = _normalized(evidence)
+    counting = _normalized(evidence + math.log(_ODDS_AGAINST_MOTION) * at_rest)
+    best = int(np.argmax(counting))
+    steps = np.array([step_between(modes[best].state, mode.state) for mode in modes])
+    mean = counting @ steps
+    state = apply_step(modes[best].state, mean)
+    offsets = steps - mean
+    covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
+    for probability, mode in zip(possible, modes, strict=True):
+        covariance += probability * mode.covariance
+    # Shaking that was not seen may be there all the same.
+    joint = found.covariance.copy()
+    joint[:PARAMETERS, :PARAMETERS] = covariance
+    joint[:PARAMETERS, PARAMETERS:] = 0.0
+    joint[PARAMETERS:, :PARAMETERS] = 0.0
+    return replace(
+        found,
+        state=state,
+        covariance=joint,
+        squared_errors=frame.observations.squared_errors(state),
+        model_error=float(possible @ [mode.field for mode in modes]),
+        mirror=_mirror(evidence, steps, covariance) if planar else None,
+    )
+
+
+def _modes(frame: _Frame, found: Posterior, planar: bool) -> list[_Mode]:
+    """A Gaussian for each speed and, before a plane, for either way that it may lean."""
+    terms, may_rest = frame.terms, frame.assumed.may_rest
+    modes: list[_Mode] = []
+    near = np.concatenate([found.state[:12], np.zeros(12)]) if may_rest else found.state
+    other = mirrored(frame.observations.points, frame.inliers, near) if planar else None
+    for speed in _SPEEDS if may_rest else (1.0,):
+        if speed == 0.0:
+            chosen = held_beside(terms)
+        else:
+            chosen = terms if speed == 1.0 else slower_terms(terms, speed)
+        modes.append(frame.mode(near, chosen, speed))
+        near = modes[-1].state
+        if planar and other is None:
+            other = mirrored(frame.observations.points, frame.inliers, near)
+        if other is not None:
+            modes.append(frame.mode(other, chosen, speed))
+            other = modes[-1].state
+        if max(mode.evidence for mode in modes if mode.speed == speed) < (
+            max(mode.evidence for mode in modes) - _FAR_LESS_PROBABLE
+        ):
+            break  # what moves faster explains even less
+    return modes
+
+
+def _normalized(evidence: Array) -> Array:
+    weights = np.exp(evidence - evidence.max())
+    normalized: Array = weights / weights.sum()
+    return normalized
+
+
+def _mirror(evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
+    """The farthest pose that is not out of the question."""
+    worse = 2.0 * (evidence.max() - evidence)
+    turns = np.where(worse < _CLEARLY_WORSE, np.linalg.norm(steps[:, :3], axis=1), 0.0)
+    far = int(np.argmax(turns))
+    if turns[far] == 0.0:
+        return None
+    # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
+    deviation = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))

@@ -1,0 +1,184 @@
+"""A camera that shakes while it is read out: vibration that no constant acceleration follows.
+
+The turn beside the motion is a sum of polynomials of the row time
+(:mod:`rs_localizer.core.model_error`), each with a size of its own that the frame tells: a
+vibration has a frequency, and the polynomials near it are large (automatic relevance determination:
+MacKay, "Bayesian nonlinear modeling for the prediction competition", 1994; here by expectation
+maximization, with sizes that neighbouring degrees share).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.model_error import columns_of, neighbours_agree, shake_at
+from rs_localizer.core.observations import Observations
+from rs_localizer.core.prior import PriorTerms, add_prior
+from rs_localizer.core.refine import apply_step
+from rs_localizer.core.residuals import linearized
+from rs_localizer.core.state import PARAMETERS
+
+# Degrees to try, until neighbouring rows no longer agree: twelve follow a cycle and a half in one
+# readout, twenty-two six.
+_DEGREES = (12, 22)
+# Errors whose neighbours agree more than this are not followed, in standard deviations.
+AGREEMENT = 1.7
+_STEPS = 3
+_SIZE_ROUNDS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shaken:
+    """The motion and the shaking of a frame."""
+
+    state: Array  # (24,)
+    coefficients: Array  # (k,3) rad, of :func:`rs_localizer.core.model_error.shake_basis`
+    covariance: Array  # (18 + 3 k, 18 + 3 k)
+    noise: float  # px
+    agreement: float  # of what is left, see :func:`neighbours_agree`
+    squared_errors: Array  # (n,) px^2
+
+
+def follow(
+    observations: Observations,
+    start: Array,
+    inliers: BoolArray,
+    terms: PriorTerms,
+    noise: float,
+    size: float,
+    least_size: float,
+) -> Shaken:
+    """Fit motion and shaking together.
+
+    Args:
+        start: state (24,), the best without shaking.
+        noise: px, a first estimate.
+        size, least_size: rad, of the coefficients: a first estimate, and what is always possible.
+    """
+    for degrees in _DEGREES:
+        found = _fit(observations, start, inliers, terms, noise, size, least_size, degrees)
+        if found.agreement < AGREEMENT:
+            break
+    return found
+
+
+def _fit(
+    observations: Observations,
+    start: Array,
+    inliers: BoolArray,
+    terms: PriorTerms,
+    noise: float,
+    size: float,
+    least_size: float,
+    degrees: int,
+) -> Shaken:
+    state, coefficients = start, np.zeros((degrees - 1, 3))
+    sizes = np.full(degrees - 1, size**2)
+    count = len(observations)
+    covariance = np.empty((0, 0))
+    for _ in range(_STEPS):
+        errors, by_motion, by_turn, tau = linearized(
+            observations.packed,
+            count,
+            state,
+            observations.row_time_gradient,
+            shake_at(observations.tau, coefficients),
+        )
+        columns = columns_of(
+            errors, by_motion, by_turn, tau, observations.rays, inliers, degrees, False
+        )
+        information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+        add_prior(*terms, state, 1.0, information, slope)
+        step, covariance, noise = _sizes_and_step(
+            columns.products, columns.with_errors, columns.squared_errors,
+            2.0 * np.count_nonzero(inliers), information, slope, coefficients, noise,
+            least_size, sizes,
+        )  # fmt: skip
+        state = apply_step(state, step[:PARAMETERS])
+        coefficients = coefficients + step[PARAMETERS:].reshape(-1, 3)
+    errors, *_ = linearized(
+        observations.packed,
+        count,
+        state,
+        observations.row_time_gradient,
+        shake_at(observations.tau, coefficients),
+    )
+    agreement = neighbours_agree(errors, observations.tau, inliers)
+    behind = np.isinf(observations.squared_errors(state))
+    squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
+    return Shaken(state, coefficients, covariance, noise, agreement, squared)
+
+
+@kernel
+def _sizes_and_step(
+    products: Array, with_errors: Array, squared_errors: float, equations: float,
+    information: Array, slope: Array, coefficients: Array, noise: float, least_size: float,
+    sizes: Array,
+) -> tuple[Array, Array, float]:  # fmt: skip
+    """Step (m,) of motion and coefficients, covariance, and noise; ``sizes`` (k,) are updated."""
+    count = len(with_errors)
+    held = coefficients.ravel()
+    step, covariance = np.zeros(count), np.zeros((count, count))
+    matrix, scale, right = np.empty((count, count)), np.empty(count), np.empty(count)
+    found = np.empty(len(sizes))
+    for _ in range(_SIZE_ROUNDS):
+        weight = 1.0 / (noise * noise)
+        for i in range(count):
+            for j in range(count):
+                matrix[i, j] = weight * products[i, j]
+            right[i] = weight * with_errors[i]
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
+                matrix[i, j] += information[i, j]
+            right[i] -= slope[i]
+        for k in range(PARAMETERS, count):
+            precision = 1.0 / sizes[(k - PARAMETERS) // 3]
+            matrix[k, k] += precision
+            right[k] -= precision * held[k - PARAMETERS]
+        for i in range(count):
+            scale[i] = 1.0 / np.sqrt(matrix[i, i])
+        scaled = matrix.copy()
+        for i in range(count):
+            for j in range(count):
+                scaled[i, j] *= scale[i] * scale[j]
+            scaled[i, i] += 1e-14
+        inverse = np.linalg.inv(scaled)
+        for i in range(count):
+            step[i] = 0.0
+            for j in range(count):
+                covariance[i, j] = scale[i] * scale[j] * inverse[i, j]
+                step[i] += covariance[i, j] * right[j]
+        # Expected squares of the coefficients, and of the errors.
+        for k in range(len(sizes)):
+            total = 0.0
+            for axis in range(3):
+                place = PARAMETERS + 3 * k + axis
+                total += (held[3 * k + axis] + step[place]) ** 2 + covariance[place, place]
+            found[k] = total / 3.0
+        _share(found, least_size * least_size, sizes)
+        left, freedom = squared_errors, equations
+        for i in range(count):
+            left -= 2.0 * step[i] * with_errors[i]
+            for j in range(count):
+                left += step[i] * step[j] * products[i, j]
+                freedom -= weight * covariance[i, j] * products[i, j]
+        noise = np.sqrt(max(left, 1e-8 * equations) / max(freedom, 1.0))
+    return step, covariance, noise
+
+
+@kernel
+def _share(found: Array, least: float, sizes: Array) -> None:
+    """Mean squares of the neighbouring degrees, even and odd alike."""
+    count = len(found)
+    for k in range(count):
+        total, weights = 0.0, 0.0
+        for shift in range(-2, 3):
+            if 0 <= k + shift < count:
+                weight = 3.0 - abs(shift)
+                total += weight * found[k + shift]
+                weights += weight
+        sizes[k] = total / weights + least
