@@ -84,7 +84,14 @@ def _context(name: str, trials: int, seed: int) -> Context:
     parameters = yaml.safe_load((webcam / "parameters.yaml").read_text(encoding="utf-8"))
     readout_time = parameters["rs_localizer"]["ros__parameters"]["readout_time"]
     return Context(
-        trials, seed, partial(_track, name), webcam, readout_time, data.path(data.HAND_MOTION)
+        trials,
+        seed,
+        partial(_track, name),
+        webcam,
+        readout_time,
+        data.path(data.HAND_MOTION),
+        data.path(data.SLOW_HAND_MOTION),
+        data.path(data.GLOBAL_SHUTTER_TAGS),
     )
 
 

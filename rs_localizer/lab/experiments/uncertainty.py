@@ -18,7 +18,7 @@ from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray
 
 CONFIDENCE = 0.95
-_RESAMPLED = 1000
+_RESAMPLED = 200
 
 IntArray = NDArray[np.int64]
 
@@ -90,27 +90,31 @@ def bootstrap(
     confidence: float = CONFIDENCE,
     seed: int = 0,
 ) -> Interval:
-    """A statistic of the trials chosen by indices, resampled with replacement (whole groups)."""
+    """A positive statistic of the trials (m,) chosen, resampled with replacement, groups as one.
+
+    The interval is that of a normal distribution of its logarithm, with the deviation that
+    resampling shows, so that it can be had for any confidence.
+    """
     everything = np.arange(count)
     if count == 0:
-        return Interval(np.nan, -np.inf, np.inf, 0)
-    of_group = (
-        list(everything[:, None])
-        if groups is None
-        else [np.flatnonzero(groups == group) for group in np.unique(groups)]
-    )
+        return Interval(np.nan, 0.0, np.inf, 0)
+    value = statistic(everything)
+    if groups is None:
+        groups = everything
+    members = [np.flatnonzero(groups == group) for group in np.unique(groups)]
+    if len(members) < 2:
+        return Interval(value, 0.0, np.inf, count)
     rng = np.random.default_rng(seed)
-    drawn = np.array(
-        [
-            statistic(
-                np.concatenate([of_group[k] for k in rng.integers(0, len(of_group), len(of_group))])
-            )
-            for _ in range(_RESAMPLED)
-        ]
-    )
-    tail = 0.5 * (1.0 - confidence)
-    low, high = np.quantile(drawn, (tail, 1.0 - tail))
-    return Interval(statistic(everything), float(low), float(high), count)
+    draws = rng.integers(0, len(members), (_RESAMPLED, len(members)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithms = np.log(
+            [statistic(np.concatenate([members[k] for k in drawn])) for drawn in draws]
+        )
+    known = logarithms[np.isfinite(logarithms)]
+    if len(known) < 2 or not value > 0.0:
+        return Interval(value, 0.0, np.inf, count)
+    width = np.exp(norm.ppf(0.5 + 0.5 * confidence) * np.std(known))
+    return Interval(value, float(value / width), float(value * width), count)
 
 
 def together(claims: int, confidence: float = CONFIDENCE) -> float:

@@ -30,7 +30,7 @@ def main() -> int:
     parser.add_argument("names", nargs="+", metavar="BENCH", choices=_NAMES, help=", ".join(_NAMES))
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="WORD",
-        help="conditions whose names contain all of these, such as: hand rich 0.05px tracked",
+        help="conditions with all of these words in their names, such as: hand rich 0.05px tracked",
     )  # fmt: skip
     parser.add_argument(
         "--frames", type=integer(1), default=100, metavar="N",

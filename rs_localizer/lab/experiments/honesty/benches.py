@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,8 +43,11 @@ class Bench(Generic[C, F]):
     row: Callable[[str, F], tuple[str | float | int, ...]]
 
     def matching(self, words: Sequence[str]) -> list[C]:
-        """The conditions whose names contain each of these words."""
-        return [one for one in self.conditions if all(word in one.name for word in words)]
+        """The conditions in whose names each of these begins a word: ``3px`` is not ``0.3px``."""
+        patterns = [re.compile(rf"(^|[/ ]){re.escape(word)}") for word in words]
+        return [
+            one for one in self.conditions if all(pattern.search(one.name) for pattern in patterns)
+        ]
 
     def run(self, conditions: Sequence[C], frames: int, seed: int) -> Iterator[tuple[str, F]]:
         """One after the other."""

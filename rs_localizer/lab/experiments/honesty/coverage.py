@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
+from rs_localizer.config import LocalizerConfig
 from rs_localizer.lab.experiments.honesty.estimating import (
     Found,
     believed,
@@ -58,7 +59,10 @@ def measure(condition: Condition, frames: int, seed: int) -> Found:
     motion, scene = MOTIONS[condition.motion], SCENES[condition.scene]
     seen = frames_of(Camera(), motion, scene, frames, seed)
     camera = believed(seen.camera)
-    results = estimate(seen, Localizer(camera), condition.noise, condition.tracking)
+    # As users are told: the final inliers may miss by twice the threshold, 3.5 deviations have to.
+    threshold = max(LocalizerConfig().inlier_threshold, 2.0 * condition.noise)
+    localizer = Localizer(camera, inlier_threshold=threshold)
+    results = estimate(seen, localizer, condition.noise, condition.tracking)
     return scored(seen, results, camera)
 
 

@@ -24,8 +24,6 @@ from rs_localizer.solvers import find_solver
 
 CAMERA_INFO, CORRESPONDENCES = "/camera/camera_info", "/camera/correspondences"
 FRAMES = 450
-# Longer than this (ns) from frame to frame, and one was lost between.
-_LONGEST_STEP_NS = 50_000_000
 _BLOCK_NS = 1_000_000_000  # frames of one second are not independent
 
 
@@ -96,15 +94,14 @@ def measure(condition: Condition, recording: Path, frames: int = FRAMES) -> Repl
 
 def _second_differences(frames: Iterable[Frame]) -> tuple[Array, IntArray]:
     """Angles (n,) in deg between a turn and the next one, and the second of each."""
-    turns: list[tuple[int, int, Array]] = []  # from, to, in the camera's axes
-    for before, after in pairwise(frames):
-        turn = logarithm(before.pose.rotation.T @ after.pose.rotation)
-        turns.append((before.input_stamp_ns, after.input_stamp_ns, turn))
+    turns = [
+        (after.input_stamp_ns, logarithm(before.pose.rotation.T @ after.pose.rotation))
+        for before, after in pairwise(frames)
+    ]
     jitter, seconds = [], []
-    for first, second in pairwise(turns):
-        if max(first[1] - first[0], second[1] - second[0]) < _LONGEST_STEP_NS:
-            jitter.append(float(np.degrees(np.linalg.norm(second[2] - first[2]))))
-            seconds.append(first[1] // _BLOCK_NS)
+    for (_, first), (stamp_ns, second) in pairwise(turns):
+        jitter.append(float(np.degrees(np.linalg.norm(second - first))))
+        seconds.append(stamp_ns // _BLOCK_NS)
     return np.array(jitter), np.array(seconds, dtype=np.int64)
 
 
