@@ -17,7 +17,9 @@ from typing import Any
 from rs_localizer import data
 from rs_localizer.arguments import integer
 from rs_localizer.lab.experiments.honesty.benches import Bench, Recordings, benches
+from rs_localizer.lab.experiments.honesty.picture import Shares, picture, shares_at_stamp
 from rs_localizer.lab.experiments.honesty.text import heading, line
+from rs_localizer.lab.experiments.results import Table
 
 _NAMES = ("coverage", "p3p", "vibration", "planes", "tags", "rendered")
 
@@ -42,6 +44,11 @@ def main() -> int:
         help="where corners detected in rendered images are kept (default: nowhere)",
     )  # fmt: skip
     parser.add_argument("--csv", type=Path, metavar="DIR", help="write the tables there, too")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the coverage")
+    parser.add_argument(
+        "--before", type=Path, metavar="FILE",
+        help="coverage.csv of another version, which --picture shows beside this one",
+    )  # fmt: skip
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         recordings = Recordings(
@@ -74,7 +81,20 @@ def _run(name: str, bench: Bench[Any, Any], options: argparse.Namespace) -> int:
         options.csv.mkdir(parents=True, exist_ok=True)
         with (options.csv / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([bench.columns, *rows])
+    if name == "coverage" and options.picture is not None:
+        before = None if options.before is None else _shares(_read(options.before))
+        picture(_shares(Table(bench.columns, rows)), before).savefig(options.picture)
     return 0
+
+
+def _shares(table: Table) -> dict[str, Shares]:
+    return {part: shares_at_stamp(table, part) for part in ("pose", "twist")}
+
+
+def _read(path: Path) -> Table:
+    with path.open(newline="", encoding="utf-8") as file:
+        columns, *rows = csv.reader(file)
+    return Table(tuple(columns), rows)
 
 
 if __name__ == "__main__":

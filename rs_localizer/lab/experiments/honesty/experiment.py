@@ -9,8 +9,7 @@ from typing import Any
 
 from rs_localizer.lab.experiments.honesty import claims, text
 from rs_localizer.lab.experiments.honesty.benches import Bench, Recordings, benches
-from rs_localizer.lab.experiments.honesty.coverage import COLUMNS
-from rs_localizer.lab.experiments.honesty.picture import Shares, picture
+from rs_localizer.lab.experiments.honesty.picture import picture, shares_at_stamp
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table
 
 _MOST_FRAMES = 100  # of a condition
@@ -56,12 +55,6 @@ def run(context: Context) -> Result:
         {"honesty": picture(shares)},
         [text.table(table.columns, table.rows) for table in tables.values()],
     )
-
-
-def shares_at_stamp(table: Table, part: str) -> Shares:
-    """A column of the table of coverage: ``pose`` or ``twist``."""
-    column = COLUMNS.index(f"{part}@stamp")
-    return {str(row[0]): float(row[column]) for row in table.rows}
 
 
 def _run(bench: Bench[Any, Any], context: Context, frames: int) -> dict[str, Any]:

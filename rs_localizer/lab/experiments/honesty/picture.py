@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.honesty.coverage import MOTIONS, NOISES, SCENES, Condition
+from rs_localizer.lab.experiments.results import Table
 
 _BAND = (92.0, 98.0)
 # Dark blue and orange differ to everyone, and the markers to those who print in black and white.
@@ -65,6 +66,12 @@ def picture(now: Mapping[str, Shares], before: Mapping[str, Shares] | None = Non
     )
     charts.legend(drawn, panels[0, 0], columns=6)
     return drawn
+
+
+def shares_at_stamp(table: Table, part: str) -> Shares:
+    """A column of the table of coverage: ``pose`` or ``twist``."""
+    column = table.columns.index(f"{part}@stamp")
+    return {str(row[0]): float(row[column]) for row in table.rows}
 
 
 def _curves(
