@@ -19,6 +19,8 @@ from rs_localizer.core.types import BoolArray
 
 CONFIDENCE = 0.95
 _RESAMPLED = 200
+# Fewer groups say nothing of how much such groups differ.
+_LEAST_GROUPS = 5
 
 IntArray = NDArray[np.int64]
 
@@ -39,6 +41,10 @@ class Interval:
     def outside(self, low: float, high: float) -> bool:
         """Certainly not within."""
         return self.high < low or self.low > high
+
+    def over(self, unit: float) -> Interval:
+        """In units of something positive that is known."""
+        return Interval(self.value / unit, self.low / unit, self.high / unit, self.trials)
 
     def share(self) -> str:
         """As per cent: ``94.0 % (91.2 to 96.1)``."""
@@ -102,7 +108,7 @@ def bootstrap(
     if groups is None:
         groups = everything
     members = [np.flatnonzero(groups == group) for group in np.unique(groups)]
-    if len(members) < 2:
+    if len(members) < _LEAST_GROUPS:
         return Interval(value, 0.0, np.inf, count)
     rng = np.random.default_rng(seed)
     draws = rng.integers(0, len(members), (_RESAMPLED, len(members)))

@@ -1,7 +1,8 @@
 """What held still holds: all experiments with a few trials, against the verdicts expected of them.
 
-Left out are the verdicts that need the default number of trials (differences of a few per cent)
-and those on times, which are not the code's alone.
+With so few a claim may be undecided, but never the contrary of what it was. Left out are the
+verdicts that need the default number of trials (differences of a few per cent) and those on times,
+which are not the code's alone.
 """
 
 from __future__ import annotations
@@ -146,8 +147,8 @@ def test_verdicts(name: str) -> None:
     wrong = [
         f"{claim.name} {claim.verdict}: {claim.finding}"
         for claim in claims.values()
-        if (claim.name in HELD and claim.verdict is not Verdict.HELD)
-        or (claim.name in NOT_HELD and claim.verdict is not Verdict.NOT_HELD)
+        if (claim.name in HELD and claim.verdict in (Verdict.NOT_HELD, Verdict.NOT_TESTED))
+        or (claim.name in NOT_HELD and claim.verdict in (Verdict.HELD, Verdict.NOT_TESTED))
     ]
     assert wrong == []
 
@@ -160,7 +161,7 @@ def test_everything_is_said_and_shown(name: str) -> None:
         assert claim.criterion
         assert claim.finding
         assert "nan" not in claim.finding
-        if claim.name in NOT_HELD:
+        if claim.name in NOT_HELD and claim.verdict is Verdict.NOT_HELD:
             assert claim.why
     assert found.tables
     for table in found.tables.values():
