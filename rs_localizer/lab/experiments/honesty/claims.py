@@ -7,7 +7,7 @@ confidence of the single ones allows for their number.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from rs_localizer.core.types import BoolArray
 from rs_localizer.lab.experiments.honesty.against_p3p import MOST_RATIO, Pair
 from rs_localizer.lab.experiments.honesty.coverage import MOTIONS
 from rs_localizer.lab.experiments.honesty.estimating import Found
-from rs_localizer.lab.experiments.honesty.scores import percent
+from rs_localizer.lab.experiments.honesty.scores import Scores, percent
 from rs_localizer.lab.experiments.honesty.small_planes import GROSS
 from rs_localizer.lab.experiments.honesty.tags import Replayed
 from rs_localizer.lab.experiments.results import Claim, judge, judge_intervals
@@ -58,7 +58,6 @@ def vibration_claims(found: Mapping[str, Found]) -> list[Claim]:
 
 def plane_claims(found: Mapping[str, Found]) -> list[Claim]:
     """Regions and gross errors before small planes."""
-    middles = {name: Found(one.middle, one.middle) for name, one in found.items()}
     what = "small planes far away: 95 % regions of poses"
     gross = sum(
         int(np.count_nonzero(one.middle.of("orientation")[one.middle.localized] > GROSS))
@@ -66,7 +65,7 @@ def plane_claims(found: Mapping[str, Found]) -> list[Claim]:
     )
     total = sum(len(one.middle) for one in found.values())
     return [
-        _regions("honesty.planes", what, "pose", middles, _HOLD_PLANES),
+        _regions("honesty.planes", what, "pose", found, _HOLD_PLANES),
         judge(
             "honesty.planes_gross",
             _SOURCE,
@@ -164,18 +163,17 @@ def rendered_claims(found: Mapping[str, Found]) -> list[Claim]:
 def _regions(
     name: str, what: str, part: str, found: Mapping[str, Found], limits: tuple[float, float]
 ) -> Claim:
-    """At the stamp and at mid-frame."""
     hits = {
-        f"{condition} at {moment}": (scores.inside(part), scores.groups())
-        for condition, one in found.items()
-        for moment, scores in (("stamp", one.stamp), ("mid-frame", one.middle))
+        condition: (scores.inside(part), scores.groups())
+        for condition, scores in _at_both_moments(found)
     }
     return _family(name, f"{what} hold", "they hold the truth in", hits, limits)
 
 
 def _far_off(name: str, where: str, found: Mapping[str, Found]) -> Claim:
     hits = {
-        condition: (one.middle.far_off(), one.middle.groups()) for condition, one in found.items()
+        condition: (scores.far_off(), scores.groups())
+        for condition, scores in _at_both_moments(found)
     }
     return _family(
         name,
@@ -184,6 +182,12 @@ def _far_off(name: str, where: str, found: Mapping[str, Found]) -> Claim:
         hits,
         (0.0, _MOST_FAR_OFF),
     )
+
+
+def _at_both_moments(found: Mapping[str, Found]) -> Iterator[tuple[str, Scores]]:
+    for condition, one in found.items():
+        yield f"{condition} at stamp", one.stamp
+        yield f"{condition} at mid-frame", one.middle
 
 
 def _family(

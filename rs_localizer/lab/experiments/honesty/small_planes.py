@@ -66,7 +66,8 @@ def measure(condition: Condition, frames: int, seed: int) -> Found:
 
 
 COLUMNS = (
-    "condition", "frames", "pose@mid", "twist@mid", "over_5_sigma", "gross", "deg", "deg_95",
+    "condition", "frames", "pose@stamp",
+    "pose@mid", "twist@mid", "over_5_sigma", "gross", "deg", "deg_95",
     "refused", "reasons",
 )  # fmt: skip
 
@@ -78,6 +79,7 @@ def row(name: str, found: Found) -> tuple[str | float | int, ...]:
     return (
         name,
         len(scores),
+        percent(found.stamp.inside("pose")),
         percent(scores.inside("pose")),
         percent(scores.inside("twist")),
         percent(scores.far_off()),
