@@ -25,8 +25,14 @@ _SOURCE = "this project"
 _MOST_FAR_OFF = 0.01
 _LEAST_INSIGNIFICANT = 0.93
 _HOLD, _HOLD_ROUGHLY, _HOLD_PLANES = (0.92, 0.98), (0.90, 1.0), (0.90, 0.99)
-# Motion that no model of one readout follows: there regions may hold more than they promise.
-_ROUGH = ("drone", "stop")
+# Without a limit above, regions may hold more than they promise: at rest velocities are shrunk to
+# what happens to be the truth, and what shakes or stops no model of one readout follows.
+_OF_MOTION = {
+    "rest": (0.92, 1.0),
+    "hand": _HOLD,
+    "drone": _HOLD_ROUGHLY,
+    "stop": _HOLD_ROUGHLY,
+}
 _PARTS = {"pose": "poses", "twist": "twists"}
 
 Hits = Mapping[str, tuple[BoolArray, IntArray]]
@@ -38,10 +44,9 @@ def coverage_claims(found: Mapping[str, Found]) -> list[Claim]:
     claims = []
     for motion in MOTIONS:
         of_motion = {name: one for name, one in found.items() if name.startswith(f"{motion}/")}
-        limits = _HOLD_ROUGHLY if motion in _ROUGH else _HOLD
         claims += [
             _regions(f"honesty.{motion}_{part}", f"{motion}: 95 % regions of {noun}", part,
-                     of_motion, limits)
+                     of_motion, _OF_MOTION[motion])
             for part, noun in _PARTS.items()
         ]  # fmt: skip
     return [*claims, _far_off("honesty.five_sigma", "on all of these motions", found)]
