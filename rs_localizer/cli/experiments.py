@@ -25,7 +25,7 @@ from rs_localizer.lab.experiments.table import EXPERIMENTS
 
 T = TypeVar("T")
 
-# All experiments with so many trials take at most ten minutes on two cores.
+# All experiments with so many trials take about a quarter of an hour on two cores.
 _TRIALS = 2000
 
 
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=_TRIALS,
         metavar="N",
         help="simulated frames per point of a curve; recordings and timings are cut in proportion, "
-        "and below 500 compile times are left out (default: %(default)s, at most ten minutes in "
+        "and below 500 compile times are left out (default: %(default)s, a quarter of an hour in "
         "all on two cores)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")

@@ -30,6 +30,8 @@ TURNS = (0.0, 3.0, 10.0)  # deg per readout
 NOISE = 1.0  # px
 GROSS = 10.0  # deg
 _METRES_PER_DEGREE = 0.01
+# A field of view of 45 degrees, as in the paper's experiments: the smallest plane has 80 px.
+_CAMERA = Camera(width=1000, height=1000, focal=1207.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,7 @@ def conditions() -> Sequence[Condition]:
 def measure(condition: Condition, frames: int, seed: int) -> Found:
     """The scores of a condition."""
     plane = SmallPlane(condition.size, condition.distance, condition.tilt)
-    true = Camera()
+    true = _CAMERA
     turning = partial(
         steady,
         rate=math.radians(condition.turn) / true.readout_time,
