@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "markers": {"core", "io"},
     "lab": {
         *("core", "config", "solvers", "localizer", "tracking"),
-        *("io", "markers", "matching", "frames", "settings", "arguments"),
+        *("io", "markers", "matching", "moments", "frames", "settings", "arguments", "data"),
     },
 }
 ABOVE = {"ros", "cli"}

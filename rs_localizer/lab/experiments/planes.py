@@ -16,8 +16,9 @@ from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.errors import angles
 from rs_localizer.lab.experiments.plain_ransac import observe
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge_intervals
 from rs_localizer.lab.experiments.trials import Setting, camera
+from rs_localizer.lab.experiments.uncertainty import quantile
 from rs_localizer.lab.experiments.views import View, synthetic_views
 from rs_localizer.localizer import Localizer
 
@@ -108,13 +109,14 @@ _COLUMNS = ("case", "method", "orientation_deg_q25", "median", "q75", "no_pose")
 def _claim(case: Case, errors: Mapping[str, Array]) -> Claim:
     medians = {name: float(np.median(values)) for name, values in errors.items()}
     others = ", ".join(f"{medians[name]:.2f} with {_LABELS[name]}" for name in (_FREE, _P3P))
-    return judge(
+    return judge_intervals(
         f"planes.{case.name}",
         "this project",
         f"the velocity prior makes a plane usable: {case.label}",
         f"median orientation error at most {case.at_most:g} deg",
         f"{medians[_OURS]:.2f} deg ({others})",
-        medians[_OURS] <= case.at_most,
+        [quantile(errors[_OURS])],
+        (-np.inf, case.at_most),
     )
 
 

@@ -120,15 +120,15 @@ def found(bounds: np.ndarray, reported: np.ndarray, at_most: float = 1.05) -> bo
 def test_at_the_bound_and_calibrated_or_not() -> None:
     draws = chi2.rvs(12, size=4000, random_state=0)
     right = found(draws, draws)
-    assert right.ratio == pytest.approx(1.0, abs=0.02)
-    assert right.coverage == pytest.approx(0.95, abs=0.01)
+    assert right.ratio.value == pytest.approx(1.0, abs=0.02)
+    assert right.coverage.value == pytest.approx(0.95, abs=0.01)
     assert {claim.verdict for claim in bound.claims(right)} == {Verdict.HELD}
     worse = found(1.2 * draws, 1.2 * draws)  # by a tenth in standard deviations
     verdicts = {claim.name: claim.verdict for claim in bound.claims(worse)}
     assert verdicts["bound.fast"] is Verdict.NOT_HELD
     assert verdicts["bound.fast_calibrated"] is Verdict.NOT_HELD
     modest = found(draws, 0.8 * draws)
-    assert modest.coverage > 0.97
+    assert modest.coverage.value > 0.97
     assert bound.claims(modest)[1].verdict is Verdict.NOT_HELD
 
 
@@ -138,8 +138,10 @@ def test_gross_errors_and_those_that_hide() -> None:
     one = found(with_two, np.concatenate([draws, [200.0, 12.0]]))
     assert one.gross == pytest.approx(2 / 102)
     assert one.overconfident == 1
-    assert bound.claims(one)[2].verdict is Verdict.NOT_HELD
-    missing = bound.Found(one.case, [*one.outcomes[:98], NO_POSE, NO_POSE])
+    assert bound.claims(one)[2].verdict is Verdict.UNDECIDED
+    many = found(np.repeat(with_two, 20), np.repeat(with_two, 20))
+    assert bound.claims(many)[2].verdict is Verdict.NOT_HELD
+    missing = bound.Found(one.case, [*one.outcomes[:90], *[NO_POSE] * 10])
     assert bound.claims(missing)[2].verdict is Verdict.NOT_HELD
 
 
