@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from rs_localizer.config import Acceleration
 from rs_localizer.core import camera as core
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.lab.experiments.honesty.scores import Score, Scores, Truth, score_at
@@ -65,7 +64,7 @@ def estimate(
 ) -> dict[int, Estimate | Failure]:
     """Results of the counted frames, by their place in ``frames``."""
     found: dict[int, Estimate | Failure] = {}
-    tracker = Tracker(localizer, Acceleration()) if tracking else None
+    tracker = Tracker(localizer) if tracking else None
     first_counted = int(frames.place.max()) + 1 - COUNTED
     for frame in range(len(frames)):
         place = int(frames.place[frame])
