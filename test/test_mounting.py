@@ -84,7 +84,8 @@ def robot() -> TransformTree:
 
 def estimate() -> Estimate:
     rng = np.random.default_rng(0)
-    root = rng.normal(size=(12, 12)) * np.repeat([0.003, 0.01, 0.02, 0.05], 3)[:, None]
+    deviations = np.repeat([0.003, 0.01, 0.02, 0.05, 0.01, 0.02], 3)
+    root = rng.normal(size=(18, 18)) * deviations[:, None]
     return Estimate(
         rotation=Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(),
         translation=np.array([0.1, -0.2, 2.0]),
@@ -92,7 +93,7 @@ def estimate() -> Estimate:
         linear_velocity=np.array([0.02, 0.05, -0.01]),
         inliers=np.ones(8, dtype=bool),
         residuals=np.ones(8),
-        covariance=root @ root.T,
+        joint_covariance=root @ root.T,
         global_shutter_inliers=4,
         iterations=10,
     )

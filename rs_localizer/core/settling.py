@@ -29,10 +29,13 @@ from rs_localizer.core.shaking import AGREEMENT, follow
 from rs_localizer.core.state import PARAMETERS, VELOCITIES
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
-_SPEEDS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
+_SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
 # Odds by which motion must explain the points better than rest, to count in the estimate: what
 # explains little is often a slightly wrong map or lens. The covariance allows for it at even odds.
 _ODDS_AGAINST_MOTION = 100.0
+# Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
+# by that.
+_GENEROSITY = 0.5
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part.
 _CLEARLY_MOVING = 67.0
@@ -86,6 +89,7 @@ class _Mode:
     state: Array  # (24,)
     covariance: Array  # (18,18)
     evidence: float
+    volume: float  # the part of the evidence that speaks for few possibilities (Occam's factor)
     speed: float
     field: float  # px
 
@@ -124,11 +128,12 @@ class _Frame:
         state, _ = self.fitted(start, terms)
         examined = self.examined(state, terms, 0)
         known = np.diag(terms.informations[0])
-        volume = np.log(known[known > 0.0]).sum() - examined.determined
+        volume = 0.5 * (np.log(known[known > 0.0]).sum() - examined.determined)
         return _Mode(
             state,
             self.inflation * examined.covariance,
-            examined.sizes.evidence + 0.5 * volume,
+            examined.sizes.evidence + volume,
+            volume,
             speed,
             examined.sizes.field,
         )
@@ -217,7 +222,7 @@ def _weighed(frame: _Frame, found: Posterior, planar: bool) -> Posterior:
     modes = _modes(frame, found, planar)
     evidence = np.array([mode.evidence for mode in modes])
     at_rest = np.array([mode.speed == 0.0 for mode in modes])
-    possible = _normalized(evidence)
+    possible = _normalized(evidence - _GENEROSITY * np.array([mode.volume for mode in modes]))
     counting = _normalized(evidence + math.log(_ODDS_AGAINST_MOTION) * at_rest)
     best = int(np.argmax(counting))
     steps = np.array([step_between(modes[best].state, mode.state) for mode in modes])

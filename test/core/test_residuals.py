@@ -34,7 +34,7 @@ def test_the_jacobian_is_the_finite_difference_of_the_forward_projection(scene, 
     for k in range(18):
         ahead, behind = (
             project_rolling(
-                camera, scene.motion_of(apply_step(state, sign * h * np.eye(12)[k])).at_rows, points
+                camera, scene.motion_of(apply_step(state, sign * h * np.eye(18)[k])).at_rows, points
             )[0]
             for sign in (1, -1)
         )
