@@ -185,7 +185,7 @@ def test_the_second_object_is_rigid_too() -> None:
 def test_ratios_of_tracking_are_by_quartile() -> None:
     errors = np.column_stack([np.arange(9.0), np.arange(9.0)])
     one = tracking.Run(np.arange(9.0), errors * [0.5, 2.0], errors, np.arange(9) > 4)
-    np.testing.assert_allclose(one.ratios(0.5), [0.5, 2.0])
+    assert [one.ratio(0.5, column).value for column in (0, 1)] == [0.5, 2.0]
     assert one.share == 0.5
     assert tracking._never_worse(tracking._CASES[2], one).verdict is Verdict.NOT_HELD
     assert tracking._improves(tracking._CASES[0], one).verdict is Verdict.NOT_HELD
