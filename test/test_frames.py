@@ -71,7 +71,7 @@ class MockLocalizer:
             linear_velocity=MOTION.linear_velocity,
             inliers=np.arange(len(points)) % 2 == 0,
             residuals=pixels[:, 0] - 100.0,
-            covariance=np.eye(12),
+            joint_covariance=np.eye(18),
             global_shutter_inliers=4,
             iterations=10,
         )

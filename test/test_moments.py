@@ -102,9 +102,11 @@ def twist(motion: Estimate, tau: float) -> Array:
     return np.concatenate([linear, angular])
 
 
-def numerical_jacobian(function: Callable[[Array], Array], step: float) -> Array:
+def numerical_jacobian(
+    function: Callable[[Array], Array], step: float, size: int = 3 * len(DEVIATIONS)
+) -> Array:
     columns = [
-        (function(step * unit) - function(-step * unit)) / (2.0 * step) for unit in np.eye(3 * len(DEVIATIONS))
+        (function(step * unit) - function(-step * unit)) / (2.0 * step) for unit in np.eye(size)
     ]
     return np.array(columns).T
 
@@ -141,21 +143,24 @@ def test_pose_covariance(rate: float, tau: float) -> None:
 @pytest.mark.parametrize("rate", RATES)
 def test_twist_covariance(rate: float, tau: float) -> None:
     motion = estimate(rate)
-    jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-3)
+    # Polynomials far outside the readout are no shaking.
+    covariance = motion.joint_covariance[:18, :18]
+    motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=covariance)
+    jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-4, 18)
     expected = jacobian @ motion.joint_covariance @ jacobian.T
     found = twist_at(motion, tau, READOUT_TIME).covariance
     assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("tau", [-0.5, 0.2, 0.5])
-@pytest.mark.parametrize(("acceleration", "shake"), [(0.01, 0.0), (0.0, 0.003), (0.05, 0.003)])
+@pytest.mark.parametrize(("acceleration", "shake"), [(0.01, 0.0), (0.0, 0.001), (0.05, 0.001)])
 def test_covariances_of_an_uneven_motion(acceleration: float, shake: float, tau: float) -> None:
     """To first order of acceleration (the default deviation is 0.01) and shaking."""
     motion = estimate(0.2, acceleration=acceleration, shake=shake)
     for found, function, step in (
         (pose_at(motion, tau).covariance, lambda error: pose_error(motion, tau, error), 1e-5),
         (twist_at(motion, tau, READOUT_TIME).covariance,
-         lambda error: twist(disturbed(motion, error), tau), 1e-3),
+         lambda error: twist(disturbed(motion, error), tau), 1e-4),
     ):  # fmt: skip
         jacobian = numerical_jacobian(function, step)
         expected = jacobian @ motion.joint_covariance @ jacobian.T

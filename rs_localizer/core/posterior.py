@@ -17,7 +17,7 @@ from rs_localizer.core.state import PARAMETERS
 
 # Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
 # distributed errors); the threshold is widened for them at most twofold.
-_GATE = 3.5
+GATE = 3.5
 WIDEST_GATE = 2.0
 _ROUNDS = 3
 _ITERATIONS = 50
@@ -97,7 +97,7 @@ def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float
             total += squared
             left += 2.0
     if left <= 0.0:
-        return gate / _GATE
+        return gate / GATE
     mean = total / left
     variance = mean
     for _ in range(_NOISE_ROUNDS):
@@ -156,7 +156,7 @@ def _rounds(
         errors = squared_errors(data, count, state, gradient)
         freedom = decided(information, prior, noise)
         noise = noise_deviation(errors, gate, freedom)
-        gate = min(max(threshold, _GATE * noise), WIDEST_GATE * threshold)
+        gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
     weights[:] = 1.0
     set_weights(data, weights)
     return state, information, cost, errors, noise, gate, freedom

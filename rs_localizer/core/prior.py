@@ -18,10 +18,10 @@ from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,
+    LINEAR,
     MOTION_PARAMETERS,
     PARAMETERS,
     STATE_SIZE,
-    VELOCITIES,
 )
 
 # A precision that holds a velocity at its mean whatever the points say.
@@ -29,6 +29,7 @@ _HOLDING = 1e18
 _LEAST_DEVIATION = 1e-9
 # A tenth of the speed goes with the accelerations of the whole.
 _JOLTS = 10.0
+_WALKING = 0.1
 # Numbers whose squares are finite.
 _MOST = 1e100
 
@@ -144,12 +145,14 @@ def held_terms() -> PriorTerms:
 
 
 def slower_terms(terms: PriorTerms, part: float) -> PriorTerms:
-    """The prior of a motion whose typical speed is this part of the configured one.
+    """The prior of a motion whose typical turn rate is this part of the configured one.
 
-    What is slow accelerates slowly, too; but not in proportion: jolts come at any speed.
+    Neither travel nor accelerations slow down as much: who hardly turns may walk, and jolts come
+    at any speed.
     """
     informations = terms.informations.copy()
-    informations[0, VELOCITIES] /= part**2
+    informations[0, ANGULAR] /= part**2
+    informations[0, LINEAR] /= max(part, _WALKING) ** 2
     informations[0, ACCELERATIONS] /= min(_JOLTS * part, 1.0) ** 2
     return terms._replace(informations=informations)
 

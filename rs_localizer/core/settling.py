@@ -169,8 +169,8 @@ def settle(
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
     if assumed.rolling and (sizes.no_shake < _SHAKING or examined.agreement > AGREEMENT):
-        shaken = _followed(frame, best, sizes)
-        if shaken.noise < sizes.noise:
+        shaken = _followed(frame, best, sizes, threshold)
+        if sizes.no_shake < _SHAKING or shaken.noise < best.noise:
             return shaken
     found = replace(
         best,
@@ -186,20 +186,20 @@ def settle(
     return found
 
 
-def _followed(frame: _Frame, best: Posterior, sizes: Sizes) -> Posterior:
+def _followed(frame: _Frame, best: Posterior, sizes: Sizes, threshold: float) -> Posterior:
     """The posterior of a camera that shakes."""
     observations = frame.observations
     shaken = follow(
         observations, best.state, best.inliers, frame.terms, sizes.noise, sizes.shake,
-        frame.assumed.shake,
+        frame.assumed.shake, threshold,
     )  # fmt: skip
-    # In pixels: what the shaking moves the points by, which no longer is an error.
     return replace(
         best,
         state=shaken.state,
         covariance=best.inflation * shaken.covariance,
         noise=shaken.noise,
         squared_errors=shaken.squared_errors,
+        inliers=shaken.inliers,
         shake=shaken.coefficients,
         agreement=shaken.agreement,
     )

@@ -17,6 +17,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.model_error import columns_of, neighbours_agree, shake_at
 from rs_localizer.core.observations import Observations
+from rs_localizer.core.posterior import GATE, WIDEST_GATE
 from rs_localizer.core.prior import PriorTerms, add_prior
 from rs_localizer.core.refine import apply_step
 from rs_localizer.core.residuals import linearized
@@ -27,8 +28,12 @@ from rs_localizer.core.state import PARAMETERS
 _DEGREES = (12, 22)
 # Errors whose neighbours agree more than this are not followed, in standard deviations.
 AGREEMENT = 1.7
+# Points within so many times the largest error of an inlier may belong to the scene.
+_NEAR = 4.0
 _STEPS = 3
+_INLIER_ROUNDS = 3
 _SIZE_ROUNDS = 8
+_DOUBT = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +46,7 @@ class Shaken:
     noise: float  # px
     agreement: float  # of what is left, see :func:`neighbours_agree`
     squared_errors: Array  # (n,) px^2
+    inliers: BoolArray  # (n,)
 
 
 def follow(
@@ -51,16 +57,28 @@ def follow(
     noise: float,
     size: float,
     least_size: float,
+    threshold: float,
 ) -> Shaken:
-    """Fit motion and shaking together.
+    """Fit motion and shaking together, and choose the inliers anew: those of a motion without
+    shaking are the points that it happens to pass by.
 
     Args:
         start: state (24,), the best without shaking.
+        threshold: px, least gate of inliers.
         noise: px, a first estimate.
         size, least_size: rad, of the coefficients: a first estimate, and what is always possible.
     """
     for degrees in _DEGREES:
         found = _fit(observations, start, inliers, terms, noise, size, least_size, degrees)
+        for _ in range(_INLIER_ROUNDS):
+            gate = min(max(threshold, GATE * found.noise), WIDEST_GATE * threshold)
+            chosen = found.squared_errors < gate * gate
+            if np.array_equal(chosen, found.inliers):
+                break
+            found = _fit(
+                observations, found.state, chosen, terms, found.noise, size, least_size, degrees,
+                found.coefficients,
+            )  # fmt: skip
         if found.agreement < AGREEMENT:
             break
     return found
@@ -75,8 +93,11 @@ def _fit(
     size: float,
     least_size: float,
     degrees: int,
+    coefficients: Array | None = None,
 ) -> Shaken:
-    state, coefficients = start, np.zeros((degrees - 1, 3))
+    state = start
+    if coefficients is None:
+        coefficients = np.zeros((degrees - 1, 3))
     sizes = np.full(degrees - 1, size**2)
     count = len(observations)
     covariance = np.empty((0, 0))
@@ -107,10 +128,14 @@ def _fit(
         observations.row_time_gradient,
         shake_at(observations.tau, coefficients),
     )
-    agreement = neighbours_agree(errors, observations.tau, inliers)
     behind = np.isinf(observations.squared_errors(state))
     squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
-    return Shaken(state, coefficients, covariance, noise, agreement, squared)
+    # Points beyond the gate count, too: where rows swing out of it, they do so together.
+    gate = np.sqrt(squared[inliers].max(initial=0.0))
+    near = squared < (_NEAR * gate) ** 2
+    clipped = errors * np.minimum(1.0, gate / np.sqrt(np.maximum(squared, 1e-300)))[:, None]
+    agreement = neighbours_agree(clipped, observations.tau, near)
+    return Shaken(state, coefficients, covariance, noise, agreement, squared, inliers)
 
 
 @kernel
@@ -125,7 +150,7 @@ def _sizes_and_step(
     step, covariance = np.zeros(count), np.zeros((count, count))
     matrix, scale, right = np.empty((count, count)), np.empty(count), np.empty(count)
     found = np.empty(len(sizes))
-    for _ in range(_SIZE_ROUNDS):
+    for round_ in range(_SIZE_ROUNDS):
         weight = 1.0 / (noise * noise)
         for i in range(count):
             for j in range(count):
@@ -135,8 +160,10 @@ def _sizes_and_step(
             for j in range(PARAMETERS):
                 matrix[i, j] += information[i, j]
             right[i] -= slope[i]
+        # The sizes are estimates of few coefficients; the covariance allows for that.
+        doubt = _DOUBT if round_ == _SIZE_ROUNDS - 1 else 1.0
         for k in range(PARAMETERS, count):
-            precision = 1.0 / sizes[(k - PARAMETERS) // 3]
+            precision = 1.0 / (doubt * sizes[(k - PARAMETERS) // 3])
             matrix[k, k] += precision
             right[k] -= precision * held[k - PARAMETERS]
         for i in range(count):
@@ -152,6 +179,8 @@ def _sizes_and_step(
             for j in range(count):
                 covariance[i, j] = scale[i] * scale[j] * inverse[i, j]
                 step[i] += covariance[i, j] * right[j]
+        if round_ == _SIZE_ROUNDS - 1:
+            break
         # Expected squares of the coefficients, and of the errors.
         for k in range(len(sizes)):
             total = 0.0

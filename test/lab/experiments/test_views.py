@@ -30,16 +30,18 @@ def moved(motion: Motion, step: np.ndarray) -> Motion:
     """The motion one step (12,) further on."""
     state = np.concatenate(
         [motion.rotation.ravel(), motion.translation, motion.angular_velocity,
-         motion.linear_velocity]
+         motion.linear_velocity, motion.angular_acceleration, motion.linear_acceleration]
     )  # fmt: skip
     state = apply_step(state, step)
-    return Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18])
+    return Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
+                  angular_acceleration=state[18:21], linear_acceleration=state[21:])  # fmt: skip
 
 
 def estimate(motion: Motion, covariance: np.ndarray) -> Estimate:
     fields = {field.name: getattr(motion, field.name) for field in dataclasses.fields(Motion)}
-    nothing = np.zeros(0)
-    return Estimate(**fields, inliers=nothing > 0, residuals=nothing, covariance=covariance,
+    nothing, joint = np.zeros(0), np.eye(18)
+    joint[:12, :12] = covariance
+    return Estimate(**fields, inliers=nothing > 0, residuals=nothing, joint_covariance=joint,
                     global_shutter_inliers=0, iterations=0)  # fmt: skip
 
 
