@@ -65,10 +65,10 @@ def disturbed(motion: Estimate, error: Array) -> Estimate:
 
 
 def shake(motion: Estimate, tau: float) -> Array:
-    """Legendre polynomials of 2 tau from the second degree, less value and slope at 0."""
+    """Legendre polynomials of 2 tau, the smaller the higher, less value and slope at 0."""
     turn = np.zeros(3)
     for degree, coefficients in enumerate(motion.shake, start=2):
-        series = np.eye(degree + 1)[degree]
+        series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
         value, slope = legendre.legval(0.0, series), legendre.legval(0.0, legendre.legder(series))
         turn += (legendre.legval(2 * tau, series) - value - slope * 2 * tau) * coefficients
     return turn
@@ -128,6 +128,15 @@ def test_twist_is_the_rate_of_change_of_the_pose(rate: float, tau: float) -> Non
     result = twist_at(motion, tau, READOUT_TIME)
     expected = twist(motion, tau)
     assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
+
+
+def test_many_rows_are_single_rows() -> None:
+    motion, taus = estimate(0.5, acceleration=0.1, shake=0.003), np.array([-0.5, 0.0, 0.37])
+    rotations, translations = motion.at_rows(taus)
+    for tau, rotation, translation in zip(taus, rotations, translations, strict=True):
+        map_from_camera, position = pose(motion, tau)
+        assert np.allclose(rotation.T, map_from_camera, atol=1e-13)
+        assert np.allclose(-rotation.T @ translation, position, atol=1e-13)
 
 
 @pytest.mark.parametrize("tau", TAUS)

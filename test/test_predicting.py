@@ -1,4 +1,4 @@
-"""From frame to frame, in itself: the transport of motions and errors, and what comes in between."""
+"""Predictions by themselves: how motions and errors are carried on, and what comes in between."""
 
 import numpy as np
 import pytest
@@ -156,13 +156,14 @@ def shaking(seed=0, size=0.003):
 
 def whole_polynomials(estimate):
     """Value (3,) and slope (3,) at the middle of the shaking that nothing was taken from."""
-    coefficients = np.vstack([np.zeros((2, 3)), estimate.shake])
+    sizes = (3.0 / np.arange(2, 2 + len(estimate.shake))) ** 2
+    coefficients = np.vstack([np.zeros((2, 3)), sizes[:, None] * estimate.shake])
     slope = 2.0 * legendre.legval(0.0, legendre.legder(coefficients))
     return legendre.legval(0.0, coefficients), slope
 
 
 def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
-    """Whole Legendre polynomials vanish on average; theirs were moved to the middle row."""
+    """Whole polynomials vanish on average; those of a frame are taken from the middle row."""
     estimate = shaking()
     motion, _, swing = unshaken(estimate)
     value, slope = whole_polynomials(estimate)
@@ -179,7 +180,7 @@ def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
     for part, at in ((slice(0, 3), legendre.legval), (slice(6, 9), None)):
         size = 0.0
         for degree, row in enumerate(estimate.shake, start=2):
-            series = np.eye(degree + 1)[degree]
+            series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
             amount = at(0.0, series) if at else 2 * legendre.legval(0.0, legendre.legder(series))
             size += amount**2 * np.mean(row**2)
         np.testing.assert_allclose(swing[part, part], size * np.eye(3), atol=1e-15)

@@ -24,6 +24,7 @@ from rs_localizer.core.state import PARAMETERS
 
 # Polynomials of the row time, from the second degree: the motion has a constant and a linear part.
 _FIRST_DEGREE = 2
+_WHOLE_SIZE = 3.0  # the degree that counts as it is
 # Coefficients of the field: polynomials of the image up to the third degree, in two directions.
 _FIELD_DEGREE = 3
 _FIELD_TERMS = (_FIELD_DEGREE + 1) * (_FIELD_DEGREE + 2) // 2
@@ -51,7 +52,8 @@ def shake_basis(tau: float, degrees: int, values: Array, rates: Array) -> None:
     """Fill in the polynomials of the shaking at a row time, and their rates.
 
     Legendre polynomials of ``2 tau`` of degree 2 to ``degrees``, less their value and slope at the
-    middle row: there, pose and velocities are the motion's own.
+    middle row: there, pose and velocities are the motion's own. They are the smaller the faster
+    they change, because what is slow swings farther.
     """
     at, middle = np.empty(degrees + 1), np.empty(degrees + 1)
     _legendre(2.0 * tau, at)
@@ -62,8 +64,9 @@ def shake_basis(tau: float, degrees: int, values: Array, rates: Array) -> None:
     for k in range(2, degrees + 1):
         slope[k] = k * middle[k - 1]
         slope_at[k] = k * at[k - 1] + 2.0 * tau * slope_at[k - 1]
-        values[k - _FIRST_DEGREE] = at[k] - middle[k] - 2.0 * slope[k] * tau
-        rates[k - _FIRST_DEGREE] = 2.0 * (slope_at[k] - slope[k])
+        size = (_WHOLE_SIZE / k) ** 2
+        values[k - _FIRST_DEGREE] = size * (at[k] - middle[k] - 2.0 * slope[k] * tau)
+        rates[k - _FIRST_DEGREE] = size * 2.0 * (slope_at[k] - slope[k])
 
 
 @kernel
@@ -83,13 +86,20 @@ def shake_at(tau: Array, coefficients: Array) -> Array:
     return shake
 
 
+def basis_sizes(degrees: int) -> Array:
+    """Sizes (degrees - 1,) of the polynomials of :func:`shake_basis`."""
+    sizes: Array = (_WHOLE_SIZE / np.arange(_FIRST_DEGREE, degrees + 1)) ** 2
+    return sizes
+
+
 @cache
 def shake_in_the_middle(count: int) -> tuple[Array, Array]:
     """Values and slopes (count,) at the middle row that :func:`shake_basis` takes away."""
     degrees = np.arange(_FIRST_DEGREE, count + _FIRST_DEGREE)
     polynomials = [np.polynomial.Legendre.basis(k) for k in degrees]
-    values = np.array([p(0.0) for p in polynomials])
-    slopes = np.array([2.0 * p.deriv()(0.0) for p in polynomials])
+    sizes = basis_sizes(count + _FIRST_DEGREE - 1)
+    values = sizes * np.array([p(0.0) for p in polynomials])
+    slopes = sizes * np.array([2.0 * p.deriv()(0.0) for p in polynomials])
     return values, slopes
 
 

@@ -44,9 +44,9 @@ _LITTLE_OF_THE_PRIOR = 0.05
 # readout. What they find, or what neighbouring rows agree on beside them, is followed closer.
 _SHAKE_DEGREE = 6
 _SHAKING = 0.05
-# Sizes to try, as multiples of the least, and the probability that there is no more than that.
-_SHAKE_SIZES = 10.0 ** np.arange(0.0, 5.6, 0.5)
-_NO_SHAKE = 0.7
+# Sizes to try, as multiples of the least, and their probabilities.
+_SHAKE_SIZES = 10.0 ** np.arange(0.0, 5.1)
+_SHAKE_PRIOR = np.array([0.5, 0.2, 0.15, 0.1, 0.04, 0.01])
 _FIELD_SIZES = 10.0 ** np.arange(0.0, 2.1, 0.5)
 # Lenses and maps are never better than this, px: a hundredth; whose errors are a pixel, are rare.
 _LEAST_FIELD = 0.01
@@ -61,8 +61,6 @@ _CLEARLY_WORSE = 9.2
 _COVERED = 4.0
 
 
-_SHAKE_PRIOR = np.full(len(_SHAKE_SIZES), (1.0 - _NO_SHAKE) / (len(_SHAKE_SIZES) - 1))
-_SHAKE_PRIOR[0] = _NO_SHAKE
 
 
 @dataclass(frozen=True, slots=True)

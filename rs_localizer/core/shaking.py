@@ -15,7 +15,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.jit import kernel
-from rs_localizer.core.model_error import columns_of, neighbours_agree, shake_at
+from rs_localizer.core.model_error import basis_sizes, columns_of, neighbours_agree, shake_at
 from rs_localizer.core.observations import Observations
 from rs_localizer.core.posterior import GATE, WIDEST_GATE
 from rs_localizer.core.prior import PriorTerms, add_prior
@@ -98,7 +98,8 @@ def _fit(
     state = start
     if coefficients is None:
         coefficients = np.zeros((degrees - 1, 3))
-    sizes = np.full(degrees - 1, size**2)
+    # At first all are thought to be as large as each other, whatever the size of their polynomials.
+    sizes = (size / basis_sizes(degrees)) ** 2
     count = len(observations)
     covariance = np.empty((0, 0))
     for _ in range(_STEPS):

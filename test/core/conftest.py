@@ -32,9 +32,7 @@ def motion_of(state):
     )  # fmt: skip
 
 
-def frame(
-    direction="top_to_bottom", speed=0.15, noise=0.0, count=21, seed=0, acceleration=0.0
-):
+def frame(direction="top_to_bottom", speed=0.15, noise=0.0, count=21, seed=0, acceleration=0.0):
     """Camera, motion, points, true pixels, measured pixels."""
     rng = np.random.default_rng(seed)
     faster = acceleration * np.random.default_rng(seed + 1000).normal(size=(2, 3))

@@ -15,10 +15,13 @@ AXIS = {"top_to_bottom": (1, 1), "bottom_to_top": (1, -1),
 
 
 def polynomials(tau, count):
-    """(n,count): Legendre's of 2 tau from the second degree, less value and slope at 0."""
+    """(n,count): Legendre's of 2 tau from the second degree, less value and slope at 0.
+
+    Those of higher degrees are smaller.
+    """
     columns = []
     for degree in range(2, count + 2):
-        series = np.eye(degree + 1)[degree]
+        series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
         value, slope = legendre.legval(0.0, series), legendre.legval(0.0, legendre.legder(series))
         columns.append(legendre.legval(2 * tau, series) - value - slope * 2 * tau)
     return np.array(columns).T.reshape(len(tau), count)
@@ -88,12 +91,16 @@ def project(state, points, direction, coefficients=np.zeros((0, 3)), extra=0.0):
 
 
 def scene(direction, seed=0, count=40, speed=0.2, acceleration=0.1):
-    """State and points that the image holds, with their rays and row times."""
+    """State (24,) and points (n,3) well inside the image."""
     rng = np.random.default_rng(seed)
     rotation = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
     state = np.concatenate(
         [rotation.ravel(), [0.05, -0.1, 4.0], speed * rng.normal(size=6),
          acceleration * rng.normal(size=6)]
     )  # fmt: skip
-    local = np.column_stack([rng.uniform(-1.2, 1.2, (count, 2)), rng.uniform(-1, 1, count)])
-    return state, local @ rotation  # around the centre of the map, in camera axes
+    local = np.column_stack([rng.uniform(-2.0, 2.0, (8 * count, 2)), rng.uniform(-1, 1, 8 * count)])
+    points = local @ rotation  # about the centre of the map
+    seen = pixels_of(project(state, points, direction)[0])
+    inside = np.flatnonzero(np.all((seen > 20) & (seen < np.array(SIZE) - 20), axis=1))[:count]
+    assert len(inside) == count
+    return state, points[inside]

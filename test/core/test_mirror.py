@@ -51,7 +51,7 @@ def test_there_is_none_of_a_plane_that_faces_the_camera_and_of_what_is_no_plane(
 def test_only_the_points_that_count_are_the_plane():
     points, rotation = plane(), so3.exp(np.array([0.4, 0.0, 0.0]))
     state = state_of(rotation, [0, 0, 4.0] - rotation @ points.mean(axis=0))
-    strewn = np.vstack([points, points[:10] + [0.0, 0.0, 3.0]])
+    strewn = np.vstack([points, points[:10] + np.array([0.0, 0.0, 3.0])])
     assert mirrored(strewn, np.ones(50, dtype=bool), state) is None
     counting = np.arange(50) < 40
     np.testing.assert_allclose(

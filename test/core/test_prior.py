@@ -117,7 +117,8 @@ def test_motion_terms_are_precisions_and_none_for_zero():
     ("arguments", "said"),
     [
         ({"motion": motion()}, "a prior motion and its covariance go together"),
-        ({"motion": motion(), "covariance": np.eye(6)}, r"must be \(12,12\) or \(18,18\), got \(6, 6\)"),
+        ({"motion": motion(), "covariance": np.eye(6)},
+         r"must be \(12,12\) or \(18,18\), got \(6, 6\)"),
         ({"motion": motion(), "covariance": np.zeros((12, 12))}, "must be positive definite"),
         ({"motion": motion(), "covariance": np.full((12, 12), np.nan)}, "must be finite"),
         ({"motion": motion(), "covariance": np.triu(np.ones((12, 12)))}, "must be symmetric"),

@@ -126,9 +126,7 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
     information, slope = np.empty((18, 18)), np.empty(18)
 
     def cost_of(s):
-        return residuals.normal_equations(
-            data, s, gradient, scale, softness, 2, information, slope
-        )
+        return residuals.normal_equations(data, s, gradient, scale, softness, 2, information, slope)
 
     steps = [sign * h * np.eye(18)[k] for k in range(18) for sign in (1, -1)]
     around = [cost_of(apply_step(state, step)) for step in steps]
