@@ -27,7 +27,7 @@ from rs_localizer.core.prior import (
 from rs_localizer.core.ransac import Candidate
 from rs_localizer.core.refine import step_between
 from rs_localizer.core.sampling import generator
-from rs_localizer.core.settling import Assumed, settle
+from rs_localizer.core.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, settle
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.searching import Frame, MotionSearch
@@ -168,6 +168,7 @@ class Localizer:
             None if scores is None else np.argsort(-scores[usable], kind="stable"),
             terms if prior is None else with_measurements(terms, prior),
             generator(self.config.seed),
+            _with_experience(self._assumed, prior),
         )
 
     def _track(self, frame: Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
@@ -196,7 +197,7 @@ class Localizer:
     def _final(self, frame: Frame, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.
         may_rest = self._assumed.may_rest and len(terms.informations) == 1
-        assumed = replace(self._assumed, may_rest=may_rest)
+        assumed = replace(frame.assumed, may_rest=may_rest)
         threshold = self.config.inlier_threshold
         return settle(frame.observations, best.state, terms, threshold, assumed)
 
@@ -236,6 +237,8 @@ class Localizer:
             joint_covariance=posterior.covariance,
             shake=posterior.shake,
             model_error=posterior.model_error,
+            of_shake_sizes=posterior.of_shake_sizes,
+            of_field_sizes=posterior.of_field_sizes,
             global_shutter_inliers=self._search.global_shutter_inliers(frame, start),
             iterations=best.samples,
         )
@@ -260,6 +263,17 @@ def assumptions(
         shake=jerk / _JERK_OF_CUBIC,
         map_deviation=config.map_deviation,
         focal_length=camera.focal_length,
+        of_shake_sizes=np.zeros(SHAKE_SIZES),
+        of_field_sizes=np.zeros(FIELD_SIZES),
         may_rest=solver.rolling_shutter and min(velocity.angular, velocity.linear) > 0.0,
         rolling=solver.rolling_shutter,
+    )
+
+
+def _with_experience(assumed: Assumed, prior: Prior | None) -> Assumed:
+    """The assumptions and what the frames before say of shaking and model error."""
+    if prior is None or prior.of_shake_sizes is None or prior.of_field_sizes is None:
+        return assumed
+    return replace(
+        assumed, of_shake_sizes=prior.of_shake_sizes, of_field_sizes=prior.of_field_sizes
     )

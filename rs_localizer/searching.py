@@ -15,6 +15,7 @@ from rs_localizer.core.prior import PriorTerms, held_terms
 from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, search
 from rs_localizer.core.sampling import Pool, Random
 from rs_localizer.core.scoring import optimize
+from rs_localizer.core.settling import Assumed
 from rs_localizer.solvers import Solver, find_solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -42,6 +43,7 @@ class Frame:
     ranking: IntArray | None  # observed points from the best to the worst
     terms: PriorTerms  # velocity prior and whatever else is known but the pose
     random: Random
+    assumed: Assumed
 
 
 class MotionSearch:

@@ -21,7 +21,8 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.model_error import shake_in_the_middle
-from rs_localizer.core.prior import Prior
+from rs_localizer.core.prior import Prior, state_in
+from rs_localizer.core.refine import step_between
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import (
     ANGULAR,
@@ -44,6 +45,13 @@ _MOST_FAILURES = 5
 _NEWEST = 0.3
 # Time (s) in which accelerations fade: hands and drones change them about twice a second.
 _FADING = 0.1
+# What a frame says of shaking and model error fades by this from frame to frame, and counts as part
+# of what an independent frame would say: the next frame shows much the same.
+_MEMORY = 0.95
+_INDEPENDENT = 0.3
+# How fast surprises change the accelerations that are expected (exponent), and how much at most.
+_LEARNING = 0.2
+_MOST_JOLTS = 1e4
 # Below this part of the time of fading the closed form of the noise is rounding errors.
 _SHORT = 0.03
 
@@ -169,6 +177,9 @@ class _Track:
     estimate: Estimate
     time_ns: int
     share: float  # of inliers among the points
+    of_shake_sizes: Array  # what all frames so far say of shaking and model error
+    of_field_sizes: Array
+    jolts: float  # how many times the configured accelerations, squared
     failures: int = 0  # frames without a pose since then
 
 
@@ -212,8 +223,14 @@ class Tracker:
         motion, covariance = predict(
             motion, covariance, dt / readout_time, _FADING / readout_time
         )
-        covariance += acceleration_covariance(acceleration, dt, readout_time) + swing
-        return Prior(motion=motion, covariance=covariance)
+        covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
+        covariance += swing
+        return Prior(
+            motion=motion,
+            covariance=covariance,
+            of_shake_sizes=track.of_shake_sizes,
+            of_field_sizes=track.of_field_sizes,
+        )
 
     def localize(
         self, time_ns: int, points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None = None
@@ -234,8 +251,39 @@ class Tracker:
                 if self._track.failures >= _MOST_FAILURES:
                     self._track = None
             return result
-        found = float(np.mean(result.inliers))
-        if result.tracked:
-            found = (1.0 - _NEWEST) * share + _NEWEST * found
-        self._track = _Track(result, time_ns, found)
+        self._track = _followed(self._track, prior, result, time_ns)
         return result
+
+
+def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_ns: int) -> _Track:
+    """The track and its newest frame."""
+    share = float(np.mean(found.inliers))
+    if track is None or prior is None:
+        return _Track(found, time_ns, share, found.of_shake_sizes, found.of_field_sizes, 1.0)
+    if found.tracked:
+        share = (1.0 - _NEWEST) * track.share + _NEWEST * share
+    surprise = _surprise(prior, found)
+    return _Track(
+        found,
+        time_ns,
+        share,
+        _MEMORY * track.of_shake_sizes + _INDEPENDENT * found.of_shake_sizes,
+        _MEMORY * track.of_field_sizes + _INDEPENDENT * found.of_field_sizes,
+        float(np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS)),
+    )
+
+
+def _surprise(prior: Prior, found: Estimate) -> float:
+    """How many times farther than predicted the motion has changed, squared; 1 is as predicted.
+
+    The squared step from the prediction to the estimate, in standard deviations of the prediction,
+    is expected to be what the points decide of the parameters.
+    """
+    assert prior.motion is not None
+    assert prior.covariance is not None
+    scale = 1.0 / np.sqrt(np.diag(prior.covariance))
+    information = np.linalg.inv(prior.covariance * np.outer(scale, scale)) * np.outer(scale, scale)
+    step = step_between(state_in(prior.motion, np.zeros(3)), state_in(found, np.zeros(3)))
+    posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
+    expected = PARAMETERS - float(np.einsum("ij,ji->", information, posterior))
+    return float(step @ information @ step) / max(expected, 1.0)

@@ -17,7 +17,7 @@ _MOST_TURN = 1.5
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 # Errors that neighbouring rows share although the motion follows vibration, in standard deviations.
-_MOST_AGREEMENT = 4.0
+_MOST_AGREEMENT = 3.0
 # Errors of map and lens, root mean square, in inlier thresholds.
 _MOST_MODEL_ERROR = 0.4
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that

@@ -305,9 +305,11 @@ class Sizes(NamedTuple):
     # Probability that there is none of it beyond what always may be.
     no_shake: float
     no_field: float
-    # Logarithm of the marginal likelihood, but for the part of the motion; of a frame without
-    # shaking.
+    # Logarithm of the marginal likelihood, but for the part of the motion.
     evidence: float
+    # The same for each size that was tried, less that of the first.
+    of_shake_sizes: Array
+    of_field_sizes: Array
 
 
 @kernel
@@ -352,13 +354,16 @@ def sizes_of(
         fields = project_out(both, right, cost, size - first)
         evidence, noises = evidence_of_sizes(fields, field_sizes, freedom, noise)
         of_field = possible(evidence, field_prior, field_sizes, noises)
-        return Sizes(0.0, np.sqrt(of_field[0]), of_field[1], 1.0, of_field[2], of_field[3])
+        return Sizes(
+            0.0, np.sqrt(of_field[0]), of_field[1], 1.0, of_field[2], of_field[3],
+            np.zeros(len(shake_sizes)), evidence - evidence[0],
+        )  # fmt: skip
 
     # Each on its own; then the one that explains more, and the other beside it.
     shaking = project_out(both[:first, :first], right[:first], cost, shake)
-    evidence, noises = evidence_of_sizes(shaking, shake_sizes, freedom, noise)
-    of_shake = possible(evidence, shake_prior, shake_sizes, noises)
-    shake_gain = of_shake[3] - evidence[0]
+    shake_evidence, noises = evidence_of_sizes(shaking, shake_sizes, freedom, noise)
+    of_shake = possible(shake_evidence, shake_prior, shake_sizes, noises)
+    shake_gain = of_shake[3] - shake_evidence[0]
     for k in range(PARAMETERS):
         order[k] = k
     for k in range(size - first):
@@ -368,30 +373,35 @@ def sizes_of(
     turned, turned_right = both[order][:, order], right[order]
     last = size - shake
     fields = project_out(turned[:last, :last], turned_right[:last], cost, last - PARAMETERS)
-    evidence, noises = evidence_of_sizes(fields, field_sizes, freedom, noise)
-    of_field = possible(evidence, field_prior, field_sizes, noises)
-    field_gain = of_field[3] - evidence[0]
+    field_evidence, noises = evidence_of_sizes(fields, field_sizes, freedom, noise)
+    of_field = possible(field_evidence, field_prior, field_sizes, noises)
+    field_gain = of_field[3] - field_evidence[0]
+    found = of_field if field_gain > shake_gain else of_shake
+    total = found[3]
     if max(shake_gain, field_gain) < _NOTHING_TO_SHARE:
-        found = of_field if field_gain > shake_gain else of_shake
+        pass
     elif field_gain < shake_gain:
         variance = of_shake[1] ** 2 / of_shake[0]
         for k in range(PARAMETERS, first):
             both[k, k] += variance
         fields = project_out(both, right, cost, size - first)
-        evidence, noises = evidence_of_sizes(fields, field_sizes, freedom, of_shake[1])
-        of_field = possible(evidence, field_prior, field_sizes, noises)
+        field_evidence, noises = evidence_of_sizes(fields, field_sizes, freedom, of_shake[1])
+        of_field = possible(field_evidence, field_prior, field_sizes, noises)
         found = of_field
+        total += of_field[3] - field_evidence[0]
     else:
         variance = of_field[1] ** 2 / of_field[0]
         for k in range(PARAMETERS, last):
             turned[k, k] += variance
         shaking = project_out(turned, turned_right, cost, shake)
-        evidence, noises = evidence_of_sizes(shaking, shake_sizes, freedom, of_field[1])
-        of_shake = possible(evidence, shake_prior, shake_sizes, noises)
+        shake_evidence, noises = evidence_of_sizes(shaking, shake_sizes, freedom, of_field[1])
+        of_shake = possible(shake_evidence, shake_prior, shake_sizes, noises)
         found = of_shake
+        total += of_shake[3] - shake_evidence[0]
     return Sizes(
-        np.sqrt(of_shake[0]), np.sqrt(of_field[0]), found[1], of_shake[2], of_field[2], np.nan
-    )
+        np.sqrt(of_shake[0]), np.sqrt(of_field[0]), found[1], of_shake[2], of_field[2], total,
+        shake_evidence - shake_evidence[0], field_evidence - field_evidence[0],
+    )  # fmt: skip
 
 
 @kernel
@@ -478,7 +488,8 @@ class Examined(NamedTuple):
 
 @kernel
 def examine(
-    data: Array, state: Array, gradient: Array, rays: Array, measured_tau: Array, inliers: BoolArray,
+    data: Array, state: Array, gradient: Array, rays: Array, measured_tau: Array,
+    inliers: BoolArray,
     prior: PriorTerms, degrees: int, freedom: float, noise: float,
     shake_sizes: Array, shake_prior: Array, field_sizes: Array, field_prior: Array,
 ) -> Examined:  # fmt: skip

@@ -62,6 +62,9 @@ class Posterior:
     shake: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     agreement: float = 0.0  # of neighbouring rows, standard deviations
+    # What the frame says of the sizes of shaking and field, logarithms of odds; empty: nothing.
+    of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
+    of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def determined(self) -> bool:

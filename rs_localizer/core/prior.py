@@ -44,6 +44,8 @@ class Prior:
             ``Estimate.joint_covariance``; infinite variances leave a parameter free.
         angular_velocity, angular_velocity_deviation: a gyroscope's body rate (3,) in camera axes
             times the readout time (rad per readout), and its standard deviation.
+        of_shake_sizes, of_field_sizes: what the frames before say of shaking and model error, as
+            the fields of ``Estimate`` of these names.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
             along ``gravity_in_map``, of any length, and the standard deviation of its direction
             in rad.
@@ -59,6 +61,8 @@ class Prior:
     gravity: ArrayLike | None = None
     gravity_deviation: float = math.nan
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
+    of_shake_sizes: Array | None = None
+    of_field_sizes: Array | None = None
 
     def __post_init__(self) -> None:
         if (self.motion is None) != (self.covariance is None):

@@ -46,7 +46,7 @@ _SHAKE_DEGREE = 6
 _SHAKING = 0.05
 # Sizes to try, as multiples of the least, and their probabilities.
 _SHAKE_SIZES = 10.0 ** np.arange(0.0, 5.1)
-_SHAKE_PRIOR = np.array([0.5, 0.2, 0.15, 0.1, 0.04, 0.01])
+_SHAKE_PRIOR = np.array([0.6, 0.15, 0.12, 0.09, 0.03, 0.01])
 _FIELD_SIZES = 10.0 ** np.arange(0.0, 2.1, 0.5)
 # Lenses and maps are never better than this, px: a hundredth; whose errors are a pixel, are rare.
 _LEAST_FIELD = 0.01
@@ -63,13 +63,19 @@ _COVERED = 4.0
 
 
 
-@dataclass(frozen=True, slots=True)
+SHAKE_SIZES, FIELD_SIZES = len(_SHAKE_SIZES), len(_FIELD_SIZES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Assumed:
     """What is assumed of a camera and its map, beside the prior of the motion."""
 
     shake: float  # rad, of each polynomial: as much as the jerk of an ordinary motion
     map_deviation: float  # m
     focal_length: float  # px
+    # Logarithms of the odds of each size beside those of any camera: what its last frames said.
+    of_shake_sizes: Array
+    of_field_sizes: Array
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
 
@@ -105,6 +111,8 @@ class _Frame:
         depth = float(np.partition(depths, count // 2)[count // 2]) if count else 1.0
         self.field_sizes = assumed.field_sizes(max(depth, _NEAREST))
         self.freedom = max(2.0 * count - 6.0, 1.0)
+        self.shake_prior = _more_probable(_SHAKE_PRIOR, assumed.of_shake_sizes)
+        self.field_prior = _more_probable(_FIELD_PRIOR, assumed.of_field_sizes)
 
     def fitted(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
         """State (24,) and cost of the best motion near a state."""
@@ -117,7 +125,8 @@ class _Frame:
         found: Examined = examine(
             observations.packed, state, observations.row_time_gradient, observations.rays,
             observations.tau, self.inliers, terms, degree, self.freedom, self.noise,
-            self.assumed.shake * _SHAKE_SIZES, _SHAKE_PRIOR, self.field_sizes, _FIELD_PRIOR,
+            self.assumed.shake * _SHAKE_SIZES, self.shake_prior,
+            self.field_sizes, self.field_prior,
         )  # fmt: skip
         return found
 
@@ -125,8 +134,7 @@ class _Frame:
         """The Gaussian about the best motion of a typical speed."""
         state, _ = self.fitted(start, terms)
         examined = self.examined(state, terms, 0)
-        known = np.diag(terms.informations[0])
-        volume = 0.5 * (np.log(known[known > 0.0]).sum() - examined.determined)
+        volume = _volume(terms, examined)
         return _Mode(
             state,
             self.inflation * examined.covariance,
@@ -167,8 +175,10 @@ def settle(
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
     if assumed.rolling and (sizes.no_shake < _SHAKING or examined.agreement > AGREEMENT):
-        shaken = _followed(frame, best, sizes, threshold)
-        if sizes.no_shake < _SHAKING or shaken.noise < best.noise:
+        shaken = None if _rather_rests(frame, best, examined) else _followed(
+            frame, best, sizes, threshold
+        )
+        if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
             return shaken
     found = replace(
         best,
@@ -176,6 +186,8 @@ def settle(
         covariance=best.inflation * examined.covariance,
         shake=examined.step[PARAMETERS:].reshape(-1, 3),
         model_error=sizes.field,
+        of_shake_sizes=sizes.of_shake_sizes,
+        of_field_sizes=sizes.of_field_sizes,
         agreement=examined.agreement,
     )
     planar = other is not None
@@ -184,13 +196,33 @@ def settle(
     return found
 
 
-def _followed(frame: _Frame, best: Posterior, sizes: Sizes, threshold: float) -> Posterior:
-    """The posterior of a camera that shakes."""
+def _rather_rests(frame: _Frame, best: Posterior, examined: Examined) -> bool:
+    """Whether a camera at rest, with a map or a lens that is a little off, explains as much."""
+    if not frame.assumed.may_rest:
+        return False
+    still = np.concatenate([best.state[:12], np.zeros(12)])
+    rest = frame.mode(still, held_beside(frame.terms), 0.0)
+    moving = examined.sizes.evidence + _volume(frame.terms, examined)
+    return rest.evidence + math.log(_ODDS_AGAINST_MOTION) > moving
+
+
+def _volume(terms: PriorTerms, examined: Examined) -> float:
+    """The part of the evidence that speaks for few possibilities of the motion."""
+    known = np.diag(terms.informations[0])
+    return float(0.5 * (np.log(known[known > 0.0]).sum() - examined.determined))
+
+
+def _followed(
+    frame: _Frame, best: Posterior, sizes: Sizes, threshold: float
+) -> Posterior | None:
+    """The posterior of a camera that shakes; None if it cannot be followed."""
     observations = frame.observations
     shaken = follow(
         observations, best.state, best.inliers, frame.terms, sizes.noise, sizes.shake,
         frame.assumed.shake, threshold,
     )  # fmt: skip
+    if shaken is None:
+        return None
     return replace(
         best,
         state=shaken.state,
@@ -200,6 +232,8 @@ def _followed(frame: _Frame, best: Posterior, sizes: Sizes, threshold: float) ->
         inliers=shaken.inliers,
         shake=shaken.coefficients,
         agreement=shaken.agreement,
+        of_shake_sizes=sizes.of_shake_sizes,
+        of_field_sizes=sizes.of_field_sizes,
     )
 
 
@@ -268,6 +302,10 @@ def _modes(frame: _Frame, found: Posterior, planar: bool) -> list[_Mode]:
         ):
             break  # what moves faster explains even less
     return modes
+
+
+def _more_probable(prior: Array, odds: Array) -> Array:
+    return _normalized(np.log(prior) + odds)
 
 
 def _normalized(evidence: Array) -> Array:

@@ -30,6 +30,7 @@ _DEGREES = (12, 22)
 AGREEMENT = 1.7
 # Points within so many times the largest error of an inlier may belong to the scene.
 _NEAR = 4.0
+_FEWEST = 12  # points that shaking could be told from
 _STEPS = 3
 _INLIER_ROUNDS = 3
 _SIZE_ROUNDS = 8
@@ -58,19 +59,24 @@ def follow(
     size: float,
     least_size: float,
     threshold: float,
-) -> Shaken:
+) -> Shaken | None:
     """Fit motion and shaking together, and choose the inliers anew: those of a motion without
     shaking are the points that it happens to pass by.
 
     Args:
         start: state (24,), the best without shaking.
         threshold: px, least gate of inliers.
+
+    None where the fit leaves what can be computed.
         noise: px, a first estimate.
         size, least_size: rad, of the coefficients: a first estimate, and what is always possible.
     """
+    best = None
     for degrees in _DEGREES:
         found = _fit(observations, start, inliers, terms, noise, size, least_size, degrees)
         for _ in range(_INLIER_ROUNDS):
+            if found is None:
+                return best
             gate = min(max(threshold, GATE * found.noise), WIDEST_GATE * threshold)
             chosen = found.squared_errors < gate * gate
             if np.array_equal(chosen, found.inliers):
@@ -79,9 +85,12 @@ def follow(
                 observations, found.state, chosen, terms, found.noise, size, least_size, degrees,
                 found.coefficients,
             )  # fmt: skip
+        if found is None:
+            return best
+        best = found
         if found.agreement < AGREEMENT:
             break
-    return found
+    return best
 
 
 def _fit(
@@ -94,7 +103,7 @@ def _fit(
     least_size: float,
     degrees: int,
     coefficients: Array | None = None,
-) -> Shaken:
+) -> Shaken | None:
     state = start
     if coefficients is None:
         coefficients = np.zeros((degrees - 1, 3))
@@ -113,6 +122,8 @@ def _fit(
         columns = columns_of(
             errors, by_motion, by_turn, tau, observations.rays, inliers, degrees, False
         )
+        if not np.all(np.isfinite(columns.products)) or np.count_nonzero(inliers) < _FEWEST:
+            return None
         information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         add_prior(*terms, state, 1.0, information, slope)
         step, covariance, noise = _sizes_and_step(
@@ -130,6 +141,7 @@ def _fit(
         shake_at(observations.tau, coefficients),
     )
     behind = np.isinf(observations.squared_errors(state))
+    errors[behind] = 1e150
     squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
     # Points beyond the gate count, too: where rows swing out of it, they do so together.
     gate = np.sqrt(squared[inliers].max(initial=0.0))

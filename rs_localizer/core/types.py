@@ -48,6 +48,10 @@ class Estimate(Motion):
     # rs_localizer.core.model_error); most of it is vibration
     shake: Array = field(default_factory=lambda: np.zeros((0, 3)))
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
+    # What the frame says of how large shaking and model error are: logarithms of the odds of
+    # the sizes that rs_localizer.core.settling tries.
+    of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
+    of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
     tracked: bool = False  # found near a prior motion, without a search
 
     @property

@@ -72,7 +72,10 @@ def in_camera(state, tau, points, extra):
     return Rotation.from_rotvec(-extra).apply(Rotation.from_rotvec(-angle).apply(moved))
 
 
-def project(state, points, direction, coefficients=np.zeros((0, 3)), extra=0.0):
+STILL = np.zeros((0, 3))
+
+
+def project(state, points, direction, coefficients=STILL, extra=0.0):
     """Rays (n,2) and row times (n,) at which each point is seen by its own row.
 
     ``extra`` turns (n,3) or (3,) the camera once more, the same at all rows.

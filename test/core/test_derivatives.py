@@ -7,6 +7,7 @@ from rs_localizer.core import residuals
 
 from .projection import (
     AXIS,
+    STILL,
     disturbed,
     gradient,
     jacobian_of,
@@ -19,7 +20,6 @@ from .projection import (
 
 DIRECTIONS = list(AXIS)
 SHAKE = 0.003 * np.random.default_rng(7).normal(size=(4, 3))
-STILL = np.zeros((0, 3))
 
 
 def packed(points, rays, direction, shift=0.0):
