@@ -13,9 +13,11 @@ rho, d_omega, d_v, d_alpha, d_a`` in its own order:
     v(tau)        = exp(-theta - d_theta) (u + d_u),   u = v + tau a
                   = E u + E d_u + [E u]x J(-theta) d_theta,   E = exp(-theta)
     omega(tau)    = J(-theta) (omega + tau alpha)
+                  = omega + tau/2 (I + J(-theta)) alpha + ...
 
 where J is the left Jacobian of SO(3): ``exp(a + d) = exp(J(a) d) exp(a)``; it is the right one of
-``-a``. The body rate depends on ``theta`` in second order of the acceleration, which is left out.
+``-a``. Without acceleration the body rate is ``omega`` at any time; second orders of the
+acceleration are left out.
 Shaking turns the camera by ``delta(tau)`` in its own axes beside all that; its coefficients stand
 behind the motion in the estimate's covariance, and its turn and rate are linear in them.
 """
@@ -72,7 +74,8 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     angle = estimate.angle_at(tau)
     turn = shaken @ so3.exp(-angle)
     by_angle = so3.hat(linear) @ shaken @ so3.right_jacobian(angle)
-    body_rate = shaken @ so3.right_jacobian(angle)
+    angular = estimate.angular_velocity_at(tau)
+    by_acceleration = 0.5 * tau * shaken @ (np.eye(3) + so3.right_jacobian(angle))
     values, rates = _shaking(estimate, tau)
     jacobian = np.zeros((6, len(estimate.joint_covariance)))
     jacobian[_LINEAR, ANGULAR] = tau * by_angle
@@ -80,12 +83,12 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     jacobian[_LINEAR, LINEAR] = turn
     jacobian[_LINEAR, LINEAR_ACCELERATION] = tau * turn
     jacobian[_LINEAR, PARAMETERS:] = np.kron(values, so3.hat(linear))
-    jacobian[_ANGULAR, ANGULAR] = body_rate
-    jacobian[_ANGULAR, ANGULAR_ACCELERATION] = tau * body_rate
-    jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, np.eye(3))
+    jacobian[_ANGULAR, ANGULAR] = shaken
+    jacobian[_ANGULAR, ANGULAR_ACCELERATION] = by_acceleration
+    jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, np.eye(3)) + np.kron(values, so3.hat(angular))
     return Twist(
         linear=linear / readout_time,
-        angular=estimate.angular_velocity_at(tau) / readout_time,
+        angular=angular / readout_time,
         covariance=_propagate(jacobian / readout_time, estimate.joint_covariance),
     )
 

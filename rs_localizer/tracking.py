@@ -90,7 +90,9 @@ def predict(
     transport[MOVE, TURN] = -back @ so3.hat(way)
     transport[MOVE, LINEAR] = readouts * back
     transport[MOVE, LINEAR_ACCELERATION] = farther * back
-    transport[ANGULAR, ANGULAR_ACCELERATION] = faster * np.eye(3)
+    # Without acceleration the body rate stays what it is, however far the camera turns.
+    mean = farther / readouts
+    transport[ANGULAR, ANGULAR_ACCELERATION] = mean * np.eye(3) + (faster - mean) * turned
     transport[LINEAR, LINEAR] = back
     transport[LINEAR, LINEAR_ACCELERATION] = faster * back
     transport[LINEAR, ANGULAR] = readouts * so3.hat(velocity) @ turned

@@ -18,6 +18,7 @@ _MOST_TURN = 1.5
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 # Errors that neighbouring rows share although the motion follows vibration, in standard deviations.
 _MOST_AGREEMENT = 3.0
+_NOISE_FREE = 0.01  # px; less is rounding errors
 # Errors of map and lens, root mean square, in inlier thresholds.
 _MOST_MODEL_ERROR = 0.4
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
@@ -72,14 +73,14 @@ def refusal(
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
             "too small for the noise",
         )
-    if rolling and posterior.agreement > _MOST_AGREEMENT:
+    if rolling and posterior.agreement > _MOST_AGREEMENT and posterior.noise > _NOISE_FREE:
         return Failure(
             Reason.MODEL_ERROR,
             f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "
             f"standard deviations, {posterior.noise:.2g} px): the camera vibrates faster than its "
             "rows can tell, or the scan direction is another one",
         )
-    if posterior.model_error > _MOST_MODEL_ERROR * threshold:
+    if rolling and posterior.model_error > _MOST_MODEL_ERROR * threshold:
         return Failure(
             Reason.MODEL_ERROR,
             f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "

@@ -31,6 +31,9 @@ _FIELD_TERMS = (_FIELD_DEGREE + 1) * (_FIELD_DEGREE + 2) // 2
 # Size of each degree: fields of lenses and maps are smooth, and no lens and no paper shears an
 # image.
 _FIELD_DEGREE_SIZES = (1.0, 0.2, 0.5, 0.25)
+# Correlations below so many standard deviations are chance.
+_CHANCE = 1.5
+_MOST_SHARED = 0.9
 # Of the noise, px^2: noise-free data leave rounding errors.
 _LEAST_VARIANCE = 1e-8
 # Where neither shaking nor field explains more than this (logarithm of the likelihood), there is
@@ -268,10 +271,10 @@ def evidence_of_sizes(
     evidence, noises = np.empty(len(sizes)), np.empty(len(sizes))
     count = len(projected.with_errors)
     factor, half = np.empty((count, count)), np.empty(count)
-    variance = noise * noise
     for index in range(len(sizes)):
+        variance = noise * noise
         left, volume = projected.squared_errors, 0.0
-        for _ in range(2):
+        for _ in range(3):
             ratio = sizes[index] ** 2 / variance
             left, volume = projected.squared_errors, 0.0
             # Cholesky factor of I + ratio * products.
@@ -476,6 +479,33 @@ def neighbours_agree(errors: Array, tau: Array, inliers: BoolArray) -> float:
     return normalized
 
 
+@kernel
+def shared_errors(errors: Array, rays: Array, inliers: BoolArray) -> float:
+    """Correlation of the errors of points with those of their nearest neighbours in the image.
+
+    Beyond what chance makes of it; corners of one marker that is a little off share its error.
+    """
+    shared, squared, count = 0.0, 0.0, 0
+    for i in range(len(rays)):
+        if not inliers[i]:
+            continue
+        nearest, least = -1, np.inf
+        for j in range(len(rays)):
+            if inliers[j] and j != i:
+                x, y = rays[i, 0] - rays[j, 0], rays[i, 1] - rays[j, 1]
+                if x * x + y * y < least:
+                    nearest, least = j, x * x + y * y
+        if nearest >= 0:
+            shared += errors[i, 0] * errors[nearest, 0] + errors[i, 1] * errors[nearest, 1]
+        squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
+        count += 1
+    if not squared > 0.0:
+        return 0.0
+    correlation = shared / squared - _CHANCE / np.sqrt(2.0 * count)
+    within: float = min(max(correlation, 0.0), _MOST_SHARED)
+    return within
+
+
 class Examined(NamedTuple):
     """What :func:`examine` finds of a motion."""
 
@@ -483,6 +513,8 @@ class Examined(NamedTuple):
     covariance: Array  # (m,m) of motion and coefficients of the shaking
     sizes: Sizes
     agreement: float  # of neighbouring rows, see :func:`neighbours_agree`
+    # Correlation of each point's error with that of its neighbour in the image.
+    shared: float
     determined: float  # logarithm of the determinant of the information of the motion, px^2
 
 
@@ -513,5 +545,6 @@ def examine(
     )  # fmt: skip
     step, covariance = with_model_error(columns, sizes.noise, sizes.shake, sizes.field)
     agreement = neighbours_agree(errors, measured_tau, inliers)
+    shared = shared_errors(errors, rays, inliers)
     determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
-    return Examined(step, covariance, sizes, agreement, determined)
+    return Examined(step, covariance, sizes, agreement, shared, determined)

@@ -100,7 +100,10 @@ _STILL = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
 
 
 def _check_motion(motion: Motion) -> None:
-    for name in ("rotation", "translation", "angular_velocity", "linear_velocity"):
+    for name in (
+        "rotation", "translation", "angular_velocity", "linear_velocity",
+        "angular_acceleration", "linear_acceleration",
+    ):  # fmt: skip
         shape = (3, 3) if name == "rotation" else (3,)
         if np.shape(getattr(motion, name)) != shape:
             raise ValueError(

@@ -32,7 +32,7 @@ from rs_localizer.core.state import PARAMETERS, VELOCITIES
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
 # Odds by which motion must explain the points better than rest, to count in the estimate: what
 # explains little is often a slightly wrong map or lens. The covariance allows for it at even odds.
-_ODDS_AGAINST_MOTION = 100.0
+_ODDS_AGAINST_MOTION = 1e6
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
@@ -94,6 +94,7 @@ class _Mode:
     covariance: Array  # (18,18)
     evidence: float
     volume: float  # the part of the evidence that speaks for few possibilities (Occam's factor)
+    cost: float  # of its fit, noise variances
     speed: float
     field: float  # px
 
@@ -111,6 +112,8 @@ class _Frame:
         depth = float(np.partition(depths, count // 2)[count // 2]) if count else 1.0
         self.field_sizes = assumed.field_sizes(max(depth, _NEAREST))
         self.freedom = max(2.0 * count - 6.0, 1.0)
+        # What a point is worth beside one whose error is its own (an effective number of points).
+        self.worth = 1.0
         self.shake_prior = _more_probable(_SHAKE_PRIOR, assumed.of_shake_sizes)
         self.field_prior = _more_probable(_FIELD_PRIOR, assumed.of_field_sizes)
 
@@ -132,14 +135,15 @@ class _Frame:
 
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> _Mode:
         """The Gaussian about the best motion of a typical speed."""
-        state, _ = self.fitted(start, terms)
+        state, cost = self.fitted(start, terms)
         examined = self.examined(state, terms, 0)
         volume = _volume(terms, examined)
         return _Mode(
             state,
-            self.inflation * examined.covariance,
-            examined.sizes.evidence + volume,
-            volume,
+            self.inflation / self.worth * examined.covariance,
+            self.worth * (examined.sizes.evidence + volume),
+            self.worth * volume,
+            cost / self.noise**2,
             speed,
             examined.sizes.field,
         )
@@ -165,25 +169,33 @@ def settle(
         return best
     frame = _Frame(observations, best, terms, assumed)
     other = mirrored(observations.points, best.inliers, best.state)
+    mirrored_fits = False
     if other is not None:
         state, cost = frame.fitted(other, terms)
-        if cost < frame.fitted(best.state, terms)[1] - best.noise**2:
+        better = frame.fitted(best.state, terms)[1] - cost
+        mirrored_fits = abs(better) < _CLEARLY_WORSE * best.noise**2
+        if better > best.noise**2:
             best = maximum_a_posteriori(observations, state, terms, threshold)
             if not best.determined:
                 return best
             frame = _Frame(observations, best, terms, assumed)
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
-    if assumed.rolling and (sizes.no_shake < _SHAKING or examined.agreement > AGREEMENT):
-        shaken = None if _rather_rests(frame, best, examined) else _followed(
-            frame, best, sizes, threshold
-        )
+    seems_to_shake = sizes.no_shake < _SHAKING or examined.agreement > AGREEMENT
+    if (
+        assumed.rolling
+        and seems_to_shake
+        and not mirrored_fits
+        and not _rather_rests(frame, best, examined)
+    ):
+        shaken = _followed(frame, best, sizes, threshold)
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
             return shaken
+    frame.worth = (1.0 - examined.shared) / (1.0 + examined.shared)
     found = replace(
         best,
         state=apply_step(best.state, examined.step[:PARAMETERS]),
-        covariance=best.inflation * examined.covariance,
+        covariance=best.inflation / frame.worth * examined.covariance,
         shake=examined.step[PARAMETERS:].reshape(-1, 3),
         model_error=sizes.field,
         of_shake_sizes=sizes.of_shake_sizes,
@@ -275,7 +287,7 @@ def _weighed(frame: _Frame, found: Posterior, planar: bool) -> Posterior:
         covariance=joint,
         squared_errors=frame.observations.squared_errors(state),
         model_error=float(possible @ [mode.field for mode in modes]),
-        mirror=_mirror(evidence, steps, covariance) if planar else None,
+        mirror=_mirror(modes, evidence, steps, covariance) if planar else None,
     )
 
 
@@ -314,9 +326,13 @@ def _normalized(evidence: Array) -> Array:
     return normalized
 
 
-def _mirror(evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
-    """The farthest pose that is not out of the question."""
-    worse = 2.0 * (evidence.max() - evidence)
+def _mirror(
+    modes: list[_Mode], evidence: Array, steps: Array, covariance: Array
+) -> Mirror | None:
+    """The farthest pose that is not out of the question: neither unlikely nor of a bad fit."""
+    costs = np.array([mode.cost for mode in modes])
+    best = int(np.argmax(evidence))
+    worse = np.maximum(2.0 * (evidence[best] - evidence), costs - costs[best])
     turns = np.where(worse < _CLEARLY_WORSE, np.linalg.norm(steps[:, :3], axis=1), 0.0)
     far = int(np.argmax(turns))
     if turns[far] == 0.0:

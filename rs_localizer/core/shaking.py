@@ -31,6 +31,7 @@ AGREEMENT = 1.7
 # Points within so many times the largest error of an inlier may belong to the scene.
 _NEAR = 4.0
 _FEWEST = 12  # points that shaking could be told from
+_MOST_COEFFICIENTS = 1.0  # for each point, which gives two equations
 _STEPS = 3
 _INLIER_ROUNDS = 3
 _SIZE_ROUNDS = 8
@@ -73,6 +74,8 @@ def follow(
     """
     best = None
     for degrees in _DEGREES:
+        if 3 * degrees > _MOST_COEFFICIENTS * np.count_nonzero(inliers):
+            break
         found = _fit(observations, start, inliers, terms, noise, size, least_size, degrees)
         for _ in range(_INLIER_ROUNDS):
             if found is None:
