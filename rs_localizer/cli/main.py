@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import rs_localizer
 from rs_localizer.cli import UsageError
+from rs_localizer.missing import explain
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +105,16 @@ def main(
         arguments = parser.parse_args(words[1:])
     except SystemExit as end:  # argparse has said all there is to say
         return int(end.code or 0)
+    except ImportError as error:
+        return _fail(name, explain(error), 1)
     try:
         module.run(arguments)
     except UsageError as error:
         return _fail(name, str(error), 2)
     except (ValueError, OSError) as error:
         return _fail(name, str(error), 1)
+    except ImportError as error:  # of what only some of its work needs
+        return _fail(name, explain(error), 1)
     except MemoryError as error:
         return _fail(name, f"the memory does not suffice: {error}", 1)
     except KeyboardInterrupt:
