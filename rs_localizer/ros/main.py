@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from rs_localizer import threads
 from rs_localizer.missing import explain
 from rs_localizer.stopping import StopRequest
 
@@ -36,6 +37,7 @@ def marker_detector(args: list[str] | None = None) -> int:
 
 
 def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:
+    threads.limit()
     with StopRequest() as stop:
         try:
             with stop.at_once():
