@@ -67,6 +67,11 @@ COMMANDS = {
         "what a map of landmarks holds; one file from another: COLMAP, PLY, NPZ",
         "rs_localizer map convert sparse/0 map.npz",
     ),
+    "warm": Command(
+        "rs_localizer.cli.warm",
+        "compile all kernels now, for images and installers; the first start is then as any other",
+        "rs_localizer warm",
+    ),
     "experiments": Command(
         "rs_localizer.cli.experiments",
         "the experiments of the literature and ours: curves, figures, a verdict on every claim",

@@ -35,8 +35,13 @@ _said: set[str] = set()
 def cache_directory() -> Path:
     """The user's folder of compiled kernels: ``NUMBA_CACHE_DIR``, or below ``XDG_CACHE_HOME``."""
     config: Any = numba.config
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(config.CACHE_DIR or Path(home) / "rs_localizer")
+    chosen = config.CACHE_DIR or os.environ.get("XDG_CACHE_HOME")
+    if not chosen:
+        try:
+            chosen = Path.home() / ".cache"
+        except RuntimeError:  # a user without a home, as in some containers
+            chosen = "/nonexistent"
+    return Path(chosen) if config.CACHE_DIR else Path(chosen) / "rs_localizer"
 
 
 def digest(part: str, package: Path) -> str:

@@ -61,6 +61,8 @@ def diagnose(condition: Condition, summary: Summary) -> Health:
 
 
 def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
+    if condition.life_cycle == "configuring":
+        return Level.WARN, "compiling", "the node is being configured: kernels are compiled"
     if condition.life_cycle != "active":
         return Level.STALE, "inactive", f"the node is {condition.life_cycle}: activate it"
     if not condition.wanted:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import traceback
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.service import Service
@@ -37,18 +36,12 @@ from rs_localizer.settings import NODE_NAME
 class LocalizerNode(RobustLifecycleNode):
     """A managed node; only while active it takes and publishes messages.
 
-    Args:
-        compiling: entered while configuring compiles kernels.
-
     Raises:
         ValueError: when it is started with parameters that are refused, saying what was found.
     """
 
-    def __init__(
-        self, compiling: Callable[[], AbstractContextManager[None]] = nullcontext, **kwargs
-    ) -> None:
+    def __init__(self, **kwargs) -> None:
         super().__init__(NODE_NAME, **kwargs)
-        self._compiling = compiling
         config = parameters.declare(self)
         _check(config)
         for text in parameters.unknown_names(self):
@@ -70,18 +63,20 @@ class LocalizerNode(RobustLifecycleNode):
 
     # -- life cycle -------------------------------------------------------------------------
 
+    def kernels(self) -> Callable[[], None]:
+        frames = FrameLocalizer(parameters.read(self))
+        log = self.get_logger()
+        log.info("compiling kernels (once on this machine, up to a minute)")
+        return lambda: log.info(f"kernels are ready after {warm_up(frames):.1f} s")
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             config = parameters.read(self)
             frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
-            self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
-            self._diagnostics.publish()
-            with self._compiling():
-                frames.load_map()
-                if frames.map is not None:
-                    self.get_logger().info(described(frames.map))
-                seconds = warm_up(frames)
-            self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
+            frames.load_map()
+            if frames.map is not None:
+                self.get_logger().info(described(frames.map))
+            frames.warm_up()  # what has been set since they were compiled
             self._broadcaster.configure(config)
             self._outputs = Outputs(
                 self, afterwards=lambda frame: self._broadcaster.publish(frame, frames.config)
@@ -179,7 +174,7 @@ class LocalizerNode(RobustLifecycleNode):
         missing = () if frames is None else frames.missing
         silence = {} if self._inputs is None else self._inputs.silence()
         condition = Condition(
-            life_cycle=self._state_machine.current_state[1],
+            life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,
             missing=missing,
             frame_topics=FRAME_TOPICS,

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import traceback
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -24,6 +23,7 @@ from rs_localizer.config import DetectorConfig, ImageTransport
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.marker_frames import Detected, FrameDetector
+from rs_localizer.markers.detection import warm_up
 from rs_localizer.ros import parameters
 from rs_localizer.ros.detector_debug import DebugPictures
 from rs_localizer.ros.detector_health import Condition, Sight, diagnose
@@ -69,18 +69,12 @@ class _Work:
 class MarkerDetectorNode(RobustLifecycleNode):
     """A managed node; only while active it takes images and publishes.
 
-    Args:
-        compiling: entered while configuring compiles kernels.
-
     Raises:
         ValueError: when it is started with parameters that are refused, saying what was found.
     """
 
-    def __init__(
-        self, compiling: Callable[[], AbstractContextManager[None]] = nullcontext, **kwargs
-    ) -> None:
+    def __init__(self, **kwargs) -> None:
         super().__init__(DETECTOR_NAME, **kwargs)
-        self._compiling = compiling
         config = parameters.declare(self, DetectorConfig)
         for text in parameters.unknown_names(self, DetectorConfig):
             self._warn(f"a parameter is ignored: {text}")
@@ -104,12 +98,13 @@ class MarkerDetectorNode(RobustLifecycleNode):
 
     # -- life cycle -------------------------------------------------------------------------
 
+    def kernels(self) -> Callable[[], None]:
+        return warm_up
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             config = parameters.read(self, kind=DetectorConfig)
             detector = FrameDetector(config, self.refusals.notice)
-            with self._compiling():
-                detector.warm_up()
             self._outputs = DetectorOutputs(self)
         except ValueError as error:
             self.get_logger().error(f"not configured: {error}")
@@ -254,7 +249,7 @@ class MarkerDetectorNode(RobustLifecycleNode):
         """For the diagnostics: how the node is."""
         silence = {} if self._inputs is None else self._inputs.silence()
         condition = Condition(
-            life_cycle=self._state_machine.current_state[1],
+            life_cycle=self.state,
             wanted=bool(self._listening),
             silence={name: silence[name] for name in silence if name in _IMAGES},
         )

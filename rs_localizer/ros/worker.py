@@ -57,8 +57,7 @@ class Worker:
         self._mailbox: Mailbox[FrameLocalizer, Arrival] = Mailbox()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
-        # A daemon: a frame that takes minutes must not keep the process alive.
-        threading.Thread(target=self._run, name=_NAME, daemon=True).start()
+        in_thread(self._run)
 
     def update(self, kind: str, update: Update[FrameLocalizer]) -> None:
         """Have this done before the next frame (see :meth:`Mailbox.update`)."""
@@ -126,8 +125,13 @@ class Worker:
         return result
 
 
+def in_thread(function: Callable[[], None]) -> None:
+    """Run what may take minutes, which must not keep the process alive."""
+    threading.Thread(target=function, name=_NAME, daemon=True).start()
+
+
 def wait_for_workers(seconds: float) -> bool:
-    """Wait for the end of all closed workers of this process; whether it came in time."""
+    """Wait for the end of all threads of :func:`in_thread`; whether it came in time."""
     deadline = time.monotonic() + seconds
     threads = [thread for thread in threading.enumerate() if thread.name == _NAME]
     for thread in threads:
