@@ -7,6 +7,7 @@ localizes and publishes.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import traceback
 from collections.abc import Callable
@@ -67,7 +68,13 @@ class LocalizerNode(RobustLifecycleNode):
         frames = FrameLocalizer(parameters.read(self))
         log = self.get_logger()
         log.info("compiling kernels (once on this machine, up to a minute)")
-        return lambda: log.info(f"kernels are ready after {warm_up(frames):.1f} s")
+
+        def compiles() -> None:
+            with contextlib.suppress(MapError):  # of which on_configure tells, at once
+                frames.load_map()
+                log.info(f"kernels are ready after {warm_up(frames):.1f} s")
+
+        return compiles
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:

@@ -23,7 +23,6 @@ from rs_localizer.config import DetectorConfig, ImageTransport
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.marker_frames import Detected, FrameDetector
-from rs_localizer.markers.detection import warm_up
 from rs_localizer.ros import parameters
 from rs_localizer.ros.detector_debug import DebugPictures
 from rs_localizer.ros.detector_health import Condition, Sight, diagnose
@@ -99,7 +98,10 @@ class MarkerDetectorNode(RobustLifecycleNode):
     # -- life cycle -------------------------------------------------------------------------
 
     def kernels(self) -> Callable[[], None]:
-        return warm_up
+        try:
+            return FrameDetector(parameters.read(self, kind=DetectorConfig)).warm_up
+        except ValueError:  # of which on_configure tells, at once
+            return lambda: None
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
