@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rs_localizer.ros.health import Health, Level
+from rs_localizer.ros.health import Health, Level, lost_on_the_way
 from rs_localizer.ros.inputs import Silence
 from rs_localizer.ros.statistics import WINDOW, Summary
 
@@ -82,6 +82,8 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
             f"{WINDOW:.0f} s"
         )
         return Level.WARN, "detecting", message
+    if summary.recently_missing > _SOME * summary.recently_received:
+        return Level.WARN, "detecting", lost_on_the_way(summary)
     last = summary.last
     if last is None:
         return Level.OK, "detecting", "no image has been looked at yet"

@@ -137,7 +137,18 @@ def _judge_frames(summary: Summary) -> tuple[Level, str, str]:
     if replaced > _SOME * summary.recently_received:
         message = f"{replaced} frames came while another was localized in the last {WINDOW:.0f} s"
         return Level.WARN, state, message
+    if summary.recently_missing > _SOME * summary.recently_received:
+        return Level.WARN, state, lost_on_the_way(summary)
     return Level.OK, state, f"{state} with {last.inliers} of {last.points} points"
+
+
+def lost_on_the_way(summary: Summary) -> str:
+    """What to say where stamps have gaps."""
+    sent = summary.recently_received + summary.recently_missing
+    return (
+        f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not come "
+        f"in the last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
+    )
 
 
 def _values(condition: Condition, summary: Summary) -> dict[str, str]:
@@ -161,6 +172,8 @@ def _values(condition: Condition, summary: Summary) -> dict[str, str]:
         "Frames replaced": str(summary.replaced),
         "Frames refused": str(summary.refused),
     }
+    if summary.recently_missing:
+        values["Frames missing by their stamps, recently"] = str(summary.recently_missing)
     if summary.dropped:
         values["Frames dropped"] = str(summary.dropped)
     values |= {f"Refused: {reason}": str(n) for reason, n in sorted(summary.refusals.items())}
@@ -179,5 +192,6 @@ def _milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:
 
 def _heard(item: Silence) -> str:
     if not item.cause:
-        return "messages come" if item.heard else "no message yet"
+        quality = "reliable" if item.reliable else "best effort"
+        return f"messages come, {quality}" if item.heard else "no message yet"
     return f"silent for {item.seconds:.0f} s: {item.cause}"

@@ -29,7 +29,7 @@ from rs_localizer.ros.detector_health import Condition, Sight, diagnose
 from rs_localizer.ros.detector_outputs import DetectorOutputs
 from rs_localizer.ros.diagnostics import Diagnostics
 from rs_localizer.ros.health import Health
-from rs_localizer.ros.inputs import Inputs, Topic
+from rs_localizer.ros.inputs import LATCHED, Inputs, Topic
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.statistics import Statistics
@@ -220,7 +220,7 @@ class MarkerDetectorNode(RobustLifecycleNode):
     def _topics(self) -> dict[str, Topic]:
         images = {name: Topic(kind, self._images(name)) for name, kind in _IMAGES.items()}
         return images | {
-            "camera_info": Topic(CameraInfo, self._take_camera_info),
+            "camera_info": Topic(CameraInfo, self._take_camera_info, LATCHED),
             f"{NODE_NAME}/pose": Topic(PoseStamped, self._take_pose),
             f"{NODE_NAME}/odometry": Topic(Odometry, self._take_odometry),
         }

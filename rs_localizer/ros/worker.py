@@ -65,7 +65,7 @@ class Worker:
 
     def localize(self, topic: str, message: Any, localize: Localize) -> None:
         """Have this frame localized and published, unless a newer one comes first."""
-        self._statistics.received(topic)
+        self._statistics.received(topic, message)
         arrival = Arrival(topic, message, localize, time.monotonic())
         if self._mailbox.put(topic, arrival):
             self._statistics.replaced()
