@@ -37,6 +37,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.moments import pose_at, twist_at
 from rs_localizer.mounting import base_pose, base_twist, find_mounting
+from rs_localizer.oddities import oddities
 from rs_localizer.solvers import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -87,9 +88,8 @@ class FrameLocalizer:
         config: settings; assigning :attr:`config` changes them from the next frame on.
         notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
             (a recording that starts over), ``map_changed`` (another frame of the points),
-            ``map_replaced``, ``map_incomplete``, ``map_is_camera`` (points in the camera's own
-            frame), ``camera_changed`` and ``too_many_keypoints``. Frames are localized all the
-            same.
+            ``map_replaced``, ``map_incomplete``, ``camera_changed``, ``too_many_keypoints`` and
+            those of :func:`rs_localizer.oddities.oddities`. Frames are localized all the same.
         transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
 
@@ -298,12 +298,8 @@ class FrameLocalizer:
     def _localize(self, cloud: Correspondences) -> Frame | Refusal:
         if self._calibration is None:
             return Refusal("no_camera_info", "no usable camera_info has come yet")
-        if cloud.frame == self._calibration.frame:
-            self._notice(
-                "map_is_camera",
-                f"the points are given in {cloud.frame!r}, which is the camera's own frame: "
-                "header.frame_id of the cloud (or map) must name the frame of x, y, z",
-            )
+        for name, text in oddities(cloud, self._camera, self._calibration.frame).items():
+            self._notice(name, text)
         given = (cloud.points, cloud.pixels, cloud.scores)
         if self._tracker is None:
             result = self._localizer.localize(*given)

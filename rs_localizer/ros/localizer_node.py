@@ -29,9 +29,12 @@ from rs_localizer.ros.inputs import Inputs
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.outputs import Outputs
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.statistics import Statistics
+from rs_localizer.ros.statistics import WINDOW, Statistics
 from rs_localizer.ros.worker import Worker
 from rs_localizer.settings import NODE_NAME
+
+# Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
+_ODD = ("map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed")
 
 
 class LocalizerNode(RobustLifecycleNode):
@@ -186,6 +189,7 @@ class LocalizerNode(RobustLifecycleNode):
             missing=missing,
             frame_topics=FRAME_TOPICS,
             silence=of_interest(silence, FRAME_TOPICS, missing),
+            oddities=self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault(),
         )
         health = diagnose(condition, self._statistics.summary())
         return health, "" if frames is None else frames.camera_frame

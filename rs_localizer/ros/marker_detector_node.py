@@ -32,7 +32,7 @@ from rs_localizer.ros.health import Health
 from rs_localizer.ros.inputs import LATCHED, Inputs, Topic
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.statistics import Statistics
+from rs_localizer.ros.statistics import WINDOW, Statistics
 from rs_localizer.ros.worker import Worker
 from rs_localizer.settings import DETECTOR_NAME, NODE_NAME
 
@@ -254,6 +254,7 @@ class MarkerDetectorNode(RobustLifecycleNode):
             life_cycle=self.state,
             wanted=bool(self._listening),
             silence={name: silence[name] for name in silence if name in _IMAGES},
+            oddities=self.refusals.recent(("wrong_map", "repeated_markers"), WINDOW),
         )
         return diagnose(condition, self._statistics.summary()), ""
 

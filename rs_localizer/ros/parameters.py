@@ -84,6 +84,7 @@ def on_change(
 
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         try:
+            _check_fixed(node, parameters, kind)
             check(read(node, parameters, kind))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -97,13 +98,22 @@ def on_change(
     node.add_post_set_parameters_callback(after_set)
 
 
+def _check_fixed(node: Any, parameters: list[Parameter], kind: Kind) -> None:
+    if node.state == "unconfigured":
+        return
+    fixed = {name for name, setting in settings(kind).items() if setting.fixed}
+    for item in parameters:
+        if item.name in fixed and item.value != node.get_parameter(item.name).value:
+            raise ValueError(
+                f"{item.name} cannot be changed while the node is {node.state}: clean it up first"
+            )
+
+
 def _descriptor(setting: Setting) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=setting.description,
         read_only=setting.read_only,
-        additional_constraints=(
-            f"one of {', '.join(setting.choices)}" if setting.choices else ""
-        ),
+        additional_constraints="; ".join(_constraints(setting)),
     )
     if setting.minimum is None or setting.maximum is None:
         return descriptor
@@ -116,3 +126,9 @@ def _descriptor(setting: Setting) -> ParameterDescriptor:
             FloatingPointRange(from_value=float(setting.minimum), to_value=float(setting.maximum))
         ]
     return descriptor
+
+
+def _constraints(setting: Setting) -> list[str]:
+    """What ranges cannot say."""
+    found = [f"one of {', '.join(setting.choices)}"] if setting.choices else []
+    return found + (["can be changed while the node is unconfigured"] if setting.fixed else [])

@@ -157,6 +157,30 @@ def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
     assert int(health.values["Frames missing by their stamps, recently"]) in range(50, 61)
 
 
+def test_what_is_odd_is_a_warning(world: World) -> None:
+    odd = replace(GOOD, oddities={"pixels_outside": "7 of 100 pixels"})
+    world.pass_frames(10, rate=50.0)
+    health = world.diagnose(odd)
+    assert (health.level, health.state) == (Level.WARN, "localized")
+    assert health.message == "pixels_outside: 7 of 100 pixels"
+    assert health.values["Odd: pixels_outside"] == "7 of 100 pixels"
+    world.refuse(5)
+    health = world.diagnose(odd)
+    assert health.level == Level.ERROR
+    assert health.message.endswith("for too_few_inliers; pixels_outside: 7 of 100 pixels")
+
+
+def test_what_was_odd_is_forgotten() -> None:
+    now = [0.0]
+    refusals = Refusals(lambda text: None, lambda: now[0])
+    refusals.notice("map_is_camera", "first")
+    refusals.notice("map_is_camera", "second")
+    refusals.notice("another", "text")
+    assert refusals.recent(("map_is_camera", "nothing"), 5.0) == {"map_is_camera": "second"}
+    now[0] = 5.1
+    assert refusals.recent(("map_is_camera",), 5.0) == {}
+
+
 def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) -> Silence:
     return Silence(topic, 7.0, heard, cause, mismatch)
 
@@ -164,11 +188,11 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
 @pytest.mark.parametrize(
     ("change", "level", "state", "message"),
     [
-        ({"life_cycle": "inactive"}, Level.STALE, "inactive", "the node is inactive: activate it"),
+        ({"life_cycle": "inactive"}, Level.OK, "inactive", "the node is inactive: activate it"),
         ({"life_cycle": "configuring"}, Level.WARN, "compiling", "the node is being configured"),
         (
             {"life_cycle": "unconfigured"},
-            Level.STALE,
+            Level.OK,
             "inactive",
             "the node is unconfigured: configure and activate it",
         ),

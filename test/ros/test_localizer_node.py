@@ -264,6 +264,33 @@ def test_life_cycle(recording: Path, start_node: Start, peer: Any) -> None:
     assert "Traceback" not in node.log
 
 
+def test_what_is_fixed_can_be_set_while_it_is_unconfigured(
+    start_node: Start, peer: Any, tmp_path: Path
+) -> None:
+    node = start_node("-p", "autostart:=false")
+
+    def set_one(name: str, value: str) -> Any:
+        wanted = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[wanted])
+        return peer.call(SetParameters, "/rs_localizer/set_parameters", request).results[0]
+
+    assert set_one("map_file", str(tmp_path / "no.npz")).successful
+    assert not change_state(peer, Transition.TRANSITION_CONFIGURE)
+    node.wait_for_log("not configured: map_file: ")
+    for name, value in (("map_file", ""), ("map_frame", "hall"), ("odom_frame", "wheels")):
+        assert set_one(name, value).successful
+    assert change_state(peer, Transition.TRANSITION_CONFIGURE)
+    refused = set_one("map_frame", "cellar")
+    assert not refused.successful
+    assert refused.reason == (
+        "map_frame cannot be changed while the node is inactive: clean it up first"
+    )
+    assert set_one("map_frame", "hall").successful  # as it is
+    assert change_state(peer, Transition.TRANSITION_CLEANUP)
+    assert set_one("map_frame", "cellar").successful
+    assert node.stop() == 0
+
+
 def test_impossible_transitions_are_refused(recording: Path, start_node: Start, peer: Any) -> None:
     node = start_node(*SHUTTER)
     talk = Talk(peer)

@@ -276,6 +276,7 @@ def test_map_to_camera(made: Any, robot: Any, peer: Any) -> None:
     ((reason, text),) = node.notes
     assert reason == "not_broadcast"
     assert text.startswith("publish_tf map_to_camera: header.stamp of the input is zero")
+    assert node.broadcaster.fault() == {}  # one has been sent just now
     node.publish(frame(6 * 10**9), NodeConfig())  # switched off meanwhile
     assert len(node.notes) == 1
 
@@ -288,6 +289,7 @@ def test_a_frame_has_one_parent(made: Any, robot: Any, peer: Any) -> None:
     reason, text = node.notes[0]
     assert reason == "not_broadcast"
     assert text.startswith("publish_tf map_to_camera: frame 'base_link' hangs on 'odom' already")
+    assert node.broadcaster.fault() == {"not_broadcast": text}  # for the diagnostics
     peer.spin_until(lambda: False, 0.1)
     assert not robot_knows(robot, "map")
 
