@@ -32,7 +32,7 @@ from rs_localizer.io.maps import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transform_tree import TransformTree
-from rs_localizer.io.transforms import TransformError, Transforms
+from rs_localizer.io.transforms import NotYetError, TransformError, Transforms
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.moments import pose_at, twist_at
@@ -59,6 +59,8 @@ _STILL = Estimate(
     iterations=0,
 )
 
+_NO_TRANSFORM = "no_transform"
+
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
@@ -75,6 +77,17 @@ class Refusal:
 
     def __bool__(self) -> Literal[False]:
         return False
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting(Refusal):
+    """A localized frame whose mounting is known for earlier times only.
+
+    It is refused, unless somebody asks for it again.
+    """
+
+    again: Callable[[], Frame | Refusal]
+    patience: float  # s, for which this makes sense
 
 
 class FrameLocalizer:
@@ -270,7 +283,9 @@ class FrameLocalizer:
             self._say_if_too_many(keypoints)
             if self._tracker is not None and self._config.matching.gate > 0.0:
                 prior = self._tracker.prediction(self._middle_row_ns(keypoints.stamp_ns))
-                if prior is not None and (result := self._match(keypoints, prior)):
+                result = None if prior is None else self._match(keypoints, prior)
+                # Without its mounting a pose is none the worse.
+                if result or (result is not None and result.reason == _NO_TRANSFORM):
                     return result
         return self._match(keypoints, None)
 
@@ -369,10 +384,11 @@ class FrameLocalizer:
         try:
             mounting = find_mounting(self.transforms, frame.body_frame, base, stamp_ns, span_ns)
         except TransformError as error:
-            return Refusal(
-                "no_transform",
-                f"from the camera {frame.body_frame!r} to base_frame {base!r}: {error}",
-            )
+            text = f"from the camera {frame.body_frame!r} to base_frame {base!r}: {error}"
+            if not isinstance(error, NotYetError):
+                return Refusal(_NO_TRANSFORM, text)
+            patience = self._config.transform_tolerance
+            return Waiting(_NO_TRANSFORM, text, lambda: self._mounted(frame), patience)
         return replace(
             frame,
             body_frame=base,

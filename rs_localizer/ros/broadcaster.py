@@ -14,11 +14,11 @@ from rclpy.node import Node
 from rs_localizer.broadcasts import Broadcast, broadcast
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.outputs import Frame
-from rs_localizer.io.transforms import TransformError, make_transform
+from rs_localizer.io.transforms import NotYetError, TransformError, make_transform
 from rs_localizer.ros.conversion import make_message
 from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.statistics import WINDOW
-from rs_localizer.ros.transforms import AtOnce, NotYetError, Tf, import_tf2_ros
+from rs_localizer.ros.transforms import Tf, import_tf2_ros
 
 # Frames that wait for odometry, which mostly comes later than they do.
 _MOST_PENDING = 100
@@ -113,7 +113,7 @@ class Broadcaster:
             self._pending.clear()
             for item in waiting:
                 try:
-                    self._send(broadcast(item.frame, item.config, AtOnce(self.tf)))
+                    self._send(broadcast(item.frame, item.config, self.tf))
                 except NotYetError as error:
                     if time.monotonic() < item.deadline:
                         self._pending.append(item)
