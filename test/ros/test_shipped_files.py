@@ -20,7 +20,7 @@ from rs_localizer.config import DetectorConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.lab.recording import PARAMETERS, write_parameters
 from rs_localizer.ros.feed import Feed
-from rs_localizer.settings import NODE_NAME, load_params_file, settings
+from rs_localizer.settings import NODE_NAME, build, load_params_file, settings
 
 ROOT = Path(__file__).parents[2]
 # Displays of RViz and what they can show.
@@ -294,3 +294,24 @@ def test_foxglove_shows_what_the_node_publishes() -> None:
     assert {"pose_with_covariance", "inliers", "twist"} <= topics <= set(TYPES)
     panels = re.findall(r'"(?:first|second)": "([^"]+)"', text)
     assert sorted(panels) == sorted(layout["configById"])
+
+
+def test_nav2_manages_the_node() -> None:
+    file = ROOT / "config" / "nav2.yaml"
+    config = build(load_params_file(file))
+    assert (config.autostart, config.publish_tf) == (False, "map_to_odom")
+    manager = yaml.safe_load(file.read_text())["/**/lifecycle_manager_localization"]
+    assert NODE_NAME in manager["ros__parameters"]["node_names"]
+    assert manager["ros__parameters"]["bond_timeout"] == 0.0  # a Python node has none
+
+
+def test_robot_localization_listens_to_what_the_node_publishes() -> None:
+    file = ROOT / "config" / "robot_localization.yaml"
+    found = yaml.safe_load(file.read_text())["/**/ekf_map"]["ros__parameters"]
+    kinds = {"pose0": "geometry_msgs/msg/PoseWithCovarianceStamped",
+             "twist0": "geometry_msgs/msg/TwistWithCovarianceStamped"}  # fmt: skip
+    for name, kind in kinds.items():
+        assert TYPES[found[name].removeprefix(f"/{NODE_NAME}/")] == kind
+    for name in ("odom0", *kinds):
+        assert [type(item) for item in found[f"{name}_config"]] == [bool] * 15
+    assert found["world_frame"] == found["map_frame"]
