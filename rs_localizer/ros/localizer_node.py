@@ -50,7 +50,7 @@ class LocalizerNode(RobustLifecycleNode):
         _check(config)
         for text in parameters.unknown_names(self):
             self._warn(f"a parameter is ignored: {text}")
-        parameters.on_change(self, check=_check, apply=self._take_config)
+        parameters.on_change(self, check=_check, apply=self._take_config, state=lambda: self.state)
         self.autostart = config.autostart
         self.refusals = Refusals(self._warn)
         self._statistics = Statistics(self.refusals, lambda: self.get_clock().now().nanoseconds)

@@ -18,6 +18,8 @@ from rclpy.parameter import Parameter
 from rs_localizer.config import NodeConfig
 from rs_localizer.settings import Kind, Setting, build, settings, unknown
 
+_UNCONFIGURED = "unconfigured"
+
 
 def declare(node: Node, kind: Kind = NodeConfig) -> Any:
     """Declare every setting as a parameter and return those that the node was started with.
@@ -72,6 +74,7 @@ def on_change(
     check: Callable[[Any], None],
     apply: Callable[[Any], None],
     kind: Kind = NodeConfig,
+    state: Callable[[], str] = lambda: _UNCONFIGURED,
 ) -> None:
     """Check, then apply, changes of parameters; several set at once are one change.
 
@@ -80,11 +83,12 @@ def on_change(
         check: raises ``ValueError`` for settings that are refused: then all stay as they were.
         apply: takes settings that were accepted.
         kind: the class of the node's settings.
+        state: label of the node's, for settings that are fixed once it is configured.
     """
 
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         try:
-            _check_fixed(node, parameters, kind)
+            _check_fixed(node, parameters, kind, state())
             check(read(node, parameters, kind))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -98,14 +102,14 @@ def on_change(
     node.add_post_set_parameters_callback(after_set)
 
 
-def _check_fixed(node: Any, parameters: list[Parameter], kind: Kind) -> None:
-    if node.state == "unconfigured":
+def _check_fixed(node: Node, parameters: list[Parameter], kind: Kind, state: str) -> None:
+    if state == _UNCONFIGURED:
         return
     fixed = {name for name, setting in settings(kind).items() if setting.fixed}
     for item in parameters:
         if item.name in fixed and item.value != node.get_parameter(item.name).value:
             raise ValueError(
-                f"{item.name} cannot be changed while the node is {node.state}: clean it up first"
+                f"{item.name} cannot be changed while the node is {state}: clean it up first"
             )
 
 
