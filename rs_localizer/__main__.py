@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 from contextlib import AbstractContextManager
 
+from rs_localizer import threads
 from rs_localizer.stopping import StopSignals
 
 
 def run() -> int:
     """Run the command of the process's arguments; Ctrl-C and SIGTERM end it with one line."""
+    threads.limit()
     with StopSignals() as signals:
 
         def importing(name: str) -> AbstractContextManager[None]:

@@ -49,8 +49,18 @@ def setting(
     maximum: float | None = None,
     choices: tuple[str, ...] = (),
     read_only: bool = False,
+    fixed: bool = False,
 ) -> Any:
-    """A dataclass field with what a user needs to know of it (ranges include their ends)."""
+    """A dataclass field with what a user needs to know of it.
+
+    Args:
+        default: its value, which also says its type.
+        description: one line.
+        minimum, maximum: of a number; they belong to the range.
+        choices: of a text.
+        read_only: it cannot be set while the node runs.
+        fixed: it cannot be set after the node has been configured.
+    """
     return field(
         default=default,
         metadata={
@@ -59,6 +69,7 @@ def setting(
             "maximum": maximum,
             "choices": choices,
             "read_only": read_only,
+            "fixed": fixed,
         },
     )
 
@@ -279,10 +290,10 @@ class NodeConfig(LocalizerConfig):
         "",
         "Frame of the body whose pose and twist are published, connected to the camera by TF; "
         "empty: the camera's optical frame",
-        read_only=True,
+        fixed=True,
     )
     odom_frame: str = setting(
-        "odom", "Frame of the odometry, for publish_tf map_to_odom", read_only=True
+        "odom", "Frame of the odometry, for publish_tf map_to_odom", fixed=True
     )
     publish_tf: str = setting(
         PublishTf.NONE.value,
@@ -301,9 +312,9 @@ class NodeConfig(LocalizerConfig):
         "",
         "Map that keypoints are matched with: a .npz or .ply file or a sparse model of COLMAP; "
         "empty: none, or the one published on map_points",
-        read_only=True,
+        fixed=True,
     )
-    map_frame: str = setting("map", "Frame of the points in map_file", read_only=True)
+    map_frame: str = setting("map", "Frame of the points in map_file", fixed=True)
     matching: Matching = field(default_factory=Matching)
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-import yaml
 from tqdm import tqdm
 
 from rs_localizer import data
@@ -22,6 +21,7 @@ from rs_localizer.lab.experiments.report import (
 )
 from rs_localizer.lab.experiments.results import Context, Result, Verdict
 from rs_localizer.lab.experiments.table import EXPERIMENTS
+from rs_localizer.settings import load_params_file
 
 T = TypeVar("T")
 
@@ -81,8 +81,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _context(name: str, trials: int, seed: int) -> Context:
     webcam = data.path(data.WEBCAM)
-    parameters = yaml.safe_load((webcam / "parameters.yaml").read_text(encoding="utf-8"))
-    readout_time = parameters["rs_localizer"]["ros__parameters"]["readout_time"]
+    readout_time = load_params_file(webcam / "parameters.yaml")["readout_time"]
     return Context(
         trials,
         seed,

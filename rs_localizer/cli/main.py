@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import rs_localizer
 from rs_localizer.cli import UsageError
+from rs_localizer.missing import explain
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,11 @@ COMMANDS = {
         "what a map of landmarks holds; one file from another: COLMAP, PLY, NPZ",
         "rs_localizer map convert sparse/0 map.npz",
     ),
+    "warm": Command(
+        "rs_localizer.cli.warm",
+        "compile all kernels now, for images and installers; the first start is then as any other",
+        "rs_localizer warm",
+    ),
     "experiments": Command(
         "rs_localizer.cli.experiments",
         "the experiments of the literature and ours: curves, figures, a verdict on every claim",
@@ -104,12 +110,16 @@ def main(
         arguments = parser.parse_args(words[1:])
     except SystemExit as end:  # argparse has said all there is to say
         return int(end.code or 0)
+    except ImportError as error:
+        return _fail(name, explain(error), 1)
     try:
         module.run(arguments)
     except UsageError as error:
         return _fail(name, str(error), 2)
     except (ValueError, OSError) as error:
         return _fail(name, str(error), 1)
+    except ImportError as error:  # of what only some of its work needs
+        return _fail(name, explain(error), 1)
     except MemoryError as error:
         return _fail(name, f"the memory does not suffice: {error}", 1)
     except KeyboardInterrupt:

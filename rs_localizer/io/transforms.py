@@ -25,6 +25,10 @@ class TransformError(ValueError):
     """There is no such transform; the text names the frames and says why."""
 
 
+class NotYetError(TransformError):
+    """The transform is known for earlier times only."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Transform:
     """A rigid transform: ``x_target = rotation @ x_source + translation``."""
@@ -49,6 +53,7 @@ class Transforms(Protocol):
         """``target_from_source`` at a time; None: the latest.
 
         Raises:
+            NotYetError: when it is known for earlier times, and may still come.
             TransformError: when it is not known for that time.
         """
 

@@ -42,7 +42,7 @@ def write_parameters(directory: Path, readout_time: float, scan_direction: str) 
     """The shutter of a recording as a params file beside its data, for ``replay --params``."""
     config = NodeConfig(readout_time=readout_time, scan_direction=scan_direction)
     (directory / PARAMETERS).write_text(
-        f"{NODE_NAME}:\n  ros__parameters:\n"
+        f"/**/{NODE_NAME}:\n  ros__parameters:\n"  # in whatever namespace
         f"    readout_time: {config.readout_time!r}\n"
         f"    scan_direction: {config.scan_direction}\n",
         encoding="utf-8",

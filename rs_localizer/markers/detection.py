@@ -87,10 +87,6 @@ class MarkerDetector:
         self._chessboard: Array | None = None
         self._chessboard_ns = 0
 
-    def warm_up(self) -> None:
-        """Compile the kernels."""
-        refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), np.full(1, 6))
-
     def detect(self, image: Gray, stamp_ns: int = 0) -> Detections:
         """All corners of the map that an image shows.
 
@@ -183,6 +179,11 @@ class MarkerDetector:
             return np.empty(0, np.int64), np.empty((0, 2))
         self._chessboard, self._chessboard_ns = corners, stamp_ns
         return np.arange(len(corners)), corners
+
+
+def warm_up() -> None:
+    """Compile the kernels of detection."""
+    refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), np.full(1, 6))
 
 
 def _finders(marker_map: MarkerMap) -> list[MarkerFinder]:
