@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -13,15 +12,25 @@ import numpy as np
 
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.frames import Refusal
-from rs_localizer.image_sources import Shot
+from rs_localizer.image_sources import Carried, Shot
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.io.images import Image
 from rs_localizer.io.messages import MessageError
+from rs_localizer.io.whole import whole
 from rs_localizer.lab.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, IMAGE_TOPIC
 from rs_localizer.marker_frames import Detected, FrameDetector, correspondences
+from rs_localizer.markers.displaced import LeaveOneOut
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.recognition import recognized
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6
+# So many images without anything of the map are no chance: a few seconds of a video.
+_PATIENCE = 64
+# A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
+# unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
+_MOST_STILL, _STILL_PERCENT = 3.0, 10.0
 
 
 class DetectError(ValueError):
@@ -37,62 +46,127 @@ class Recorded:
     corners: float  # median of the images that show any
     refused: dict[str, str]  # why images could not be read: the first detail of each reason
     residual: float  # px rms of a global-shutter pose, median; NaN where none was possible
+    period: float  # s from one image to the next, median; NaN for a single one
+    carried: dict[str, int]  # messages of each other topic that replay may need
+    faults: tuple[str, ...]  # what speaks against map or calibration
 
 
 def record(
-    shots: Iterable[Shot],
+    shots: Iterable[Shot | Carried],
     detector: FrameDetector,
     out: Path,
     *,
     storage: str = "mcap",
     with_images: bool = False,
     done: Callable[[], object] = lambda: None,
+    tell: Callable[[str], object] = lambda text: None,
 ) -> Recorded:
     """Write the corners of all images that show any, each with its CameraInfo.
 
     Args:
-        shots: the images.
+        shots: the images, and what else of their recording is to be kept.
         detector: looks for markers.
         out: bag directory to create.
         storage: ``mcap`` or ``sqlite3``.
         with_images: write these images, too, as far as they are compressed.
         done: called after each image.
+        tell: called when many images in the beginning show nothing, with what they show instead.
 
     Raises:
         DetectError: when no image shows anything, or images and calibration differ in size.
     """
-    images = 0
-    counts: list[int] = []
-    residuals: list[float] = []
-    refused: dict[str, str] = {}
-    others: Counter[str] = Counter()
+    tally = _Tally(detector.map)
     cameras = _Cameras()
-    with BagWriter(out, storage) as bag:
+    with whole(out), BagWriter(out, storage) as bag:
         for shot in shots:
-            images += 1
+            if isinstance(shot, Carried):
+                tally.carried[shot.topic] += 1
+                bag.write(shot.topic, shot.message, shot.recorded_ns)
+                continue
             if isinstance(shot.image, Refusal):
-                refused.setdefault(shot.image.reason, shot.image.detail)
+                tally.refuse(shot.image)
             else:
                 detected = detector.detect(shot.image)
-                others.update(detected.detections.unknown)
-                camera = cameras.of(shot, detected)
+                tally.add(cameras.of(shot, detected), detected)
                 if len(detected.detections.ids):
                     _write(bag, shot, detected, with_images)
-                    counts.append(len(detected.detections.ids))
-                    residuals.append(static_residual(camera, detected))
+                elif tally.images == _PATIENCE and not tally.counts:
+                    tell(f"none of the first {_PATIENCE} images {tally.nothing()}")
             done()
-    if not counts:
-        if out.exists():
-            shutil.rmtree(out)
-        raise DetectError(_nothing(images, refused, others))
-    known = [value for value in residuals if np.isfinite(value)]
-    return Recorded(
-        images,
-        len(counts),
-        float(np.median(counts)),
-        refused,
-        float(np.median(known)) if known else np.nan,
-    )
+        if not tally.counts:
+            raise DetectError(f"none of the {tally.images} images {tally.nothing()}")
+    return tally.recorded()
+
+
+class _Tally:
+    """Counts what became of the images."""
+
+    def __init__(self, marker_map: MarkerMap) -> None:
+        self.images = 0
+        self.counts: list[int] = []
+        self.carried: Counter[str] = Counter()
+        self._map = marker_map
+        self._refused: dict[str, str] = {}
+        self._others: Counter[str] = Counter()
+        self._residuals: list[float] = []
+        self._stamps: list[int] = []
+        self._empty: list[Image] = []  # some that show nothing
+        self._markers = LeaveOneOut(marker_map)
+
+    def refuse(self, refusal: Refusal) -> None:
+        self.images += 1
+        self._refused.setdefault(refusal.reason, refusal.detail)
+
+    def add(self, camera: Camera, detected: Detected) -> None:
+        self.images += 1
+        self._stamps.append(detected.image.stamp_ns)
+        found = detected.detections
+        self._others.update(found.unknown)
+        if len(found.ids):
+            self.counts.append(len(found.ids))
+            self._residuals.append(static_residual(camera, detected))
+            self._markers.add(camera, found)
+            self._empty.clear()
+        elif not self.counts and self.images.bit_count() == 1:  # the 1st, 2nd, 4th, 8th ...
+            self._empty.append(detected.image)
+
+    def nothing(self) -> str:
+        """What is to be said of images that show nothing of the map."""
+        families = sorted({marker.family.name for marker in self._map.markers})
+        wanted = ", ".join([*families, *(board.name for board in self._map.boards)])
+        text = f"shows anything of the map ({wanted})"
+        if self._refused:
+            text += f"; {'; '.join(self._refused.values())}"
+        if self._others:
+            names = ", ".join(name for name, _ in self._others.most_common(5))
+            return f"{text}; they show {names}, which the map does not have"
+        seen = Counter(name for image in self._empty for name in recognized(image.pixels))
+        if seen:
+            names = "; ".join(name for name, _ in seen.most_common(4))
+            return f"{text}; they show {names}"
+        if self._empty:
+            text += "; nor any other marker or chessboard that OpenCV knows"
+        return text
+
+    def recorded(self) -> Recorded:
+        known = [value for value in self._residuals if np.isfinite(value)]
+        faults = [] if (fault := self._markers.fault()) is None else [fault]
+        if known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
+            faults.append(
+                f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
+                "of this camera in this mode, or the map (sizes, positions) is wrong"
+            )
+        period = np.diff(np.array(self._stamps, np.int64))
+        return Recorded(
+            self.images,
+            len(self.counts),
+            float(np.median(self.counts)),
+            self._refused,
+            float(np.median(known)) if known else np.nan,
+            float(np.median(period)) * 1e-9 if len(period) else np.nan,
+            dict(self.carried),
+            tuple(faults),
+        )
 
 
 class _Cameras:
@@ -113,27 +187,28 @@ class _Cameras:
         if (width, height) != camera.size:
             raise DetectError(
                 f"the images are of {width}x{height}, the calibration is for "
-                f"{camera.size[0]}x{camera.size[1]}"
+                f"{camera.size[0]}x{camera.size[1]}{_why((width, height), camera.size)}"
             )
         return camera
 
 
+def _why(found: tuple[int, int], calibrated: tuple[int, int]) -> str:
+    """What two sizes of images have to do with each other."""
+    if found == calibrated[::-1]:
+        return (
+            ": they are turned by a quarter; calibrate with images as they are recorded (the scan "
+            "direction turns with them)"
+        )
+    if abs(found[0] * calibrated[1] - found[1] * calibrated[0]) <= max(calibrated):
+        return ": another resolution of the same shape; calibrate in the mode that is used"
+    return ": another mode or camera; calibrate in the mode that is used"
+
+
 def _write(bag: BagWriter, shot: Shot, detected: Detected, with_images: bool) -> None:
-    stamp_ns = detected.image.stamp_ns
-    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, stamp_ns)
-    bag.write(CORRESPONDENCES_TOPIC, correspondences(detected, make_message), stamp_ns)
+    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
+    bag.write(CORRESPONDENCES_TOPIC, correspondences(detected, make_message), shot.recorded_ns)
     if with_images and shot.compressed is not None:
-        bag.write(IMAGE_TOPIC, shot.compressed, stamp_ns)
-
-
-def _nothing(images: int, refused: dict[str, str], others: Counter[str]) -> str:
-    text = f"none of the {images} images shows anything of the map"
-    if refused:
-        text += f"; {'; '.join(refused.values())}"
-    if others:
-        names = ", ".join(name for name, _ in others.most_common(5))
-        text += f"; they show {names}, which the map does not have"
-    return text
+        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
 
 
 def static_residual(camera: Camera, detected: Detected) -> float:

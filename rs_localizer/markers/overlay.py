@@ -21,7 +21,6 @@ from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.dictionaries import Gray
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Chessboard
 
 Picture = NDArray[np.uint8]
 
@@ -138,8 +137,7 @@ def _standing(seen: Detections, marker_map: MarkerMap) -> Iterator[tuple[Pose, f
     names = {name for name, _ in seen.boards}
     for board in marker_map.boards:
         if board.name in names:
-            more = 1 if isinstance(board, Chessboard) else 0
-            yield board.pose, board.square * (min(board.columns, board.rows) + more)
+            yield board.pose, min(board.extent)
 
 
 def _cube(pose: Pose, size: float) -> list[Array]:

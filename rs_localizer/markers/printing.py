@@ -9,7 +9,7 @@ from rs_localizer.core.so3 import Array
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.pages import MARGIN, Figure, Page, PrintError
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
 # Upright, in mm.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
@@ -142,6 +142,8 @@ def _marker_figure(marker: Marker) -> Figure:
 
 
 def _board_figure(board: Board) -> Figure:
+    if isinstance(board, CircleGrid):
+        raise PrintError(f"a {board.name} can be detected, but not printed from here")
     square = board.square * _MM
     if isinstance(board, Chessboard):
         columns, rows = board.columns + 1, board.rows + 1
@@ -164,10 +166,11 @@ def _board_figure(board: Board) -> Figure:
     return Figure(np.concatenate(black), columns * square, rows * square, 0.0, label)
 
 
-def _white_cells(board: Board, columns: int, rows: int) -> list[tuple[int, int]]:
+def _white_cells(board: Chessboard | Charuco, columns: int, rows: int) -> list[tuple[int, int]]:
     if isinstance(board, Charuco):
         return board.cells
-    return [(c, r) for r in range(rows) for c in range(columns) if (c + r) % 2 == 1]
+    first = 0 if board.inverted else 1
+    return [(c, r) for r in range(rows) for c in range(columns) if (c + r) % 2 == first]
 
 
 def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:

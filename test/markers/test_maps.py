@@ -121,7 +121,7 @@ CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
         (MARKER | {"size": "big"}, "size cannot be 'big'"),
         (MARKER | {"position": [0, 0]}, "position must have 3 values"),
         (MARKER | {"position": [0, 0, float("nan")]}, "position must be finite"),
-        (MARKER | {"quaternion": [0, 0, 0, 0]}, "quaternion must have the length 1, found 0"),
+        (MARKER | {"quaternion": [0, 0, 0, 0]}, "quaternion .* must have the length 1, found 0"),
         (MARKER | {"rotation": np.eye(3).tolist()}, "both a rotation and a quaternion"),
         (MARKER | {"colour": "red"}, "unknown colour"),
         ({"family": "4x4_50"}, "marker 1 has no id; it has nothing else"),
@@ -148,7 +148,8 @@ def test_faults_of_markers(tmp_path: Path, entry: Any, text: str) -> None:
 @pytest.mark.parametrize(
     ("entry", "text"),
     [
-        (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\): type must be chessboard or"),
+        (CHESSBOARD | {"type": "rings"}, r"board 1 \(rings\): type must be one of chess"),
+        (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\) has no spacing"),
         (CHESSBOARD | {"columns": 2}, "needs 3x3 inner corners, got 2x4"),
         (CHESSBOARD | {"columns": 10**9}, "may be 200 squares wide and high, got 1000000000x4"),
         (CHARUCO | {"rows": 10**9}, "may be 200 squares wide and high, got 3x1000000000"),
@@ -186,7 +187,7 @@ def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
         ),
         (
             {"map_frame": "map", "boards": [CHESSBOARD, CHESSBOARD]},
-            "2 chessboards, which cannot be told apart",
+            "2 boards without markers .*, which cannot be told apart",
         ),
         ([1, 2], "the map must be a mapping"),
     ],
