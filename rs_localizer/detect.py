@@ -26,11 +26,13 @@ from rs_localizer.markers.recognition import recognized
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6
+# Of these, the last few are looked at for anything else: seconds each.
+_RECOGNIZED = 4
 # So many images without anything of the map are no chance: a few seconds of a video.
 _PATIENCE = 64
 # A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
 # unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
-_MOST_STILL, _STILL_PERCENT = 3.0, 10.0
+_MOST_STILL, _STILL_PERCENT = 1.5, 10.0
 
 
 class DetectError(ValueError):
@@ -140,10 +142,12 @@ class _Tally:
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
-        seen = Counter(name for image in self._empty for name in recognized(image.pixels))
-        if seen:
-            names = "; ".join(name for name, _ in seen.most_common(4))
-            return f"{text}; they show {names}"
+        images = self._empty[-_RECOGNIZED:]
+        seen = Counter(name for image in images for name in recognized(image.pixels))
+        # What one of several shows may be chance.
+        usual = [name for name, count in seen.most_common(4) if 2 * count >= len(images)]
+        if usual:
+            return f"{text}; they show {'; '.join(usual)}"
         if self._empty:
             text += "; nor any other marker or chessboard that OpenCV knows"
         return text
