@@ -1,8 +1,8 @@
 """Rolling-shutter absolute pose: the camera's pose and velocities from 2D-3D correspondences."""
 
 import importlib
-from typing import TYPE_CHECKING
 
+TYPE_CHECKING = False  # type checkers take it for typing's, which takes milliseconds to import
 if TYPE_CHECKING:
     from rs_localizer.config import LocalizerConfig, VelocityPrior
     from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection

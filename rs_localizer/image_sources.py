@@ -24,6 +24,7 @@ from rs_localizer.replay import CARRIED_TYPES, as_tf2
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 SUFFIXES = (".jpg", ".jpeg", ".png")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts")
 
 # Names of image files that are a time in ns, as EuRoC's and TUM-VI's: from 1973 (before, a name
 # may be a time of today in us) to what a stamp of ROS can hold.
@@ -97,6 +98,21 @@ def image_files(folder: Path) -> list[Path]:
     if all(file.stem.isdecimal() for file in files):
         return sorted(files, key=lambda file: int(file.stem))
     return sorted(files)
+
+
+def holds_images(path: Path) -> str:
+    """What a path that is no recording holds of images, as ``is a video``; empty: nothing."""
+    if path.is_dir():
+        found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return f"is a folder of {found} images" if found else ""
+    if path.suffix.lower() in SUFFIXES:
+        return "is an image"
+    return "is a video" if path.is_file() and path.suffix.lower() in _VIDEOS else ""
+
+
+def image_topics(bag: BagReader) -> list[str]:
+    """Topics of a bag with images."""
+    return sorted(topic for topic, kind in bag.topics.items() if kind in IMAGE_TYPES)
 
 
 def have_times(files: list[Path]) -> bool:

@@ -81,6 +81,11 @@ def find_topics(
     return Topics(camera, None, _find(bag, "keypoints", keypoints), map_points)
 
 
+def has_frames(bag: BagReader) -> bool:
+    """Whether there is anything to localize: a cloud of any kind."""
+    return _INPUTS["correspondences"] in bag.topics.values()
+
+
 def _named(bag: BagReader, name: str) -> list[str]:
     """Topics of the type of an input that end in its name."""
     kind = _INPUTS[name]

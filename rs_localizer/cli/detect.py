@@ -34,6 +34,7 @@ from rs_localizer.image_sources import (
 )
 from rs_localizer.io.bags import STORAGES, is_bag, open_bag
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.whole import told
 from rs_localizer.lab.recording import PARAMETERS, write_parameters
 from rs_localizer.lab.video import has_times
 from rs_localizer.marker_frames import FrameDetector
@@ -157,15 +158,13 @@ def run(args: argparse.Namespace) -> None:
                 info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
             shots = from_bag(bag, topic, info, camera)
             recorded = _record(args, shots, bag.count([topic]), detector)
-        _copy_parameters(args)
     else:
         start_ns = None if args.start is None else round(args.start * 1e9)
         clock = ImageClock(args.rate, start_ns)
         files, total = _files(args, clock)
         recorded = _record(args, files, total, detector)
-    if args.readout_time is not None:
-        direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
-        write_parameters(args.out, args.readout_time, direction)
+    with told(args.out):
+        _write_parameters(args)
     _tell(args, recorded, notices)
     _warn(args, recorded, clock)
     _tell_next(args)
@@ -251,10 +250,13 @@ def _record(
         )
 
 
-def _copy_parameters(args: argparse.Namespace) -> None:
-    """The shutter of a recording, as simulate writes it beside its images."""
+def _write_parameters(args: argparse.Namespace) -> None:
+    """The shutter: as given, or as simulate writes it beside the images of a recording."""
     beside = args.images / PARAMETERS
-    if args.readout_time is None and args.images.is_dir() and beside.exists():
+    if args.readout_time is not None:
+        direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
+        write_parameters(args.out, args.readout_time, direction)
+    elif is_bag(args.images) and beside.exists():
         shutil.copy(beside, args.out / PARAMETERS)
 
 
