@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from rs_localizer.ros.usage import answer
 from rs_localizer.stopping import StopRequest
 
 Run = Callable[[StopRequest, list[str] | None], int]
@@ -38,6 +39,10 @@ def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:
     with StopRequest() as stop:
         try:
             with stop.at_once():
+                text = answer(name, sys.argv[1:] if args is None else args)
+                if text is not None:
+                    sys.stdout.write(text)
+                    return 0
                 run = load()
         except ImportError as error:
             sys.stderr.write(
