@@ -19,6 +19,7 @@ from rs_localizer.lab.experiments.plain_ransac import observe
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.views import View, synthetic_views
+from rs_localizer.lab.palette import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 _PRIOR = VelocityPrior(angular=float(np.radians(10.0)), linear=0.1)
@@ -53,9 +54,9 @@ _LABELS = {
     _P3P: "global shutter (p3p)",
 }
 _LOOKS = {
-    _OURS: Look("#0b3c8c", "", "-", 2.2),
+    _OURS: Look(BLUE, "", "-", 2.2),
     _FREE: Look("#5aa0e0", "", ":", 1.8),
-    _P3P: Look("#f08a24", "", "--", 1.6),
+    _P3P: Look(ORANGE, "", "--", 1.6),
 }
 
 
