@@ -259,8 +259,9 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
     )
     longest = max(float(np.linalg.norm(pixels - seen, axis=1).max()) for seen in predicted.values())
     magnification = _round_down(_RIM / longest) if longest > 0.0 else 1.0
+    panels = figure.subplots(1, len(predicted), squeeze=False)[0]
     for axes, (name, style), seen in zip(
-        figure.subplots(1, len(predicted)), _methods(predicted), predicted.values(), strict=True
+        panels, _methods(predicted), predicted.values(), strict=True
     ):
         offset = pixels - seen
         rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))

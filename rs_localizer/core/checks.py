@@ -1,0 +1,28 @@
+"""Values that people and files give, as the numbers they mean."""
+
+from __future__ import annotations
+
+import math
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core.so3 import Array
+
+
+def numbers(name: str, values: Any) -> Array:
+    """An array of float64 of its own; ValueError for anything that is no number."""
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {values!r}") from None
+
+
+def pixel_count(name: str, value: Any) -> int:
+    """A whole number of pixels, also of a float as JSON has it (1280.0); otherwise ValueError."""
+    if isinstance(value, Real) and not isinstance(value, bool):
+        number = float(value)
+        if math.isfinite(number) and number == math.floor(number):
+            return int(number)
+    raise ValueError(f"{name} must be a whole number of pixels, got {value!r}")

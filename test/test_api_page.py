@@ -1,0 +1,34 @@
+"""The reference of the library is that of the code, and lists all public names."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import rs_localizer
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def generator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("make_api", DOCS / "make_api.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_is_up_to_date() -> None:
+    # `python docs/make_api.py` writes it.
+    assert (DOCS / "api.md").read_text(encoding="utf-8") == generator().page()
+
+
+def test_all_public_names_are_there_and_documented() -> None:
+    text = (DOCS / "api.md").read_text(encoding="utf-8")
+    for name in rs_localizer.__all__:
+        assert f"\n## {name}\n" in text
+        assert f"* [`{name}`]" in text
+    assert "### Localizer.localize\n" in text
+    assert "### Estimate.position\n" in text
