@@ -57,7 +57,7 @@ def _members(kind: type) -> Iterator[str]:
     if issubclass(kind, enum.Enum):
         yield f"Values: {', '.join(f'`{member.value}`' for member in kind)}\n"
         return
-    if is_dataclass(kind):
+    if is_dataclass(kind) and any(not row.endswith("|  |") for row in _fields(kind)):
         yield "\n".join(["| field | |", "|---|---|", *_fields(kind)]) + "\n"
     for name, member in sorted(_public(kind).items()):
         if isinstance(member, property):

@@ -25,8 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--database",
             type=Path,
             metavar="FILE",
-            help="COLMAP's, for the descriptors (default: database.db in the folder or one of the "
-            "two above)",
+            help="COLMAP's, for the descriptors (default: database.db, or the only database of any "
+            "name, in the folder or one of the two above)",
         )
     convert.add_argument("out", type=Path, metavar="OUT", help=" or ".join(WRITERS))
     convert.add_argument("--text", action="store_true", help="write .ply as text")

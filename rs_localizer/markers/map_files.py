@@ -202,6 +202,21 @@ def _pose(entry: _Entry) -> Pose:
         return Pose(position, entry.take("rotation", list))
 
 
+_EXPLANATION = """\
+# Where prints are, in the frame map_frame; all lengths in metres.
+#   size: side of the black square of a marker, without the white rim around it
+#   square, spacing: of a board: side of its squares; from row to row of its circles
+#   position: of the middle of the print, x y z in map_frame
+#   quaternion: x y z w (not w x y z), of length 1; turns the print's axes into those of the map.
+#     Axes of a print: x to the right, y up, z out of the paper toward who looks at it.
+#     [0, 0, 0, 1]: the same axes as the map. [0.7071, 0, 0, 0.7071]: upright in a map whose z is up
+#     and whose y points into the wall.
+#   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
+# Measure what was put up, write it here, and check it: rs_localizer markers check FILE;
+# rs_localizer detect names a marker that is not where this file has it.
+"""
+
+
 def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
     """Write a map file that :func:`read_marker_map` reads."""
     tree: dict[str, Any] = {"map_frame": marker_map.map_frame}
@@ -210,7 +225,7 @@ def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
     if marker_map.boards:
         tree["boards"] = [_board_entry(board) for board in marker_map.boards]
     text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100)
-    Path(path).write_text(text, encoding="utf-8")
+    Path(path).write_text(f"{_EXPLANATION}{text}", encoding="utf-8")
 
 
 def _marker_entry(marker: Marker) -> dict[str, Any]:
