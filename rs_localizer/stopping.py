@@ -11,7 +11,7 @@ import os
 import signal
 from collections.abc import Iterator
 from types import FrameType
-from typing import Self
+from typing import ClassVar, Self
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # What shells report of a program that a signal ended: 130 for Ctrl-C, 143 for SIGTERM.
@@ -27,10 +27,12 @@ class _Signals(abc.ABC):
     send theirs at the same time.
     """
 
+    code: ClassVar[int] = 0
+    """What shells report of a program that was ended by the signal that came, to whichever of
+    several that are entered within each other; 0: none has come."""
+
     def __init__(self) -> None:
         self.requested = False
-        self.code = 0
-        """What shells report of a program that was ended by the signal that came."""
         self._at_once: tuple[int | None, str] | None = None
 
     def __enter__(self) -> Self:
@@ -61,7 +63,7 @@ class _Signals(abc.ABC):
             self._at_once = before
 
     def _take(self, number: int, frame: FrameType | None) -> None:
-        self.code = _SIGNALLED + number
+        _Signals.code = _SIGNALLED + number
         self._leave_if_at_once()
         first, self.requested = not self.requested, True
         if first:

@@ -144,7 +144,7 @@ def test_a_database_of_any_name(tmp_path: Path) -> None:
     assert found.equals(read_map_file(COLMAP / "binary", "map", COLMAP / "database.db"))
     assert found.descriptors is not None
     shutil.copy(COLMAP / "database.db", tmp_path / "attic.db")
-    with pytest.raises(MapError, match="several databases of COLMAP, attic.db, office.db: name"):
+    with pytest.raises(MapError, match=r"several databases of COLMAP, attic.db, office.db: name"):
         read_map_file(model, "map")
 
 
