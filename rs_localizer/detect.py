@@ -28,6 +28,8 @@ from rs_localizer.markers.recognition import recognized
 _LEAST_CORNERS = 6
 # Of these, the last few are looked at for anything else: seconds each.
 _RECOGNIZED = 4
+# Fewer than this share of the images with anything of the map are a reason to look.
+_FEW = 0.3
 # So many images without anything of the map are no chance: a few seconds of a video.
 _PATIENCE = 64
 # A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
@@ -92,8 +94,9 @@ def record(
                 tally.add(cameras.of(shot, detected), detected)
                 if len(detected.detections.ids):
                     _write(bag, shot, detected, with_images)
-                elif tally.images == _PATIENCE and not tally.counts:
-                    tell(f"none of the first {_PATIENCE} images {tally.nothing()}")
+                if tally.images == _PATIENCE and tally.are_few:
+                    tell(f"{len(tally.counts) or 'none'} of the first {_PATIENCE} images "
+                         f"{tally.nothing()}")
             done()
         if not tally.counts:
             raise DetectError(f"none of the {tally.images} images {tally.nothing()}")
@@ -113,6 +116,7 @@ class _Tally:
         self._residuals: list[float] = []
         self._stamps: list[int] = []
         self._empty: list[Image] = []  # some that show nothing
+        self._empties = 0
         self._markers = LeaveOneOut(marker_map)
 
     def refuse(self, refusal: Refusal) -> None:
@@ -128,9 +132,15 @@ class _Tally:
             self.counts.append(len(found.ids))
             self._residuals.append(static_residual(camera, detected))
             self._markers.add(camera, found)
-            self._empty.clear()
-        elif not self.counts and self.images.bit_count() == 1:  # the 1st, 2nd, 4th, 8th ...
-            self._empty.append(detected.image)
+            return
+        self._empties += 1
+        if self._empties.bit_count() == 1:  # the 1st, 2nd, 4th, 8th ...
+            self._empty = [*self._empty[1 - _RECOGNIZED :], detected.image]
+
+    @property
+    def are_few(self) -> bool:
+        """Whether so few images show anything that it may be another board, seen in part."""
+        return len(self.counts) < _FEW * self.images
 
     def nothing(self) -> str:
         """What is to be said of images that show nothing of the map."""
@@ -142,15 +152,18 @@ class _Tally:
         if self._others:
             names = ", ".join(name for name, _ in self._others.most_common(5))
             return f"{text}; they show {names}, which the map does not have"
-        images = self._empty[-_RECOGNIZED:]
-        seen = Counter(name for image in images for name in recognized(image.pixels))
-        # What one of several shows may be chance.
-        usual = [name for name, count in seen.most_common(4) if 2 * count >= len(images)]
-        if usual:
-            return f"{text}; they show {'; '.join(usual)}"
+        seen = self.instead()
+        if seen:
+            return f"{text}; {'others' if self.counts else 'they'} show {'; '.join(seen)}"
         if self._empty:
             text += "; nor any other marker or chessboard that OpenCV knows"
         return text
+
+    def instead(self) -> list[str]:
+        """What images that show nothing of the map show otherwise."""
+        seen = Counter(name for image in self._empty for name in recognized(image.pixels))
+        # What one of several shows may be chance.
+        return [name for name, count in seen.most_common(4) if 2 * count >= len(self._empty)]
 
     def recorded(self) -> Recorded:
         known = [value for value in self._residuals if np.isfinite(value)]
@@ -160,6 +173,8 @@ class _Tally:
                 f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
                 "of this camera in this mode, or the map (sizes, positions) is wrong"
             )
+        if self.are_few and (seen := self.instead()):
+            faults.append(f"images that show nothing of the map show {'; '.join(seen)}")
         period = np.diff(np.array(self._stamps, np.int64))
         return Recorded(
             self.images,
