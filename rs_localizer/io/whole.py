@@ -34,6 +34,23 @@ def whole(directory: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
+def whole_files(*files: Path) -> Iterator[None]:
+    """Within ``with``, write these files; after an exception none of them is left.
+
+    Raises:
+        OutputError: when the disk takes no more, naming the first of them.
+    """
+    try:
+        with told(files[0]):
+            yield
+    except BaseException:
+        for file in files:
+            with contextlib.suppress(OSError):
+                file.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
 def told(path: Path) -> Iterator[None]:
     """Faults of the file system within ``with`` name the path.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rs_localizer.io.bags import STORAGES
-from rs_localizer.io.whole import OutputError, told, whole
+from rs_localizer.io.whole import OutputError, told, whole, whole_files
 
 
 def test_what_was_finished_stays(tmp_path: Path) -> None:
@@ -64,3 +64,19 @@ def test_a_full_disk_is_named_and_nothing_half_written(tmp_path: Path, storage: 
     assert done.stderr.startswith("rs_localizer simulate: bag cannot be written: ")
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "bag").exists()
+
+
+def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
+    first, second = tmp_path / "a", tmp_path / "b"
+
+    def half() -> None:
+        with whole_files(first, second):
+            first.write_text("a")
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError, match="a cannot be written: No space left on device"):
+        half()
+    assert list(tmp_path.iterdir()) == []
+    with whole_files(first, second):
+        first.write_text("a")
+    assert first.exists()
