@@ -1,6 +1,9 @@
-"""Writes ``docs/api.md``, the reference of the library, from the docstrings of its public names.
+"""Writes the pages that repeat code: the reference of the library, and the reasons of refusals.
 
     python docs/make_api.py
+
+``docs/api.md`` comes from the docstrings of the public names, ``docs/reasons.md`` from the table
+that ``replay`` prints from.
 """
 
 from __future__ import annotations
@@ -14,8 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import rs_localizer
+from rs_localizer.reasons import REASONS
 
 PAGE = Path(__file__).with_name("api.md")
+REASONS_PAGE = Path(__file__).with_name("reasons.md")
+_REASONS_INTRODUCTION = """\
+# Why a frame has no pose
+
+Written by `python docs/make_api.py` from `rs_localizer/reasons.py`. The reasons are the same in the
+library (`Failure.reason`), in what `replay` prints, in the log and in `/diagnostics`.
+
+| reason | means | look at |
+|---|---|---|
+"""
 _INTRODUCTION = """\
 # Library reference
 
@@ -128,5 +142,12 @@ def _text(item: Any) -> str:
     return text if not lists else f"{text}\n\n```text\n{title}{lists[0]}\n```"
 
 
+def reasons_page() -> str:
+    """The page of the reasons."""
+    rows = (f"| `{name}` | {means} | {look_at} |" for name, (means, look_at) in REASONS.items())
+    return _REASONS_INTRODUCTION + "\n".join(rows) + "\n"
+
+
 if __name__ == "__main__":
     PAGE.write_text(page(), encoding="utf-8")
+    REASONS_PAGE.write_text(reasons_page(), encoding="utf-8")

@@ -95,8 +95,8 @@ def record(
                 if len(detected.detections.ids):
                     _write(bag, shot, detected, with_images)
                 if tally.images == _PATIENCE and tally.are_few:
-                    tell(f"{len(tally.counts) or 'none'} of the first {_PATIENCE} images "
-                         f"{tally.nothing()}")
+                    count = len(tally.counts) or "none"
+                    tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
             done()
         if not tally.counts:
             raise DetectError(f"none of the {tally.images} images {tally.nothing()}")

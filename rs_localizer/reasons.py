@@ -12,7 +12,9 @@ class Meaning(NamedTuple):
     look_at: str
 
 
-_TURNED = "is the readout time in seconds, the scan direction right, are pixels raw (no rectified)?"
+_TURNED = (
+    "is the readout time in seconds, the scan direction right, are the pixels raw (not rectified)?"
+)
 
 REASONS = {
     "too_few_points": Meaning(

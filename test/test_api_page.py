@@ -20,9 +20,11 @@ def generator() -> ModuleType:
     return module
 
 
-def test_the_page_is_up_to_date() -> None:
-    # `python docs/make_api.py` writes it.
-    assert (DOCS / "api.md").read_text(encoding="utf-8") == generator().page()
+def test_the_pages_are_up_to_date() -> None:
+    # `python docs/make_api.py` writes them.
+    made = generator()
+    assert (DOCS / "api.md").read_text(encoding="utf-8") == made.page()
+    assert (DOCS / "reasons.md").read_text(encoding="utf-8") == made.reasons_page()
 
 
 def test_all_public_names_are_there_and_documented() -> None:
