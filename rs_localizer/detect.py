@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from rs_localizer.core.camera import Camera, ScanDirection
@@ -23,6 +22,7 @@ from rs_localizer.marker_frames import Detected, FrameDetector, correspondences
 from rs_localizer.markers.displaced import LeaveOneOut
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.recognition import recognized
+from rs_localizer.markers.still import rms, still_errors, still_pose
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6
@@ -235,15 +235,7 @@ def static_residual(camera: Camera, detected: Detected) -> float:
     found = detected.detections
     if len(found.ids) < _LEAST_CORNERS:
         return np.nan
-    rays = np.ascontiguousarray(camera.rays(found.pixels))
-    try:
-        solved, rotation, translation = cv2.solvePnP(
-            found.points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
-        )
-    except cv2.error:
+    pose = still_pose(found.points, camera.rays(found.pixels))
+    if pose is None:
         return np.nan
-    if not solved:
-        return np.nan
-    local = found.points @ cv2.Rodrigues(rotation)[0].T + translation.T
-    errors = camera.project(local) - found.pixels
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    return rms(still_errors(camera, pose, found.points, found.pixels))

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from rs_localizer.core.checks import numbers, pixel_count
+from rs_localizer.core.checks import Matrix, Vector, numbers, pixel_count
 from rs_localizer.core.so3 import Array
 
 
@@ -99,8 +99,8 @@ class Camera:
             self,
             width: int | float,
             height: int | float,
-            K: ArrayLike,
-            D: ArrayLike | None = None,
+            K: Matrix,
+            D: Vector | None = None,
             distortion_model: str = ...,
             readout_time: float = ...,
             scan_direction: str = ...,

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_localizer.core.so3 import Array
+
+# NumPy's ArrayLike is so wide that type checkers take [[500, 0], [0, 500]] for a list of objects.
+Matrix = NDArray[Any] | Sequence[Sequence[float]]
+Vector = NDArray[Any] | Sequence[float]
 
 
 def numbers(name: str, values: Any) -> Array:

@@ -112,11 +112,8 @@ def trajectories(truth: Trajectory | None, estimates: Mapping[str, Trajectory]) 
 
 
 def _range(parts: Sequence[Array], room: float) -> tuple[float, float]:
-    """What nearly all values are within: a single one far off must not shrink all others.
-
-    Args:
-        parts: values of each series.
-        room: beyond, as a share of what lies between.
+    """What nearly all values of all series are within, with some room beyond (as a share): a
+    single one far off must not shrink all others.
     """
     values = np.concatenate([np.asarray(part, np.float64) for part in parts])
     values = values[np.isfinite(values)]
@@ -254,9 +251,7 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
     wide, tall = np.maximum(high - low, 1.0)
     # As high as the pictures are, side by side, with their titles: no band stays blank.
     height = float(np.clip(_WIDTH / len(predicted) * tall / wide, 1.0, _WIDTH)) + _TITLES
-    figure = _figure(
-        f"{title}: from where the pose puts the points to where they are seen", height
-    )
+    figure = _figure(f"{title}: from where the pose puts points to where they are seen", height)
     longest = max(float(np.linalg.norm(pixels - seen, axis=1).max()) for seen in predicted.values())
     magnification = _round_down(_RIM / longest) if longest > 0.0 else 1.0
     panels = figure.subplots(1, len(predicted), squeeze=False)[0]

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.so3 import Array
 from rs_localizer.markers.detection import Detections, IntArray
+from rs_localizer.markers.map_check import whole_markers
 from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.still import rms, still_errors, still_pose
 
 # With fewer in an image it cannot be said which one is off.
 _LEAST_MARKERS = 3
@@ -50,7 +51,7 @@ class LeaveOneOut:
 
     def add(self, camera: Camera, seen: Detections) -> None:
         """Take in what an image shows."""
-        whole = _whole(seen, 4 * len(self._names))
+        whole = whole_markers(seen, 4 * len(self._names))
         if len(whole) < _LEAST_MARKERS:
             return
         self._images += 1
@@ -60,23 +61,26 @@ class LeaveOneOut:
         rows = np.concatenate(list(whole.values()))
         if not np.isfinite(rays[rows]).all():
             return
-        together = _pose(seen.points[rows], rays[rows])
+
+        def errors(pose: tuple[Array, Array], some: IntArray) -> Array:
+            return still_errors(camera, pose, seen.points[some], seen.pixels[some])
+
+        together = still_pose(seen.points[rows], rays[rows])
         if together is None:
             return
-        fit_with = _rms(_errors(camera, together, seen, rows))
+        fit_with = rms(errors(together, rows))
         for marker, own in whole.items():
             others = rows[~np.isin(rows, own)]
-            pose = _pose(seen.points[others], rays[others])
+            pose = still_pose(seen.points[others], rays[others])
             if pose is None:
                 continue
-            errors = _errors(camera, pose, seen, own)
             local = seen.points[own] @ pose[0].T + pose[1]
             shift = (rays[own] - local[:, :2] / local[:, 2:]).mean(axis=0) * local[:, 2].mean()
             self._views.setdefault(marker, []).append(
                 _View(
-                    fit=_rms(_errors(camera, pose, seen, others)),
+                    fit=rms(errors(pose, others)),
                     fit_with=fit_with,
-                    off=float(np.linalg.norm(errors.mean(axis=0))),
+                    off=float(np.linalg.norm(errors(pose, own).mean(axis=0))),
                     axes=pose[0][:2],
                     shift=shift,
                 )
@@ -100,40 +104,6 @@ class LeaveOneOut:
             f"{fit:.2f} px without it, it is off by {off:.1f} px, about "
             f"{100.0 * np.linalg.norm(away):.1f} cm ({x}, {y}, {z} m in the map)"
         )
-
-
-def _whole(seen: Detections, end: int) -> dict[int, IntArray]:
-    """Rows of the detections for each single marker of which all four corners were found."""
-    ids = seen.ids
-    markers, counts = np.unique(ids[ids < end] // 4, return_counts=True)
-    return {
-        int(m): np.flatnonzero((ids // 4 == m) & (ids < end))
-        for m in markers[counts == 4].tolist()
-    }
-
-
-def _pose(points: Array, rays: Array) -> tuple[Array, Array] | None:
-    """Rotation (3,3) and translation (3,) camera_from_map of a global shutter."""
-    try:
-        solved, rotation, translation = cv2.solvePnP(
-            points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
-        )
-    except cv2.error:
-        return None
-    if not solved:
-        return None
-    turn = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
-    return turn, np.asarray(translation, np.float64).ravel()
-
-
-def _errors(
-    camera: Camera, pose: tuple[Array, Array], seen: Detections, rows: IntArray
-) -> Array:
-    return camera.project(seen.points[rows] @ pose[0].T + pose[1]) - seen.pixels[rows]
-
-
-def _rms(errors: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
 def _median(views: list[_View], name: str) -> float:
