@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.shutter import project_rolling
+from rs_localizer.core.so3 import Array
 from rs_localizer.frames import Refusal
 from rs_localizer.image_sources import Carried, Shot
 from rs_localizer.io.bags import BagWriter, make_message
@@ -18,8 +20,9 @@ from rs_localizer.io.images import Image
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.whole import whole
 from rs_localizer.lab.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, IMAGE_TOPIC
+from rs_localizer.localizer import Localizer
 from rs_localizer.marker_frames import Detected, FrameDetector, correspondences
-from rs_localizer.markers.displaced import LeaveOneOut
+from rs_localizer.markers.displaced import LeaveOneOut, Predict
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.recognition import recognized
 from rs_localizer.markers.still import rms, still_errors, still_pose
@@ -32,6 +35,8 @@ _RECOGNIZED = 4
 _FEW = 0.3
 # So many images without anything of the map are no chance: a few seconds of a video.
 _PATIENCE = 64
+# Corners of two markers: the least that is left of three.
+_LEAST_INLIERS = 8
 # A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
 # unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
 _MOST_STILL, _STILL_PERCENT = 1.5, 10.0
@@ -62,6 +67,7 @@ def record(
     *,
     storage: str = "mcap",
     with_images: bool = False,
+    scan_direction: str = ScanDirection.TOP_TO_BOTTOM,
     done: Callable[[], object] = lambda: None,
     tell: Callable[[str], object] = lambda text: None,
 ) -> Recorded:
@@ -73,6 +79,7 @@ def record(
         out: bag directory to create.
         storage: ``mcap`` or ``sqlite3``.
         with_images: write these images, too, as far as they are compressed.
+        scan_direction: of the shutter, for the check of the markers' places.
         done: called after each image.
         tell: called when many images in the beginning show nothing, with what they show instead.
 
@@ -80,7 +87,7 @@ def record(
         DetectError: when no image shows anything, or images and calibration differ in size.
     """
     tally = _Tally(detector.map)
-    cameras = _Cameras()
+    cameras = _Cameras(scan_direction)
     with whole(out), BagWriter(out, storage) as bag:
         for shot in shots:
             if isinstance(shot, Carried):
@@ -117,7 +124,7 @@ class _Tally:
         self._stamps: list[int] = []
         self._empty: list[Image] = []  # some that show nothing
         self._empties = 0
-        self._markers = LeaveOneOut(marker_map)
+        self._markers = LeaveOneOut(marker_map, _RollingFit())
 
     def refuse(self, refusal: Refusal) -> None:
         self.images += 1
@@ -188,17 +195,33 @@ class _Tally:
         )
 
 
+class _RollingFit:
+    """Fits the motion of a rolling shutter (see :data:`rs_localizer.markers.displaced.Fit`)."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Camera, Localizer] | None = None
+
+    def __call__(self, camera: Camera, points: Array, pixels: Array) -> Predict | None:
+        if self._last is None or self._last[0] is not camera:
+            self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
+        found = self._last[1].localize(points, pixels)
+        if not found:
+            return None
+        return lambda some: project_rolling(camera, found.at_rows, some)[0]
+
+
 class _Cameras:
     """The camera of each image; mostly that of the one before."""
 
-    def __init__(self) -> None:
+    def __init__(self, scan_direction: str) -> None:
+        self._scan_direction = scan_direction
         self._last: tuple[Calibration, Camera] | None = None
 
     def of(self, shot: Shot, detected: Detected) -> Camera:
         try:
             calibration = read_camera_info(shot.camera_info)
             if self._last is None or self._last[0] != calibration:
-                self._last = calibration, calibration.camera(0.0, ScanDirection.TOP_TO_BOTTOM)
+                self._last = calibration, calibration.camera(0.0, self._scan_direction)
         except MessageError as error:
             raise DetectError(f"the camera_info cannot be used: {error}") from error
         camera = self._last[1]

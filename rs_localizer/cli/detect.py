@@ -245,6 +245,7 @@ def _record(
             args.out,
             storage=args.storage,
             with_images=args.with_images,
+            scan_direction=args.scan_direction or ScanDirection.TOP_TO_BOTTOM,
             done=progress.update,
             tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )
