@@ -24,9 +24,9 @@ IntArray = NDArray[np.int64]
 
 # After this long without a board (ns) it may lie the other way round.
 _LONGEST_LOSS_NS = 1_000_000_000
-# Other markers of the map's families are looked for in the first images, and then in one of so
-# many: they are only told of, and a large family takes several times as long.
-_FIRST_IMAGES, _ONE_IN = 5, 30
+# Other markers of a family larger than this are looked for in the first images, and then in one of
+# so many: they are only told of, and a large family takes several times as long.
+_LARGE, _FIRST_IMAGES, _ONE_IN = 100, 5, 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class MarkerDetector:
     """Finds the markers and boards of a map.
 
     What is found of the map depends on the image alone (and for a board that looks the same turned
-    on the image before); :attr:`Detections.unknown` is looked for now and then.
+    on the image before); of large families, :attr:`Detections.unknown` is told now and then only.
 
     Args:
         marker_map: what to look for.
@@ -199,7 +199,7 @@ class MarkerDetector:
 
 
 def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
-    """For each kind of family, one that knows the map's ids and one of the largest family."""
+    """For each kind of family, one that knows the map's ids, if that is faster, and one of all."""
     families: dict[str, Family] = {}
     ids: dict[str, set[int]] = {}
     for marker, _ in marker_map.all_markers():
@@ -210,8 +210,9 @@ def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
             families[kind] = marker.family
     try:
         return [
-            (MarkerFinder(family, ids[kind]), MarkerFinder(family))
+            (MarkerFinder(family, ids[kind]) if family.count > _LARGE else everything, everything)
             for kind, family in families.items()
+            for everything in [MarkerFinder(family)]
         ]
     except DictionaryError as error:
         raise MarkerMapError(str(error)) from error
