@@ -6,6 +6,8 @@ ranges here are what users see in ``ros2 param describe``.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from numbers import Integral, Real
@@ -251,6 +253,22 @@ class LocalizerConfig:
                 raise ValueError(
                     f"{name} must be of type {kind.__name__}, got {getattr(self, name)!r}"
                 )
+
+
+def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
+    """The settings of a localizer by keyword.
+
+    Raises:
+        ValueError: for a value out of range, or a name that is no setting; then with the one that
+            may have been meant.
+    """
+    known = [item.name for item in fields(LocalizerConfig)]
+    for name in settings:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
+            raise ValueError(f"{name!r} is no setting of the localizer; {hint}")
+    return LocalizerConfig(**settings)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.config import LocalizerConfig
+from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.acceptance import refusal
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
@@ -66,10 +66,7 @@ class Localizer:
     ) -> None:
         if config is not None and settings:
             raise ValueError(f"give either config or settings, got both: {', '.join(settings)}")
-        try:
-            self.config = config or LocalizerConfig(**settings)  # type: ignore[arg-type]
-        except TypeError as error:
-            raise ValueError(f"unknown setting: {error}") from None
+        self.config = config or localizer_config(settings)
         self.camera = camera
         self._solver = find_solver(self.config.solver)
         self._search = MotionSearch(camera, self.config, self._solver)

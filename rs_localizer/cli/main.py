@@ -1,12 +1,15 @@
 """``rs_localizer COMMAND``: finds the command, turns its faults into one line and an exit code.
 
-Exit codes: 0 done, 1 the work failed, 2 wrong usage.
+Exit codes: 0 done, 1 the work failed, 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM, and 141
+when who reads the output goes away (``| head``).
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -15,6 +18,10 @@ from dataclasses import dataclass
 import rs_localizer
 from rs_localizer.cli import UsageError
 from rs_localizer.missing import explain
+from rs_localizer.stopping import INTERRUPTED
+
+# What shells report of a program whose output nobody reads any more: 128 + SIGPIPE.
+_SIGPIPE = 141
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +121,9 @@ def main(
         return _fail(name, explain(error), 1)
     try:
         module.run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return _unheard()
     except UsageError as error:
         return _fail(name, str(error), 2)
     except (ValueError, OSError) as error:
@@ -123,13 +133,21 @@ def main(
     except MemoryError as error:
         return _fail(name, f"the memory does not suffice: {error}", 1)
     except KeyboardInterrupt:
-        return _fail(name, "interrupted", 1)
+        return _fail(name, "interrupted", INTERRUPTED)
     return 0
 
 
 def _fail(name: str, text: str, code: int) -> int:
     print(f"rs_localizer {name}: {' '.join(text.split())}", file=sys.stderr)
     return code
+
+
+def _unheard() -> int:
+    """Nobody reads the output any more; to say so would be heard by nobody either."""
+    with contextlib.suppress(OSError, ValueError):
+        # What is left in the buffer would be written at the end of the process, and fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return _SIGPIPE
 
 
 def _parser() -> argparse.ArgumentParser:

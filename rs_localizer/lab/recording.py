@@ -141,12 +141,12 @@ def _vector(vector: Array) -> Any:
     return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def make_camera_info(camera: Camera, stamp_ns: int) -> Any:
+def make_camera_info(camera: Camera, stamp_ns: int, frame: str = CAMERA_FRAME) -> Any:
     """The sensor_msgs/CameraInfo of a camera."""
     roi = camera.roi
     return make_message(
         "sensor_msgs/msg/CameraInfo",
-        header=make_header(make_message, stamp_ns, CAMERA_FRAME),
+        header=make_header(make_message, stamp_ns, frame),
         height=camera.height,
         width=camera.width,
         distortion_model=str(camera.distortion_model),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from rs_localizer import threads
 from rs_localizer.missing import explain
+from rs_localizer.ros.usage import answer
 from rs_localizer.stopping import StopRequest
 
 Run = Callable[[StopRequest, list[str] | None], int]
@@ -41,6 +42,10 @@ def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:
     with StopRequest() as stop:
         try:
             with stop.at_once():
+                text = answer(name, sys.argv[1:] if args is None else args)
+                if text is not None:
+                    sys.stdout.write(text)
+                    return 0
                 run = load()
         except ImportError as error:
             sys.stderr.write(f"{name}: {explain(error)}\n")

@@ -85,7 +85,7 @@ def test_a_map_in_the_recording(
     out = tmp_path / "out"
     assert main(["replay", str(flight / "with_map"), "--out", str(out), *SHUTTER]) == 0
     said = capsys.readouterr().out
-    assert [line.split()[-1] for line in said.splitlines() if "no_map" in line] == ["2"]
+    assert [line.split()[-1] for line in said.splitlines() if ": no_map" in line] == ["2"]
     found = errors(out, flight / "with_map")
     assert len(found) == FRAMES - 2
     assert found.max() < 0.02

@@ -23,6 +23,7 @@ from rs_localizer.lab.experiments.results import (
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.uncertainty import Interval, quantile, share
 from rs_localizer.lab.experiments.views import GROSS, Outcome, outcome, synthetic_views
+from rs_localizer.lab.palette import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 _REGION = 0.95
@@ -50,14 +51,14 @@ class Case:
 
 _CASES = (
     Case("fast", "50 points at 20 deg and 0.2 m", Setting(20.0, 0.2, 1.0),
-         Look("#0b3c8c", "", "-", 2.0), 1.05),
+         Look(BLUE, "", "-", 2.0), 1.05),
     Case("outliers", "200 points, 50 % outliers, at 10 deg and 0.1 m",
          Setting(10.0, 0.1, 1.0, points=200), Look("#2f6fc0", "", "--", 1.6), 1.05, outliers=0.5),
     Case("faster", "100 points at 30 deg and 0.3 m", Setting(30.0, 0.3, 1.0, points=100),
          Look("#5aa0e0", "", ":", 2.0), 1.08),
     Case("slow", "50 points at 1 deg and 0.01 m", Setting(1.0, 0.01, 1.0),
          Look("#2a6b34", "", "-.", 1.6), 1.05),
-    Case("rest", "50 points at rest", Setting(noise=1.0), Look("#f08a24", "", "-", 1.4)),
+    Case("rest", "50 points at rest", Setting(noise=1.0), Look(ORANGE, "", "-", 1.4)),
 )  # fmt: skip
 
 

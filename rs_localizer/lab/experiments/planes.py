@@ -20,6 +20,7 @@ from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, 
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.uncertainty import quantile
 from rs_localizer.lab.experiments.views import View, synthetic_views
+from rs_localizer.lab.palette import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 # 10 degrees and 0.1 m in a readout of 30 ms, which is assumed without one.
@@ -56,9 +57,9 @@ _LABELS = {
     _P3P: "global shutter (p3p)",
 }
 _LOOKS = {
-    _OURS: Look("#0b3c8c", "", "-", 2.2),
+    _OURS: Look(BLUE, "", "-", 2.2),
     _FREE: Look("#5aa0e0", "", ":", 1.8),
-    _P3P: Look("#f08a24", "", "--", 1.6),
+    _P3P: Look(ORANGE, "", "--", 1.6),
 }
 
 

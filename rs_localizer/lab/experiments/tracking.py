@@ -24,6 +24,7 @@ from rs_localizer.lab.experiments.results import (
     judge_intervals,
 )
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
+from rs_localizer.lab.palette import BLUE, ORANGE
 from rs_localizer.lab.scene import room
 from rs_localizer.lab.simulation import (
     FrameSettings,
@@ -64,7 +65,7 @@ _CASES = (
          wall=True),
     Case("rich", "150 points, 30 % outliers", FrameSettings(points=150, rate=_RATE)),
 )  # fmt: skip
-_LOOKS = {"tracked": Look("#0b3c8c", "", "-", 1.4), "untracked": Look("#f08a24", "", "--", 1.0)}
+_LOOKS = {"tracked": Look(BLUE, "", "-", 1.4), "untracked": Look(ORANGE, "", "--", 1.0)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,7 @@ from itertools import product
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.lab.experiments.honesty.estimating import (
     believed,
     estimate,

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import BoolArray
 from rs_localizer.lab.experiments.honesty.against_p3p import MOST_RATIO, Pair
 from rs_localizer.lab.experiments.honesty.coverage import MOTIONS
 from rs_localizer.lab.experiments.honesty.estimating import Found

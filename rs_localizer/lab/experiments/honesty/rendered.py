@@ -95,7 +95,6 @@ def _render(trajectory: Path, axes: str, recording: Path, seconds: float) -> Non
     assert scene.marker_map is not None
     renderer = Renderer(camera, scene.planes, _SENSOR)
     detector = MarkerDetector(scene.marker_map)
-    detector.warm_up()
 
     def image(numbered: tuple[int, int]) -> tuple[int, Detections]:
         index, stamp_ns = numbered

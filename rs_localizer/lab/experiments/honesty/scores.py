@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray, Estimate, Failure
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.outputs import Pose, Twist
 from rs_localizer.lab.independent.rotations import logarithm
 from rs_localizer.moments import pose_at, twist_at

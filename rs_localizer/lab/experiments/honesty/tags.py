@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import Frame
