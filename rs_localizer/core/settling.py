@@ -34,7 +34,7 @@ _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
 # map or a lens is seen to be wrong, what looks like motion mostly is more of that, and the odds
 # grow by the second factor. The covariance allows for motion at even odds.
 _ODDS_AGAINST_MOTION = 100.0
-_DISTRUST = 1e7
+_DISTRUST = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
