@@ -31,6 +31,8 @@ _FIELD_TERMS = (_FIELD_DEGREE + 1) * (_FIELD_DEGREE + 2) // 2
 # Size of each degree: fields of lenses and maps are smooth, and no lens and no paper shears an
 # image.
 _FIELD_DEGREE_SIZES = (1.0, 0.2, 0.5, 0.25)
+# Probability of no field above which none is looked for among neighbours.
+_NO_FIELD = 0.5
 # Points nearer than this part of the image that the points fill are neighbours in it.
 _FAR_APART = 0.15
 # Correlations below so many standard deviations are chance.
@@ -562,6 +564,7 @@ def examine(
     )  # fmt: skip
     step, covariance = with_model_error(columns, sizes.noise, sizes.shake, sizes.field)
     agreement = neighbours_agree(errors, measured_tau, rays, inliers)
-    shared = shared_errors(errors, rays, inliers)
+    # Where no field is seen, nor is what neighbours share; and most frames have none.
+    shared = shared_errors(errors, rays, inliers) if sizes.no_field < _NO_FIELD else 0.0
     determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
     return Examined(step, covariance, sizes, agreement, shared, determined)
