@@ -88,6 +88,7 @@ def test_numbers_of_a_working_node(world: World) -> None:
         "Inliers with rolling shutter": "3",
         "Inliers with global shutter": "2",
         "Residual RMS (px)": f"{np.sqrt(25.0 / 3.0):.3f}",
+        "Model error (px)": "0.000",
         "Iterations": "64",
         "Frames received": "100",
         "Poses published": "100",
