@@ -16,9 +16,6 @@ from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
-# Controls in a block of the block-tridiagonal form: four neighbours lie in two blocks.
-_BLOCK = CONTROL * 3
-
 
 class Undetermined(ValueError):
     """The observations leave something open; the message says so."""
@@ -37,6 +34,9 @@ class Factored:
 
     def __init__(self, normal: Normal, damping: float = 0.0) -> None:
         band = normal.band.copy()
+        # Size of the blocks of the block-tridiagonal form: as many neighbouring controls as the
+        # band couples lie in two blocks.
+        self._block = len(band) - CONTROL
         band[0] *= 1.0 + damping
         corner = normal.corner + np.tril(normal.corner, -1).T
         corner[np.diag_indices_from(corner)] *= 1.0 + damping
@@ -83,15 +83,15 @@ class Factored:
         diagonal, beside = self._inverse_blocks()
         border = self.border_covariance()
         out = np.empty((len(firsts), LOCAL, LOCAL))
-        pair = np.empty((2 * _BLOCK, 2 * _BLOCK))
-        count = len(self._band[0])
+        size, count = self._block, len(self._band[0])
+        pair = np.empty((2 * size, 2 * size))
         for m, first in enumerate(firsts):
-            block, inside = divmod(CONTROL * int(first), _BLOCK)
+            block, inside = divmod(CONTROL * int(first), size)
             following = min(block + 1, len(diagonal) - 1)
-            pair[:_BLOCK, :_BLOCK] = diagonal[block]
-            pair[_BLOCK:, _BLOCK:] = diagonal[following]
-            pair[:_BLOCK, _BLOCK:] = beside[block]
-            pair[_BLOCK:, :_BLOCK] = beside[block].T
+            pair[:size, :size] = diagonal[block]
+            pair[size:, size:] = diagonal[following]
+            pair[:size, size:] = beside[block]
+            pair[size:, :size] = beside[block].T
             begin = CONTROL * int(first)
             lifted = self._lifted[begin : min(begin + LOCAL, count)]
             own = pair[inside : inside + LOCAL, inside : inside + LOCAL]
@@ -99,24 +99,24 @@ class Factored:
         return out
 
     def _inverse_blocks(self) -> tuple[Array, Array]:
-        """Blocks (k,18,18) on the diagonal of H^-1, and those to their right."""
-        band = self._band
+        """Blocks (k,s,s) on the diagonal of H^-1, and those to their right."""
+        band, size = self._band, self._block
         count = band.shape[1]
-        blocks = -(-count // _BLOCK)
-        lower = np.zeros((blocks, _BLOCK, _BLOCK))
-        below = np.zeros((blocks, _BLOCK, _BLOCK))  # L of the next block by this one
-        lower[:] = np.eye(_BLOCK)
-        for d in range(min(LOCAL, count)):
+        blocks = -(-count // size)
+        lower = np.zeros((blocks, size, size))
+        below = np.zeros((blocks, size, size))  # L of the next block by this one
+        lower[:] = np.eye(size)
+        for d in range(min(len(band), count)):
             columns = np.arange(count - d)
             rows = columns + d
-            where = (columns // _BLOCK, rows % _BLOCK, columns % _BLOCK)
+            where = (columns // size, rows % size, columns % size)
             value = band[d, : count - d]
             for ahead, blocks_of in ((0, lower), (1, below)):
-                here = rows // _BLOCK == columns // _BLOCK + ahead
+                here = rows // size == columns // size + ahead
                 blocks_of[tuple(w[here] for w in where)] = value[here]
         diagonal, beside = np.empty_like(lower), np.zeros_like(lower)
         for k in range(blocks - 1, -1, -1):
-            inverse = solve_triangular(lower[k], np.eye(_BLOCK), lower=True, check_finite=False)
+            inverse = solve_triangular(lower[k], np.eye(size), lower=True, check_finite=False)
             diagonal[k] = inverse.T @ inverse
             if k + 1 < blocks:
                 gain = below[k] @ inverse  # (next, this): x_this = ... - gain^T x_next

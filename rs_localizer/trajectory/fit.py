@@ -24,6 +24,7 @@ from rs_localizer.trajectory.normal_kernels import (
     Terms,
     accumulate,
     add_smoothness,
+    eliminate_stamps,
     look,
     squared_errors,
 )
@@ -37,12 +38,10 @@ _SCALE_LIMIT = 4.0
 # Median of a squared error in two dimensions, in variances.
 _MEDIAN = 2.0 * np.log(2.0)
 _LEAST_DEVIATION = 1e-4  # px; recordings without noise are simulated
-_ROUNDS, _STEPS, _MOST_DAMPINGS = 6, 8, 6
+_ROUNDS, _STEPS, _MOST_DAMPINGS = 8, 20, 6
 # A round ends when a step lowers the cost by less than this; the rounds when the noise settles.
 _LEAST_GAIN, _SETTLED = 0.02, 0.01
 _FIRST_DAMPING = 1e-8
-# A first lens is right to about this much: focal lengths and centre in px per px, distortion.
-_LENS_DEVIATIONS = (0.3, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +53,7 @@ class Observations:
     pixels: Array  # (n,2) raw
     landmarks: Array  # (p,3) m, map frame
     points: IntArray  # (n,) rows of ``landmarks``
-    frames: IntArray  # (n,) number of the frame
+    frames: IntArray  # (n,) number of the image, rising
     trusted: BoolArray  # (n,) inliers of their frame alone
 
     def subset(self, chosen: BoolArray) -> Observations:
@@ -69,7 +68,10 @@ class Freedom:
 
     readout_time: bool = True
     lens: bool = False
+    # Standard deviations of the given lens: focal lengths and centre by focal length, distortion.
+    lens_deviations: tuple[float, float] = (0.02, 0.1)
     landmarks: float = 0.0  # m, standard deviation of their places; 0: they are known
+    stamps: float = 0.0  # s, standard deviation of each image's stamp; 0: they are right
     angular_acceleration: float = 100.0  # rad/s^2, zero-mean prior at each control
     linear_acceleration: float = 50.0  # m/s^2
 
@@ -82,6 +84,7 @@ class State:
     readout_time: float  # s; negative: against the scan direction of the camera
     lens: Array  # (m,) as of lens_values
     landmarks: Array  # (p,3) m
+    delays: Array  # (g,) s, how much later than stamped each image was exposed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +118,13 @@ class Fit:
         return covariances
 
 
-def fit(camera: Camera, observations: Observations, start: State, freedom: Freedom) -> Fit:
+def fit(
+    camera: Camera,
+    observations: Observations,
+    start: State,
+    freedom: Freedom,
+    deviation: float | None = None,
+) -> Fit:
     """The most likely motion and shared numbers.
 
     Args:
@@ -123,21 +132,30 @@ def fit(camera: Camera, observations: Observations, start: State, freedom: Freed
         observations: all keypoints; those not trusted take part once the motion is about right.
         start: first guess; its knots stay.
         freedom: what is estimated.
+        deviation: px, of the noise about the first guess if that is good; otherwise the trusted
+            keypoints have to lead to it.
 
     Raises:
         Undetermined: when the keypoints do not determine what is free.
     """
-    trusted = _Problem(camera, observations.subset(observations.trusted), start, freedom)
-    state, deviation = _settle(trusted, start, None)
-    problem = _Problem(camera, observations, start, freedom)
+    problem, state = _Problem(camera, observations, start, freedom), start
+    if deviation is None:
+        trusted = _Problem(camera, observations.subset(observations.trusted), start, freedom)
+        state, deviation = _settle(trusted, start, trusted.noise(start, np.inf))
     state, deviation = _settle(problem, state, deviation)
     return problem.finish(state, deviation)
 
 
-def _settle(problem: _Problem, state: State, deviation: float | None) -> tuple[State, float]:
+def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time: float) -> float:
+    """The least cost with this readout time (s), to be compared with ``found.cost``."""
+    held = replace(found.freedom, readout_time=False)
+    start = replace(found.state, readout_time=readout_time)
+    problem = _Problem(camera, observations, start, held)
+    return problem.normal(problem.minimise(start, found.deviation), found.deviation)[0]
+
+
+def _settle(problem: _Problem, state: State, deviation: float) -> tuple[State, float]:
     """State and noise when neither changes any more."""
-    if deviation is None:
-        deviation = problem.noise(state, np.inf)
     for _ in range(_ROUNDS):
         state = problem.minimise(state, deviation)
         before, deviation = deviation, problem.noise(state, deviation)
@@ -153,7 +171,7 @@ class _Problem:
         self, camera: Camera, observations: Observations, start: State, freedom: Freedom
     ) -> None:
         self.camera, self.observations, self.freedom = camera, observations, freedom
-        self.start = start
+        self.start_lens = lens_values(camera)
         self.lens_count = len(start.lens) if freedom.lens else 0
         self.slots = np.full(len(start.landmarks), -1)
         if freedom.landmarks > 0.0:
@@ -167,7 +185,8 @@ class _Problem:
 
     def _look(self, state: State) -> tuple[Curve, Sights]:
         seen, spline = self.observations, state.spline
-        first, u = spline.layout.locate(seen.times + state.readout_time * seen.row_times)
+        times = seen.times + state.delays[seen.frames] + state.readout_time * seen.row_times
+        first, u = spline.layout.locate(times)
         curve = Curve(
             spline.rotations, spline.positions, *spline.steps(), float(spline.layout.spacing)
         )
@@ -177,7 +196,7 @@ class _Problem:
         seen_as = project(self.camera, state.lens, ahead, self.lens_column >= 0)
         sights = Sights(
             first, u, seen.row_times, local, velocity, seen_as.pixels - seen.pixels,
-            seen_as.by_ray, seen_as.by_lens, self.slots[seen.points],
+            seen_as.by_ray, seen_as.by_lens, self.slots[seen.points], seen.frames,
         )  # fmt: skip
         return curve, sights
 
@@ -188,6 +207,7 @@ class _Problem:
             0 if self.freedom.readout_time else -1,
             self.lens_column,
             self.point_column,
+            self.freedom.stamps > 0.0,
             deviation**2,
             (_LIMIT * deviation) ** 2,
         )
@@ -210,28 +230,43 @@ class _Problem:
     def normal(self, state: State, deviation: float) -> tuple[float, Normal]:
         """Cost and normal equations."""
         curve, sights = self._look(state)
-        count = CONTROL * len(state.spline.positions)
-        normal = Normal(
-            np.zeros((LOCAL, count)), np.zeros((count, self.border)),
-            np.zeros((self.border, self.border)), np.zeros(count), np.zeros(self.border),
-        )  # fmt: skip
+        normal = self._empty(len(state.spline.positions), sights, len(state.delays))
         cost = accumulate(curve, sights, self._terms(state, deviation), normal)
         cost += add_smoothness(
             curve, state.spline.layout.firsts, float(self.freedom.angular_acceleration),
             float(self.freedom.linear_acceleration), normal,
         )  # fmt: skip
-        return cost + self._add_priors(state, normal), normal
+        cost += self._add_priors(state, normal)
+        if self.freedom.stamps > 0.0:
+            eliminate_stamps(normal)
+        return cost, normal
+
+    def _empty(self, controls: int, sights: Sights, images: int) -> Normal:
+        free = self.freedom.stamps > 0.0
+        first, last = np.zeros(images, np.int64), np.zeros(images, np.int64)
+        if free:
+            begins = np.flatnonzero(np.diff(sights.frames, prepend=-1))
+            first[sights.frames[begins]] = np.minimum.reduceat(sights.first, begins)
+            last[sights.frames[begins]] = np.maximum.reduceat(sights.first, begins)
+        width = LOCAL + CONTROL * int(np.max(last - first, initial=0))
+        # The last images have no more controls behind them.
+        first = np.minimum(first, max(controls - width // CONTROL, 0))
+        count, images, border = CONTROL * controls, images if free else 0, self.border
+        return Normal(
+            np.zeros((width, count)), np.zeros((count, border)), np.zeros((border, border)),
+            np.zeros(count), np.zeros(border), first[:images], np.zeros((images, width)),
+            np.zeros((images, border)), np.zeros(images), np.zeros(images),
+        )  # fmt: skip
 
     def _add_priors(self, state: State, normal: Normal) -> float:
         """What is known of lens and landmarks beforehand."""
         cost = 0.0
         diagonal = np.arange(self.border)
         if self.lens_column >= 0:
-            pinhole = np.full(4, _LENS_DEVIATIONS[0] * self.start.lens[:2].mean())
-            deviations = np.concatenate(
-                [pinhole, np.full(self.lens_count - 4, _LENS_DEVIATIONS[1])]
-            )
-            offset = (state.lens - self.start.lens) / deviations
+            pinhole, distortion = self.freedom.lens_deviations
+            deviations = np.full(self.lens_count, distortion)
+            deviations[:4] = pinhole * self.start_lens[:2].mean()
+            offset = (state.lens - self.start_lens) / deviations
             at = slice(self.lens_column, self.lens_column + self.lens_count)
             normal.border_slope[at] += offset / deviations
             normal.corner[diagonal[at], diagonal[at]] += deviations**-2
@@ -243,10 +278,14 @@ class _Problem:
             normal.border_slope[at] += offset / self.freedom.landmarks
             normal.corner[diagonal[at], diagonal[at]] += self.freedom.landmarks**-2
             cost += float(offset @ offset)
+        if self.freedom.stamps > 0.0:
+            normal.image_information[:] += self.freedom.stamps**-2
+            normal.image_slope[:] += state.delays * self.freedom.stamps**-2
+            cost += float(np.sum((state.delays / self.freedom.stamps) ** 2))
         return cost
 
-    def moved(self, state: State, controls: Array, border: Array) -> State:
-        """The state after a step."""
+    def moved(self, state: State, normal: Normal, controls: Array, border: Array) -> State:
+        """The state after a step that these normal equations led to."""
         readout_time, lens, landmarks = state.readout_time, state.lens, state.landmarks
         if self.freedom.readout_time:
             readout_time = readout_time + float(border[0])
@@ -255,7 +294,13 @@ class _Problem:
         if self.point_column >= 0:
             landmarks = landmarks.copy()
             landmarks[self.free_points] += border[self.point_column :].reshape(-1, 3)
-        return State(state.spline.moved(controls), readout_time, lens, landmarks)
+        delays = state.delays
+        if self.freedom.stamps > 0.0:
+            width = normal.image_controls.shape[1]
+            own = controls[CONTROL * normal.image_first[:, None] + np.arange(width)]
+            pull = np.einsum("gk,gk->g", normal.image_controls, own) + normal.image_border @ border
+            delays = delays - (normal.image_slope + pull) / normal.image_information
+        return State(state.spline.moved(controls), readout_time, lens, landmarks, delays)
 
     def minimise(self, state: State, deviation: float) -> State:
         """The state of least cost near to this one."""
@@ -263,7 +308,7 @@ class _Problem:
         damping = _FIRST_DAMPING
         for _ in range(_STEPS):
             for _ in range(_MOST_DAMPINGS):
-                trial = self.moved(state, *Factored(normal, damping).step())
+                trial = self.moved(state, normal, *Factored(normal, damping).step())
                 trial_cost, trial_normal = self.normal(trial, deviation)
                 if trial_cost < cost + _LEAST_GAIN:  # NaN compares false
                     break
@@ -319,4 +364,5 @@ def start_state(
     camera: Camera, observations: Observations, spline: Spline, readout_time: float = 0.0
 ) -> State:
     """A first guess with the camera's own lens and the map as it is given."""
-    return State(spline, readout_time, lens_values(camera), observations.landmarks.copy())
+    delays = np.zeros(int(observations.frames.max(initial=-1)) + 1)
+    return State(spline, readout_time, lens_values(camera), observations.landmarks.copy(), delays)

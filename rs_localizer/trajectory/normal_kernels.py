@@ -51,16 +51,26 @@ class Sights(NamedTuple):
     by_ray: Array  # (n,2,2)
     by_lens: Array  # (n,2,m)
     slots: IntArray  # (n,) place of the landmark among the free ones; -1: known
+    frames: IntArray  # (n,) number of the image
 
 
 class Normal(NamedTuple):
-    """Normal equations: a band for the controls, a dense border for what all frames share."""
+    """Normal equations: a band for the controls, a dense border for what all images share.
 
-    band: Array  # (24, 6 n) lower band, as LAPACK stores it
+    What the stamp of each image is off (one number) stands beside them until it is eliminated; it
+    touches the w controls that act during the image.
+    """
+
+    band: Array  # (6 w, 6 n) lower band, as LAPACK stores it
     cross: Array  # (6 n, b)
     corner: Array  # (b, b) lower triangle
     slope: Array  # (6 n,)
     border_slope: Array  # (b,)
+    image_first: IntArray  # (g,) first control of each image
+    image_controls: Array  # (g, 6 w)
+    image_border: Array  # (g, b)
+    image_information: Array  # (g,)
+    image_slope: Array  # (g,)
 
 
 class Terms(NamedTuple):
@@ -71,6 +81,7 @@ class Terms(NamedTuple):
     readout_column: int  # of the border; -1: fixed
     lens_column: int  # first of the lens' columns; -1: fixed
     point_column: int  # first of the landmarks' columns; -1: all known
+    stamps_free: bool  # each image has a time of its own
     variance: float  # px^2, of the noise of u and of v
     limit: float  # px^2, where Tukey's weight ends
 
@@ -150,7 +161,7 @@ def accumulate(curve: Curve, sights: Sights, terms: Terms, normal: Normal) -> fl
     """Add the keypoints' part to the normal equations; returns its cost."""
     work, rotation, position = np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3)
     by_point, flow, turn, error = np.empty((2, 3)), np.empty((4, 2)), np.empty(3), np.empty(2)
-    rows, basis = np.zeros((2, LOCAL)), np.empty(3)
+    rows, basis, late = np.zeros((2, LOCAL)), np.empty(3), np.empty(2)
     lenses = sights.by_lens.shape[2] if terms.lens_column >= 0 else 0
     columns, border = np.empty(4 + lenses, np.int64), np.empty((2, 4 + lenses))
     cost = 0.0
@@ -170,8 +181,9 @@ def accumulate(curve: Curve, sights: Sights, terms: Terms, normal: Normal) -> fl
         pose(curve.rotations, curve.positions, curve.vectors, first, sights.u[n], work, rotation,
              position)  # fmt: skip
         cumulative(sights.u[n], 0, basis)
-        count = 0
+        count, image = 0, sights.frames[n]
         for r in range(2):
+            late[r] = flow[2 + r, 0] * flow[0, 0] + flow[2 + r, 1] * flow[0, 1]
             g, p = by_point[r], sights.local[n]
             turn[0] = g[1] * p[2] - g[2] * p[1]
             turn[1] = g[2] * p[0] - g[0] * p[2]
@@ -180,9 +192,7 @@ def accumulate(curve: Curve, sights: Sights, terms: Terms, normal: Normal) -> fl
             count = 0
             if terms.readout_column >= 0:
                 columns[0] = terms.readout_column
-                border[r, 0] = sights.tau[n] * (
-                    flow[2 + r, 0] * flow[0, 0] + flow[2 + r, 1] * flow[0, 1]
-                )
+                border[r, 0] = sights.tau[n] * late[r]
                 count = 1
             for k in range(lenses):
                 columns[count] = terms.lens_column + k
@@ -211,12 +221,46 @@ def accumulate(curve: Curve, sights: Sights, terms: Terms, normal: Normal) -> fl
                 normal.band[a - b, base + b] += x * rows[0, b] + y * rows[1, b]
             for k in range(count):
                 normal.cross[base + a, columns[k]] += x * border[0, k] + y * border[1, k]
+            if terms.stamps_free:
+                place = base + a - CONTROL * normal.image_first[image]
+                normal.image_controls[image, place] += x * late[0] + y * late[1]
+        if terms.stamps_free:
+            x, y = weight * late[0], weight * late[1]
+            normal.image_information[image] += x * late[0] + y * late[1]
+            normal.image_slope[image] += x * error[0] + y * error[1]
+            for k in range(count):
+                normal.image_border[image, columns[k]] += x * border[0, k] + y * border[1, k]
         for k in range(count):
             x, y = weight * border[0, k], weight * border[1, k]
             normal.border_slope[columns[k]] += x * error[0] + y * error[1]
             for j in range(k + 1):  # columns rise
                 normal.corner[columns[k], columns[j]] += x * border[0, j] + y * border[1, j]
     return cost
+
+
+@kernel
+def eliminate_stamps(normal: Normal) -> None:
+    """Take what the images' own times explain out of the normal equations."""
+    width, borders = normal.image_controls.shape[1], normal.image_border.shape[1]
+    for g in range(len(normal.image_first)):
+        share = 1.0 / normal.image_information[g]
+        base, slope = CONTROL * normal.image_first[g], normal.image_slope[g]
+        for a in range(width):
+            x = share * normal.image_controls[g, a]
+            if x == 0.0:
+                continue
+            normal.slope[base + a] -= x * slope
+            for b in range(a + 1):
+                normal.band[a - b, base + b] -= x * normal.image_controls[g, b]
+            for k in range(borders):
+                normal.cross[base + a, k] -= x * normal.image_border[g, k]
+        for k in range(borders):
+            x = share * normal.image_border[g, k]
+            if x == 0.0:
+                continue
+            normal.border_slope[k] -= x * slope
+            for j in range(k + 1):
+                normal.corner[k, j] -= x * normal.image_border[g, j]
 
 
 @kernel

@@ -56,11 +56,11 @@ def first_spline(
     return Spline(layout, np.concatenate(all_rotations), np.concatenate(all_positions))
 
 
-def refined(spline: Spline, spacing: float) -> Spline:
-    """The same motion with other knots."""
+def refined(spline: Spline, spacing: float, intervals: Array | None = None) -> Spline:
+    """The same motion with other knots, over all of it or over parts (s,2) of its time."""
     layout = spline.layout
-    intervals = np.column_stack([layout.starts, layout.ends])
+    if intervals is None:
+        intervals = np.column_stack([layout.starts, layout.ends])
     finer = Layout.over(intervals, spacing)
-    times = finer.control_times()
-    states = spline.states(times)
+    states = spline.states(finer.control_times())
     return Spline(finer, states.rotations, states.positions)

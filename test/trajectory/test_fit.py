@@ -82,7 +82,7 @@ def small_problem(
     )
     state = start_state(camera, seen, spline, READOUT)
     # Weak: its errors are not zero, and second derivatives would count.
-    freedom = Freedom(True, True, 0.01, 1e4, 1e4)
+    freedom = Freedom(True, True, (0.3, 1.0), 0.01, 0.0, 1e4, 1e4)
     _, sights = _Problem(camera, seen, state, freedom)._look(state)
     exact = replace(seen, pixels=pixels + sights.errors)
     return _Problem(camera, exact, state, freedom), state
@@ -107,7 +107,7 @@ def test_the_normal_matrix_is_the_derivative_of_the_slope(direction: str, distor
         for sign in (-1.0, 1.0):
             step = np.zeros(controls + border)
             step[k] = sign * h
-            moved = problem.moved(state, step[:controls], step[controls:])
+            moved = problem.moved(state, normal, step[:controls], step[controls:])
             found = problem.normal(moved, 1.0)[1]
             slopes.append(np.concatenate([found.slope, found.border_slope]))
         numeric = (slopes[1] - slopes[0]) / (2.0 * h)
