@@ -240,6 +240,12 @@ class NodeConfig(LocalizerConfig):
         minimum=0.0,
         maximum=0.2,
     )
+    readout_time_deviation: float = setting(
+        0.0,
+        "Standard deviation of readout_time, in s, as rs_localizer calibrate finds it",
+        minimum=0.0,
+        maximum=0.2,
+    )
     scan_direction: str = setting(
         ScanDirection.TOP_TO_BOTTOM.value,
         "Direction in which the shutter moves over the raw image",

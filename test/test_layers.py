@@ -17,11 +17,12 @@ MAY_IMPORT = {
     "solvers": {"core"},
     "searching": {"core", "config", "solvers"},
     "localizer": {"core", "config", "solvers", "searching"},
+    "trajectory": {"core", "config", "solvers", "localizer", "tracking"},
     "io": {"core"},
     "markers": {"core", "io"},
     "lab": {
         *("core", "config", "solvers", "localizer", "tracking"),
-        *("io", "markers", "matching", "frames", "settings", "arguments"),
+        *("io", "markers", "matching", "frames", "settings", "arguments", "trajectory"),
     },
 }
 ABOVE = {"ros", "cli"}

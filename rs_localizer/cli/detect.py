@@ -106,12 +106,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    marker_map = _map(args)
+    marker_map = find_map(args)
     notices: Counter[str] = Counter()
     config = DetectorConfig(min_side=args.min_side)
     detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
     detector.warm_up()
-    if _is_bag(args.images):
+    if is_bag(args.images):
         with open_bag(args.images) as bag:
             camera = None if args.calibration is None else read_calibration(args.calibration)
             topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
@@ -139,14 +139,14 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
     )
 
 
-def _is_bag(path: Path) -> bool:
+def is_bag(path: Path) -> bool:
     if path.is_dir():
         holds = {file.suffix for file in path.iterdir()}
         return (path / "metadata.yaml").exists() or bool(holds & set(_BAG_SUFFIXES))
     return path.suffix in _BAG_SUFFIXES
 
 
-def _map(args: argparse.Namespace) -> MarkerMap:
+def find_map(args: argparse.Namespace) -> MarkerMap:
     if (args.map is None) == (args.board is None):
         raise UsageError("give either --map or --board")
     if args.map is not None:

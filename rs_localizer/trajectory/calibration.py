@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,7 +14,16 @@ from scipy.stats import chi2
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.banded import Undetermined
-from rs_localizer.trajectory.fit import Fit, Freedom, Observations, State, cost_at, fit, start_state
+from rs_localizer.trajectory.fit import (
+    Fit,
+    Freedom,
+    Observations,
+    State,
+    cost_at,
+    fit,
+    image_speeds,
+    start_state,
+)
 from rs_localizer.trajectory.observe import Observed, Posed, collect, in_order, localize_each
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.stamps import Stamps, examine
@@ -274,3 +284,25 @@ def likelihood(camera: Camera, found: Calibration, count: int = 9) -> tuple[Arra
     values = found.readout_time + np.linspace(-4.0, 4.0, count) * found.formal_deviation
     costs = np.array([cost_at(camera, seen, found.fit, float(value)) for value in values])
     return values, costs - found.fit.cost
+
+
+class Residuals(NamedTuple):
+    """Of the keypoints that fit."""
+
+    row_times: Array  # (n,)
+    speeds: Array  # (n,) px/s, in the image
+    squared_errors: Array  # (n,) px^2
+
+
+def without_readout(camera: Camera, found: Calibration) -> tuple[Residuals, Residuals]:
+    """What a global shutter would leave, and what the readout time leaves."""
+    seen = _within(found.posed.observations, found.fit.state.spline).subset(found.fit.inliers)
+    seen = replace(seen, trusted=np.ones_like(seen.trusted))
+    held = replace(found.fit.freedom, readout_time=False)
+    both = []
+    for value in (0.0, found.readout_time):
+        start = replace(found.fit.state, readout_time=value)
+        both.append(fit(camera, seen, start, held).squared_errors)
+    speeds = image_speeds(camera, seen, found.fit.state)
+    before, after = (Residuals(seen.row_times, speeds, errors) for errors in both)
+    return before, after

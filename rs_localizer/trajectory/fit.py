@@ -154,6 +154,15 @@ def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time
     return problem.normal(problem.minimise(start, found.deviation), found.deviation)[0]
 
 
+def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:
+    """How fast the keypoints (n,) move in their images, px/s."""
+    _, sights = _Problem(camera, observations, state, Freedom())._look(state)
+    local, velocity = sights.local, sights.velocity
+    by_ray = (velocity[:, :2] - velocity[:, 2:] * local[:, :2] / local[:, 2:]) / local[:, 2:]
+    speeds: Array = np.linalg.norm(np.einsum("nij,nj->ni", sights.by_ray, by_ray), axis=1)
+    return speeds
+
+
 def _settle(problem: _Problem, state: State, deviation: float) -> tuple[State, float]:
     """State and noise when neither changes any more."""
     for _ in range(_ROUNDS):
