@@ -311,7 +311,7 @@ class FrameLocalizer:
             result = self._tracker.localize(self._middle_row_ns(cloud.stamp_ns), *given)
         if not result:
             return Refusal(str(result.reason), result.detail)
-        return self._mounted(self._frame(cloud, result, self._calibration.frame))
+        return self.mounted(self._frame(cloud, result, self._calibration.frame))
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""
@@ -362,7 +362,7 @@ class FrameLocalizer:
             estimate=estimate,
         )
 
-    def _mounted(self, frame: Frame) -> Frame | Refusal:
+    def mounted(self, frame: Frame) -> Frame | Refusal:
         """The frame of ``base_frame``, from that of the camera."""
         base = self._config.base_frame
         if base in ("", frame.body_frame):

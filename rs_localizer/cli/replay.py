@@ -20,6 +20,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, open_bag
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Frame, messages
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms import TransformError, make_transform
@@ -33,9 +34,10 @@ from rs_localizer.replay import (
     tf_topics,
 )
 from rs_localizer.settings import NODE_NAME, build, load_params_file, parse_assignment
+from rs_localizer.smoothed_frames import smooth_frames
 
 # What replay writes into its output directory.
-POSES, TWISTS, RESULT = "poses.txt", "twists.txt", "result"
+POSES, TWISTS, RESULT, BRIDGED = "poses.txt", "twists.txt", "result", "bridged.txt"
 # Notices of a frame that could not follow the one before.
 _RESTARTS = ("time_went_back", "map_changed")
 
@@ -79,6 +81,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="the map of the keypoints: as -p map_file:=FILE",
     )
+    offline.add_argument(
+        "--smooth",
+        action="store_true",
+        help="one motion through all images, from those before and after each; images without a "
+        f"pose are bridged where their neighbours determine them, and listed in {BRIDGED}",
+    )
     offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
     graph = parser.add_argument_group("through the ROS graph")
     graph.add_argument(
@@ -87,7 +95,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="publish the recording, with /clock and its /tf, for a live node",
     )
     graph.add_argument(
-        "--rate", type=float, metavar="R", help="times real time, with --ros (default: 1)"
+        "--rate",
+        type=float,
+        metavar="R",
+        help="times real time, with --ros (default: 1); with --smooth: samples of the motion, Hz "
+        "(default: one for each image)",
     )
 
 
@@ -109,33 +121,35 @@ def run(args: argparse.Namespace) -> None:
         transforms = find_transforms(bag, topics, config)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         localizer.load_map()
+        if args.smooth and config.readout_time == 0.0:
+            raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         _prepare(out, args.overwrite)
         _hint(args.bag, args.params)
-        _replay(bag, topics, localizer, notices, out, args.storage)
+        _replay(bag, topics, localizer, notices, out, args.storage, args.smooth, args.rate)
 
 
 def _find_topics(bag: BagReader, args: argparse.Namespace) -> Topics:
-    return find_topics(
-        bag, args.correspondences, args.camera_info, args.keypoints, args.map_points
-    )
+    return find_topics(bag, args.correspondences, args.camera_info, args.keypoints, args.map_points)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
     if args.correspondences is not None and args.keypoints is not None:
         raise UsageError("give --correspondences or --keypoints, not both")
-    if not args.ros:
-        if args.rate is not None:
-            raise UsageError("--rate goes with --ros; offline replay runs at full speed")
-        return
-    given = (args.out, args.params, args.assignments, args.map, args.overwrite)
-    if any(given):
-        raise UsageError(
-            "--out, --overwrite, --params, --map and -p are for offline replay; with --ros the "
-            "running node has the settings and publishes the result"
-        )
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
+    if not args.ros:
+        if args.rate is not None and not args.smooth:
+            raise UsageError(
+                "--rate goes with --ros or --smooth; offline replay runs at full speed"
+            )
+        return
+    given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
+    if any(given):
+        raise UsageError(
+            "--out, --overwrite, --params, --map, --smooth and -p are for offline replay; with "
+            "--ros the running node has the settings and publishes the result"
+        )
 
 
 def _config(params: Path | None, assignments: list[str]) -> NodeConfig:
@@ -161,7 +175,7 @@ def _prepare(out: Path, overwrite: bool) -> None:
     if out.exists() and not _is_ours(out):
         raise ValueError(f"{out} is no result of replay; --overwrite leaves it as it is")
     out.mkdir(parents=True, exist_ok=True)
-    for name in (POSES, TWISTS):
+    for name in (POSES, TWISTS, BRIDGED):
         (out / name).unlink(missing_ok=True)
     if (out / RESULT / "metadata.yaml").exists():  # nothing but a recording is removed
         shutil.rmtree(out / RESULT)
@@ -185,6 +199,8 @@ def _replay(
     notices: Counter[str],
     out: Path,
     storage: str,
+    smooth: bool,
+    rate: float | None,
 ) -> None:
     localizer.warm_up()
     frames: list[Frame] = []
@@ -201,22 +217,43 @@ def _replay(
         for recorded_ns, result in replay(bag, topics, localizer):
             if result:
                 frames.append(result)
-                for name, message in messages(result, writer.make).items():
-                    writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
-                not_sent += not _write_transform(writer, result, localizer, recorded_ns)
+                if not smooth:
+                    not_sent += not _write_frame(writer, result, localizer, recorded_ns)
             else:
                 refused[result.reason] += 1
                 last = f"{result.reason}: {result.detail}"
             bar.update(1 if result or result.reason not in NO_FRAMES else 0)
+        localized = len(frames)
+        if smooth and frames:
+            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
+            smoothed = smooth_frames(localizer, frames, stamps, rate)
+            frames = smoothed.frames
+            for frame in frames:
+                not_sent += not _write_frame(writer, frame, localizer, frame.input_stamp_ns)
+            text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in smoothed.bridged)
+            (out / BRIDGED).write_text(text, encoding="utf-8")
     seconds = time.perf_counter() - start
     repeated = _write_texts(out, frames)
-    _print_summary(total, frames, refused, notices, repeated, not_sent, seconds)
+    _print_summary(total, localized, frames, refused, notices, repeated, not_sent, seconds)
+    if smooth and frames:
+        print(f"{'samples of the smoothed motion':40} {len(frames):8}")
+        print(f"{f'  bridged, listed in {BRIDGED}':40} {len(smoothed.bridged):8}")
+        print(f"{'  left out, not determined':40} {smoothed.undetermined:8}")
     moving = any(frame.twist for frame in frames)
     if frames and not moving:
         print(f"no twists: {_why_no_twists(localizer.config)}")
     print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}")
     if not frames:
         raise ValueError(f"no frame of {bag.path} was localized; of the last one, {last}")
+
+
+def _write_frame(
+    writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
+) -> bool:
+    """Write all messages of a frame; whether its transform could be told."""
+    for name, message in messages(frame, writer.make).items():
+        writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
+    return _write_transform(writer, frame, localizer, recorded_ns)
 
 
 def _write_transform(
@@ -265,6 +302,7 @@ def _quaternion(frame: Frame) -> so3.Array:
 
 def _print_summary(
     total: int,
+    localized: int,
     frames: list[Frame],
     refused: Counter[str],
     notices: Counter[str],
@@ -272,7 +310,7 @@ def _print_summary(
     not_sent: int,
     seconds: float,
 ) -> None:
-    rows = [("frames", total), ("localized", len(frames))]
+    rows = [("frames", total), ("localized", localized)]
     rows += [(f"  refused: {reason}", count) for reason, count in refused.most_common()]
     for name, count in notices.most_common():
         rows.append((f"{'started afresh' if name in _RESTARTS else 'noticed'}: {name}", count))
