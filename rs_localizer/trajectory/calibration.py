@@ -6,24 +6,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.banded import Undetermined
-from rs_localizer.trajectory.fit import (
-    Fit,
-    Freedom,
-    Observations,
-    State,
-    cost_at,
-    fit,
-    image_speeds,
-    start_state,
-)
+from rs_localizer.trajectory.fit import Fit, cost_at, fit
+from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
 from rs_localizer.trajectory.observe import Observed, Posed, collect, in_order, localize_each
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.stamps import Stamps, examine
@@ -165,7 +155,7 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
     """
     spacing = min(LONGEST_SPACING, interval)
     spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
-    seen = _within(posed.observations, spline)
+    seen = within(posed.observations, spline)
     plain = fit(camera, seen, start_state(camera, seen, spline), Freedom())
     found = fit(camera, seen, plain.state, _calm(plain.state, freedom), plain.deviation)
     unsteady = replace(_calm(found.state, freedom), stamps=_FIRST_JITTER * interval)
@@ -201,13 +191,13 @@ def _cheaper(richer: Fit, plainer: Fit, parameters: int) -> bool:
     return (left[0] - left[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
 
 
-def _within(observations: Observations, spline: Spline) -> Observations:
+def within(observations: Observations, spline: Spline) -> Observations:
     """Those keypoints that the motion covers."""
     return observations.subset(spline.layout.inside(observations.times))
 
 
 def _judged(camera: Camera, posed: Posed, stamps: Stamps, found: Fit, images: int) -> Calibration:
-    seen = _within(posed.observations, found.state.spline)
+    seen = within(posed.observations, found.state.spline)
     opposite = cost_at(camera, seen, found, -found.state.readout_time)
     blocks = _blocks(camera, seen, found)
     formal = found.readout_time_deviation
@@ -234,14 +224,15 @@ def _blocks(camera: Camera, observations: Observations, found: Fit) -> tuple[Blo
     blocks = []
     for start, end in pairwise(edges):
         inside = (observations.times >= start) & (observations.times < end)
-        part = observations.subset(inside & found.inliers)
+        # Not only what fits the whole: a part that differs would be left out of its own estimate.
+        part = observations.subset(inside)
         part = replace(part, landmarks=found.state.landmarks)
         state = _cut(found.state, start, end)
-        if state is None or len(part.times) == 0:
+        if state is None or not np.any(part.trusted):
             continue
         held = replace(found.freedom, lens=False, landmarks=0.0)
         try:
-            own = fit(found.camera, part, state, held, found.deviation)
+            own = fit(found.camera, part, state, held)
         except Undetermined:
             continue
         deviation = own.readout_time_deviation
@@ -276,33 +267,3 @@ def _disagreement(blocks: tuple[Block, ...]) -> float:
     # What the blocks disagree in is not their noise: none of them is better than the others.
     scatter = np.std(values, ddof=1) / math.sqrt(len(blocks))
     return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
-
-
-def likelihood(camera: Camera, found: Calibration, count: int = 9) -> tuple[Array, Array]:
-    """Readout times (count,) within four deviations, and what they cost more than the best."""
-    seen = _within(found.posed.observations, found.fit.state.spline)
-    values = found.readout_time + np.linspace(-4.0, 4.0, count) * found.formal_deviation
-    costs = np.array([cost_at(camera, seen, found.fit, float(value)) for value in values])
-    return values, costs - found.fit.cost
-
-
-class Residuals(NamedTuple):
-    """Of the keypoints that fit."""
-
-    row_times: Array  # (n,)
-    speeds: Array  # (n,) px/s, in the image
-    squared_errors: Array  # (n,) px^2
-
-
-def without_readout(camera: Camera, found: Calibration) -> tuple[Residuals, Residuals]:
-    """What a global shutter would leave, and what the readout time leaves."""
-    seen = _within(found.posed.observations, found.fit.state.spline).subset(found.fit.inliers)
-    seen = replace(seen, trusted=np.ones_like(seen.trusted))
-    held = replace(found.fit.freedom, readout_time=False)
-    both = []
-    for value in (0.0, found.readout_time):
-        start = replace(found.fit.state, readout_time=value)
-        both.append(fit(camera, seen, start, held).squared_errors)
-    speeds = image_speeds(camera, seen, found.fit.state)
-    before, after = (Residuals(seen.row_times, speeds, errors) for errors in both)
-    return before, after

@@ -11,7 +11,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
-from rs_localizer.trajectory.fit import Observations
+from rs_localizer.trajectory.model import Observations
 
 
 @dataclass(frozen=True, slots=True, eq=False)

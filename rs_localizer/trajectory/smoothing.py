@@ -11,7 +11,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.sampling import IntArray
 from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import BoolArray, Estimate
-from rs_localizer.trajectory.fit import Fit, Freedom, State, fit, start_state
+from rs_localizer.trajectory.fit import Fit, fit
+from rs_localizer.trajectory.model import Freedom, State, start_state
 from rs_localizer.trajectory.observe import Observed, collect
 from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
 

@@ -11,14 +11,9 @@ import pytest
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored
-from rs_localizer.trajectory.fit import (
-    Freedom,
-    Observations,
-    State,
-    _Problem,
-    fit,
-    start_state,
-)
+from rs_localizer.trajectory.fit import fit
+from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
+from rs_localizer.trajectory.problem import Problem
 from rs_localizer.trajectory.spline import Layout, Spline
 from rs_localizer.trajectory.start import first_spline
 
@@ -60,7 +55,7 @@ def guess(
 
 def small_problem(
     rng: np.random.Generator, direction: str = "top_to_bottom", distortion: str = "plumb_bob"
-) -> tuple[_Problem, State]:
+) -> tuple[Problem, State]:
     """Everything free, and errors of zero."""
     camera = make_camera(scan_direction=direction)
     if distortion == "equidistant":
@@ -83,9 +78,9 @@ def small_problem(
     state = start_state(camera, seen, spline, READOUT)
     # Weak: its errors are not zero, and second derivatives would count.
     freedom = Freedom(True, True, (0.3, 1.0), 0.01, 0.0, 1e4, 1e4)
-    _, sights = _Problem(camera, seen, state, freedom)._look(state)
-    exact = replace(seen, pixels=pixels + sights.errors)
-    return _Problem(camera, exact, state, freedom), state
+    _, parts = Problem(camera, seen, state, freedom).look(state)
+    exact = replace(seen, pixels=pixels + np.concatenate([part.errors for part in parts]))
+    return Problem(camera, exact, state, freedom), state
 
 
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
