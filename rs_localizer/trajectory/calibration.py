@@ -30,13 +30,16 @@ _BLOCK_SECONDS, _MOST_BLOCKS = 3.0, 8
 _DISAGREEMENT = 0.01
 # Blocks whose scatter is this part of the value: the camera may turn its picture.
 _STABILISED = 0.1
+# Images that were not taken at their even stamps may be missing others between them: the mean
+# interval, and with it the readout time, is off by about this part of what they are off.
+_INTERVAL_SHARE = 0.5
 # A readout time is determined to this part of it, or to this many seconds.
 _DETERMINED_SHARE, _DETERMINED = 0.1, 1e-3
 _GLOBAL_SIGMAS = 3.0
-# Standard deviation of the images' own times, by the interval, to begin with.
-_FIRST_JITTER = 0.1
+# Standard deviations of the images' own times, by the interval, to begin with.
+_FIRST_JITTERS = (0.1, 0.3)
 # The prior of the accelerations is so many times their median, and at least this.
-_ACCELERATIONS, _LEAST_ACCELERATION = 3.0, 0.3
+_ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 # Finer knots, or images' own times, must lower the cost by this much per new parameter (Akaike).
 _COST_PER_PARAMETER = 2.0
 
@@ -56,7 +59,7 @@ class Calibration:
     """What a recording says of its camera."""
 
     readout_time: float  # s; negative: against the scan direction that was given
-    deviation: float  # s, with the blocks' disagreement
+    deviation: float  # s, with the blocks' disagreement and doubts of the stamps
     formal_deviation: float  # s, of the noise alone
     blocks: tuple[Block, ...]
     inflation: float  # of the deviation, because the blocks disagree; 1: they do not
@@ -158,8 +161,10 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
     seen = within(posed.observations, spline)
     plain = fit(camera, seen, start_state(camera, seen, spline), Freedom())
     found = fit(camera, seen, plain.state, _calm(plain.state, freedom), plain.deviation)
-    unsteady = replace(_calm(found.state, freedom), stamps=_FIRST_JITTER * interval)
-    other = fit(camera, seen, found.state, unsteady)
+    unsteady, other = _calm(found.state, freedom), found
+    for share in _FIRST_JITTERS:
+        unsteady = replace(unsteady, stamps=share * interval)
+        other = fit(camera, seen, other.state, unsteady)
     if _cheaper(other, found, len(other.state.delays)):
         unsteady = replace(unsteady, stamps=float(np.std(other.state.delays)))
         found = fit(camera, seen, other.state, unsteady, other.deviation)
@@ -204,7 +209,7 @@ def _judged(camera: Camera, posed: Posed, stamps: Stamps, found: Fit, images: in
     inflation = _disagreement(blocks)
     return Calibration(
         readout_time=found.state.readout_time,
-        deviation=formal * inflation,
+        deviation=math.hypot(formal * inflation, _interval_deviation(found, stamps)),
         formal_deviation=formal,
         blocks=blocks,
         inflation=inflation,
@@ -250,6 +255,13 @@ def _cut(state: State, start: float, end: float) -> State | None:
     if len(kept) == 0:
         return None
     return replace(state, spline=refined(state.spline, layout.spacing, kept))
+
+
+def _interval_deviation(found: Fit, stamps: Stamps) -> float:
+    """Of the readout time (s), where stamps are even and the images were not."""
+    unsaid = float(np.var(found.state.delays)) - stamps.jitter**2
+    share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
+    return _INTERVAL_SHARE * share * abs(found.state.readout_time)
 
 
 def _disagreement(blocks: tuple[Block, ...]) -> float:
