@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -38,6 +39,9 @@ _DETERMINED_SHARE, _DETERMINED = 0.1, 1e-3
 _GLOBAL_SIGMAS = 3.0
 # Standard deviations of the images' own times, by the interval, to begin with.
 _FIRST_JITTERS = (0.1, 0.3)
+# Less than this does no harm, and may be a motion that the knots do not follow.
+_LEAST_JITTER = 0.03
+_LEAST_STAMPS = 1e-5  # s
 # The prior of the accelerations is so many times their median, and at least this.
 _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 # Finer knots, or images' own times, must lower the cost by this much per new parameter (Akaike).
@@ -161,17 +165,30 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
     seen = within(posed.observations, spline)
     plain = fit(camera, seen, start_state(camera, seen, spline), Freedom())
     found = fit(camera, seen, plain.state, _calm(plain.state, freedom), plain.deviation)
-    unsteady, other = _calm(found.state, freedom), found
+    with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
+        other = _unsteady(camera, seen, found, interval, freedom)
+        delays = other.state.delays
+        if np.std(delays) > _LEAST_JITTER * interval and _cheaper(other, found, len(delays)):
+            found = other
+    with suppress(Undetermined):
+        state = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
+        finer = fit(camera, seen, state, found.freedom, found.deviation)
+        added = 6 * (len(finer.state.spline.positions) - len(found.state.spline.positions))
+        if _cheaper(finer, found, added):
+            found = finer
+    return found
+
+
+def _unsteady(
+    camera: Camera, seen: Observations, found: Fit, interval: float, freedom: Freedom
+) -> Fit:
+    """With a time of its own for each image, from tight to loose to what they turn out to be."""
+    own, other = _calm(found.state, freedom), found
     for share in _FIRST_JITTERS:
-        unsteady = replace(unsteady, stamps=share * interval)
-        other = fit(camera, seen, other.state, unsteady)
-    if _cheaper(other, found, len(other.state.delays)):
-        unsteady = replace(unsteady, stamps=float(np.std(other.state.delays)))
-        found = fit(camera, seen, other.state, unsteady, other.deviation)
-    state = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
-    finer = fit(camera, seen, state, found.freedom, found.deviation)
-    added = 6 * (len(finer.state.spline.positions) - len(found.state.spline.positions))
-    return finer if _cheaper(finer, found, added) else found
+        own = replace(own, stamps=share * interval)
+        other = fit(camera, seen, other.state, own)
+    own = replace(own, stamps=max(float(np.std(other.state.delays)), _LEAST_STAMPS))
+    return fit(camera, seen, other.state, own, other.deviation)
 
 
 def _calm(state: State, freedom: Freedom) -> Freedom:

@@ -212,8 +212,11 @@ class Problem:
         damping = _FIRST_DAMPING
         for _ in range(steps):
             for _ in range(_MOST_DAMPINGS):
-                trial = self.moved(state, normal, *Factored(normal, damping).step())
-                trial_cost, trial_normal = self.normal(trial, deviation)
+                try:
+                    trial = self.moved(state, normal, *Factored(normal, damping).step())
+                    trial_cost, trial_normal = self.normal(trial, deviation)
+                except Undetermined:  # far from the minimum, rounding may cost definiteness
+                    trial_cost = np.inf
                 if trial_cost < cost + _LEAST_GAIN:  # NaN compares false
                     break
                 damping = max(100.0 * damping, 1e-4)

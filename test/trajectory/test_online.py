@@ -20,7 +20,7 @@ CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D
 
 
 def recording(
-    points: str = "room", seconds: float = 3.0, turn: float = 0.14, noise: float = 1.0
+    points: str = "room", seconds: float = 2.0, turn: float = 0.14, noise: float = 1.0
 ) -> list[projector.Frame]:
     rng = np.random.default_rng(7)
     motion = projector.Motion.random(rng, turn, 0.6 * turn)

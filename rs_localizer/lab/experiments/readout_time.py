@@ -22,7 +22,8 @@ from rs_localizer.trajectory.observe import Observed
 _TRIALS_PER_RECORDING = 50  # 40 recordings at 2000 trials
 _LEAST, _MOST = 8, 40
 _GLOBAL = 8  # every so many-th recording is of a global shutter
-_SECONDS, _RATE, _NOISE, _POINTS = 6.0, 30.0, 0.5, 100
+_RATE, _NOISE, _POINTS = 30.0, 0.5, 100
+_TRIALS_PER_SECOND, _SHORTEST, _LONGEST = 250, 2.0, 6.0  # s of each recording
 _READOUT_TIMES = (0.005, 0.011, 0.017, 0.03)
 _OUTLIERS = (0.0, 0.2, 0.4)
 _WALL_DISTANCE, _WALL_SIZE, _WALL_POINTS = 2.0, 16.0, 40_000  # m, m, one
@@ -55,11 +56,12 @@ def run(context: Context) -> Result:
     """The experiment."""
     count = int(np.clip(context.trials // _TRIALS_PER_RECORDING, _LEAST, _MOST))
     motion = RecordedMotion(read_tum(context.hand_motion))
-    trials = [_trial(motion, k, context.seed) for k in context.track(range(count), count)]
+    seconds = float(np.clip(context.trials / _TRIALS_PER_SECOND, _SHORTEST, _LONGEST))
+    trials = [_trial(motion, seconds, k, context.seed) for k in context.track(range(count), count)]
     moving = [trial for trial in trials if trial.truth > 0.0]
     return Result(
         "Readout time",
-        f"{count} recordings of {_SECONDS:g} s from the recorded motion of a hand, {_RATE:g} "
+        f"{count} recordings of {seconds:g} s from the recorded motion of a hand, {_RATE:g} "
         f"images per second of 640x480, up to {_POINTS} points with {_NOISE:g} px noise in a room "
         "or on one wall, 0 to 40 % outliers, readout times of 5 to 30 ms in all four directions, "
         "and global shutters; lens known to 2 %, estimated along.",
@@ -75,7 +77,7 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def _trial(motion: RecordedMotion, k: int, seed: int) -> Trial:
+def _trial(motion: RecordedMotion, seconds: float, k: int, seed: int) -> Trial:
     rng = np.random.default_rng([seed, k])
     truth = 0.0 if k % _GLOBAL == _GLOBAL - 1 else _READOUT_TIMES[k % len(_READOUT_TIMES)]
     direction = list(ScanDirection)[(k // 2) % 4]
@@ -87,7 +89,7 @@ def _trial(motion: RecordedMotion, k: int, seed: int) -> Trial:
         D=np.array([-0.1, 0.05, 0.001, 0.001, 0.0]),
     )  # fmt: skip
     stamps = frame_stamps(motion, camera, _RATE)
-    wanted = int(_SECONDS * _RATE)
+    wanted = int(seconds * _RATE)
     first = int(rng.integers(len(stamps) - wanted)) if scene == "room" else 0
     stamps = stamps[first : first + wanted]
     settings = FrameSettings(points=_POINTS, noise=_NOISE, outliers=outliers, rate=_RATE)
