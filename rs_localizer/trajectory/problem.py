@@ -40,7 +40,6 @@ _LEAST_GAIN = 0.02  # of the cost; a step that brings less is the last one
 _FIRST_DAMPING = 1e-8
 # Kernels and OpenCV leave the interpreter free for each other.
 _PARTS = 2
-_WORKERS = ThreadPoolExecutor(_PARTS, "trajectory")
 # What parts of a recording add to the normal equations.
 _SUMS = tuple(name for name in Normal._fields if name != "image_first")
 
@@ -56,6 +55,7 @@ class Problem:
         # The parts are always the same, whatever the number of workers: so is every sum.
         edges = np.linspace(0, len(observations.times), _PARTS + 1).astype(int)
         self._parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
+        self._workers = ThreadPoolExecutor(_PARTS)  # of its own: threads do not survive a fork
         self._last: tuple[State, Curve, list[Sights]] | None = None
         self.lens_count = len(start.lens) if freedom.lens else 0
         self.slots = np.full(len(start.landmarks), -1)
@@ -75,7 +75,7 @@ class Problem:
             curve = Curve(
                 spline.rotations, spline.positions, *spline.steps(), float(spline.layout.spacing)
             )
-            parts = list(_WORKERS.map(lambda part: self._part(state, curve, part), self._parts))
+            parts = list(self._workers.map(lambda part: self._part(state, curve, part), self._parts))
             self._last = state, curve, parts
         return self._last[1:]
 
@@ -126,7 +126,7 @@ class Problem:
         curve, parts = self.look(state)
         terms = self.terms(state, deviation)
         normals = self._empty(len(state.spline.positions), parts, len(state.delays))
-        costs = _WORKERS.map(
+        costs = self._workers.map(
             lambda sights, normal: accumulate(curve, sights, terms, normal), parts, normals
         )
         cost, normal = sum(costs), normals[0]

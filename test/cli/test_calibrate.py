@@ -30,7 +30,7 @@ def test_the_webcam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     values = load_params_file(out)
     # A third of the interval, by single poses (see ATTRIBUTION.md); its stamps are not its own.
     assert 0.010 < values["readout_time"] < 0.015
-    assert 0.0 < values["readout_time_deviation"] < 1e-3
+    assert 0.0 < values["readout_time_deviation"] < 2e-3
     assert values["scan_direction"] == "top_to_bottom"
     assert "beside their stamps" in capsys.readouterr().out
     camera = read_calibration(tmp_path / "webcam_camera_info.yaml")

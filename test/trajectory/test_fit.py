@@ -13,6 +13,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored
 from rs_localizer.trajectory.fit import fit
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
+from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.problem import Problem
 from rs_localizer.trajectory.spline import Layout, Spline
 from rs_localizer.trajectory.start import first_spline
@@ -83,19 +84,25 @@ def small_problem(
     return Problem(camera, exact, state, freedom), state
 
 
+def as_dense(normal: Normal) -> np.ndarray:
+    """The whole symmetric matrix of normal equations."""
+    controls, border = normal.cross.shape
+    dense = np.zeros((controls + border, controls + border))
+    for d in range(len(normal.band)):
+        k = np.arange(controls - d)
+        dense[k + d, k] = normal.band[d, : controls - d]
+    dense[controls:, :controls] = normal.cross.T
+    dense[controls:, controls:] = normal.corner
+    return np.tril(dense) + np.tril(dense, -1).T
+
+
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
 @pytest.mark.parametrize("distortion", ["plumb_bob", "equidistant"])
 def test_the_normal_matrix_is_the_derivative_of_the_slope(direction: str, distortion: str) -> None:
     problem, state = small_problem(np.random.default_rng(0), direction, distortion)
     _, normal = problem.normal(state, 1.0)
     controls, border = len(normal.slope), problem.border
-    dense = np.zeros((controls + border, controls + border))
-    for d in range(24):
-        k = np.arange(controls - d)
-        dense[k + d, k] = normal.band[d, : controls - d]
-    dense[controls:, :controls] = normal.cross.T
-    dense[controls:, controls:] = normal.corner
-    dense = np.tril(dense) + np.tril(dense, -1).T
+    dense = as_dense(normal)
     for k in range(controls + border):
         h = 1e-6 / np.sqrt(dense[k, k] + 1e-12) * 30.0
         slopes = []
@@ -114,14 +121,7 @@ def test_steps_and_covariances_are_those_of_the_dense_system() -> None:
     problem, state = small_problem(np.random.default_rng(1))
     _, normal = problem.normal(state, 1.0)
     normal.slope[:] = np.random.default_rng(2).normal(size=len(normal.slope))
-    controls = len(normal.slope)
-    dense = np.zeros((controls + problem.border,) * 2)
-    for d in range(24):
-        k = np.arange(controls - d)
-        dense[k + d, k] = normal.band[d, : controls - d]
-    dense[controls:, :controls] = normal.cross.T
-    dense[controls:, controls:] = normal.corner
-    dense = np.tril(dense) + np.tril(dense, -1).T
+    controls, dense = len(normal.slope), as_dense(normal)
     inverse = np.linalg.inv(dense)
     factored = Factored(normal)
     inner, border = factored.step()
@@ -196,3 +196,20 @@ def test_a_wrong_lens_and_a_bent_board_are_found() -> None:
     assert abs(found.state.readout_time - READOUT) < 4.0 * found.readout_time_deviation < 4e-4
     assert found.camera.K[0, 0] == pytest.approx(projector.FOCAL, rel=3e-3)
     assert found.deviation == pytest.approx(0.1, rel=0.1)
+
+
+def test_images_with_times_of_their_own() -> None:
+    """Stamps that are 3 ms off: without the images' own times the readout time pays for it."""
+    rng = np.random.default_rng(6)
+    motion, camera = projector.Motion.random(rng), make_camera()
+    frames = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=3.0)
+    late = rng.normal(0.0, 3e-3, len(frames))
+    stamped = [replace(f, stamp=f.stamp - d) for f, d in zip(frames, late, strict=True)]
+    seen = observe(camera, stamped)
+    start = start_state(camera, seen, guess(rng, motion, frames))
+    found = fit(camera, seen, start, Freedom(stamps=3e-3))
+    assert abs(found.state.readout_time - READOUT) < 4.0 * found.readout_time_deviation < 4e-4
+    delays = found.state.delays
+    assert np.corrcoef(delays[5:-5], late[5:-5])[0, 1] > 0.95
+    plain = fit(camera, seen, start, Freedom())
+    assert plain.deviation > 1.2 * found.deviation
