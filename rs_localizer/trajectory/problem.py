@@ -75,8 +75,10 @@ class Problem:
             curve = Curve(
                 spline.rotations, spline.positions, *spline.steps(), float(spline.layout.spacing)
             )
-            parts = list(self._workers.map(lambda part: self._part(state, curve, part), self._parts))
-            self._last = state, curve, parts
+            parts = list(
+                self._workers.map(lambda part: self._part(state, curve, part), self._parts)
+            )
+            self._last = state, curve, list(parts)
         return self._last[1:]
 
     def _part(self, state: State, curve: Curve, part: slice) -> Sights:
