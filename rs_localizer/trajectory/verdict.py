@@ -38,6 +38,12 @@ def refusal(found: Calibration) -> str:
             f"not observable: parts of the recording disagree ({_blocks(found)} ms); is image "
             "stabilisation on?"
         )
+    if found.jitter > _MOST_JITTER and found.deviation > 2.0 * found.formal_deviation:
+        return (
+            f"not observable: {value:.1f} +- {deviation:.1f} ms; images were exposed "
+            f"{1e3 * found.jitter:.1f} ms rms beside their stamps: record with the camera's own "
+            "time stamps, without losing images"
+        )
     return (
         f"not observable: {value:.1f} +- {deviation:.1f} ms; move the camera faster, turn it to "
         "and fro about all axes, and for longer"
