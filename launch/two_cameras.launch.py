@@ -3,31 +3,27 @@
 ros2 launch rs_localizer two_cameras.launch.py left:=front right:=rear left_params_file:=front.yaml
 """
 
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.substitutions import FindPackageShare
+from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
-
-
-def share(*path: str) -> PathJoinSubstitution:
-    """A file that the package installs."""
-    return PathJoinSubstitution([FindPackageShare("rs_localizer"), *path])
+from rs_localizer.ros.launching import argument, share
 
 
 def generate_launch_description() -> LaunchDescription:
-    """localizer.launch.py twice; each node has the topics of its namespace: /left/camera_info."""
-    actions = []
+    """localizer.launch.py twice; each node has the topics of its namespace: /left/camera_info.
+
+    Settings that are given, as use_sim_time:=true or base_frame:=base_link, are those of both.
+    """
+    actions: list = []
     for camera in ("left", "right"):
         actions += [
-            DeclareLaunchArgument(
-                camera, default_value=camera, description=f"namespace of the {camera} camera"
-            ),
-            DeclareLaunchArgument(
+            argument(camera, camera, f"namespace of the {camera} camera"),
+            argument(
                 f"{camera}_params_file",
-                default_value=share("config", "rs_localizer.yaml"),
-                description=f"parameters of the {camera} camera's node",
+                share("config", "rs_localizer.yaml"),
+                f"parameters of the {camera} camera's node",
             ),
         ]
     actions += [

@@ -1,21 +1,27 @@
 """Rolling-shutter absolute pose: the camera's pose and velocities from 2D-3D correspondences."""
 
 import importlib
-from typing import TYPE_CHECKING
 
+TYPE_CHECKING = False  # type checkers take it for typing's, which takes milliseconds to import
 if TYPE_CHECKING:
-    from rs_localizer.config import LocalizerConfig, VelocityPrior
+    from rs_localizer.config import Acceleration, LocalizerConfig, VelocityPrior
     from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection
     from rs_localizer.core.prior import Prior
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.types import Estimate, Failure, Reason
+    from rs_localizer.io.calibration import read_calibration
     from rs_localizer.localizer import Localizer
+    from rs_localizer.rectification import rectify
     from rs_localizer.solvers import solve_minimal
+    from rs_localizer.tracking import Tracker
+    from rs_localizer.units import CameraState, camera_state
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Acceleration",
     "Camera",
+    "CameraState",
     "DistortionModel",
     "Estimate",
     "Failure",
@@ -26,7 +32,11 @@ __all__ = [
     "Reason",
     "Roi",
     "ScanDirection",
+    "Tracker",
     "VelocityPrior",
+    "camera_state",
+    "read_calibration",
+    "rectify",
     "solve_minimal",
 ]
 
@@ -34,13 +44,17 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
     # Numba and OpenCV take a second to import. Who imports this package only to start a program
     # does not wait for them, and the program can take Ctrl-C in hand before they come (PEP 562).
     _HOMES = {
-        "config": ("LocalizerConfig", "VelocityPrior"),
+        "config": ("Acceleration", "LocalizerConfig", "VelocityPrior"),
         "core.camera": ("Camera", "DistortionModel", "Roi", "ScanDirection"),
         "core.prior": ("Prior",),
         "core.shutter": ("Motion",),
         "core.types": ("Estimate", "Failure", "Reason"),
+        "io.calibration": ("read_calibration",),
         "localizer": ("Localizer",),
+        "rectification": ("rectify",),
         "solvers": ("solve_minimal",),
+        "tracking": ("Tracker",),
+        "units": ("CameraState", "camera_state"),
     }
 
     def __getattr__(name):

@@ -2,22 +2,42 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import AbstractContextManager
 
+from rs_localizer import threads
 from rs_localizer.stopping import StopSignals
+
+_PROGRAM = "rs_localizer"
 
 
 def run() -> int:
-    """Run the command of the process's arguments; Ctrl-C and SIGTERM end it with one line."""
+    """Run the command of the process's arguments; Ctrl-C and SIGTERM end it with one line.
+
+    Returns:
+        the exit code: 130 after Ctrl-C and 143 after SIGTERM, as of any other program.
+    """
+    threads.limit()
     with StopSignals() as signals:
 
         def importing(name: str) -> AbstractContextManager[None]:
-            return signals.at_once(1, f"{name}: interrupted\n")
+            return signals.at_once(None, f"{name}: interrupted\n")
 
-        with importing("rs_localizer"):
-            from rs_localizer.cli.main import main
-        return main(importing=importing)
+        code = 0
+        try:
+            with importing(_PROGRAM):
+                from rs_localizer.cli.main import main
+            code = main(importing=importing)
+        except KeyboardInterrupt:  # before a command runs
+            sys.stderr.write(f"{_PROGRAM}: interrupted\n")
+    if signals.code:
+        # Python remembers a KeyboardInterrupt that went through an exec() and ends itself by SIGINT
+        # later, whatever the exit code, and after SIGTERM too. Nothing is left to be done.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(signals.code)
+    return code
 
 
 if __name__ == "__main__":

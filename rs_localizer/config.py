@@ -6,7 +6,8 @@ ranges here are what users see in ``ros2 param describe``.
 
 from __future__ import annotations
 
-import math
+import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from numbers import Integral, Real
@@ -50,8 +51,18 @@ def setting(
     maximum: float | None = None,
     choices: tuple[str, ...] = (),
     read_only: bool = False,
+    fixed: bool = False,
 ) -> Any:
-    """A dataclass field with what a user needs to know of it (ranges include their ends)."""
+    """A dataclass field with what a user needs to know of it.
+
+    Args:
+        default: its value, which also says its type.
+        description: one line.
+        minimum, maximum: of a number; they belong to the range.
+        choices: of a text.
+        read_only: it cannot be set while the node runs.
+        fixed: it cannot be set after the node has been configured.
+    """
     return field(
         default=default,
         metadata={
@@ -60,6 +71,7 @@ def setting(
             "maximum": maximum,
             "choices": choices,
             "read_only": read_only,
+            "fixed": fixed,
         },
     )
 
@@ -89,24 +101,27 @@ def _check(config: Any, prefix: str = "") -> None:
 
 
 # Of a velocity prior; anything less would hold the camera still with infinite force.
-_LEAST_DEVIATION = 1e-9
+_LEAST_DEVIATION = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityPrior:
-    """Standard deviations of the zero-mean velocity prior; 0 switches a prior off."""
+    """How fast cameras move: standard deviations of the zero-mean velocity prior.
+
+    Robots, drones and hands; what moves slower is told by the points.
+    """
 
     angular: float = setting(
-        math.radians(10.0),
-        "Standard deviation of the camera's rotation during one readout, in rad; 0: no prior",
+        6.0,
+        "Standard deviation of the camera's angular velocity, in rad/s; 0: no prior",
         minimum=0.0,
-        maximum=10.0,
+        maximum=100.0,
     )
     linear: float = setting(
-        0.1,
-        "Standard deviation of the camera's travel during one readout, in m; 0: no prior",
+        3.0,
+        "Standard deviation of the camera's linear velocity, in m/s; 0: no prior",
         minimum=0.0,
-        maximum=1000.0,
+        maximum=10000.0,
     )
 
     def __post_init__(self) -> None:
@@ -122,16 +137,16 @@ class VelocityPrior:
 
 @dataclass(frozen=True, slots=True)
 class Acceleration:
-    """How fast the camera changes its velocities, for the prediction of the next frame."""
+    """How fast cameras change their velocities, within a readout and from frame to frame."""
 
     angular: float = setting(
-        6.0,
+        10.0,
         "Standard deviation of the camera's angular acceleration, in rad/s^2",
         minimum=0.001,
         maximum=10000.0,
     )
     linear: float = setting(
-        3.0,
+        4.0,
         "Standard deviation of the camera's linear acceleration, in m/s^2",
         minimum=0.001,
         maximum=10000.0,
@@ -222,11 +237,38 @@ class LocalizerConfig:
         0, "Seed of the random samples; every frame starts from it", minimum=0, maximum=2**31 - 1
     )
     velocity_prior: VelocityPrior = field(default_factory=VelocityPrior)
+    acceleration: Acceleration = field(default_factory=Acceleration)
+    map_deviation: float = setting(
+        0.0,
+        "How well the points of the map are known, in m (one standard deviation; neighbours are "
+        "assumed to be off together)",
+        minimum=0.0,
+        maximum=1000.0,
+    )
 
     def __post_init__(self) -> None:
         _check(self)
-        if not isinstance(self.velocity_prior, VelocityPrior):
-            raise ValueError(f"velocity_prior must be a VelocityPrior, got {self.velocity_prior!r}")
+        for name, kind in (("velocity_prior", VelocityPrior), ("acceleration", Acceleration)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(
+                    f"{name} must be of type {kind.__name__}, got {getattr(self, name)!r}"
+                )
+
+
+def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
+    """The settings of a localizer by keyword.
+
+    Raises:
+        ValueError: for a value out of range, or a name that is no setting; then with the one that
+            may have been meant.
+    """
+    known = [item.name for item in fields(LocalizerConfig)]
+    for name in settings:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
+            raise ValueError(f"{name!r} is no setting of the localizer; {hint}")
+    return LocalizerConfig(**settings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,15 +310,14 @@ class NodeConfig(LocalizerConfig):
         "Use the previous pose and twist as first guess and prior; needs readout_time and a "
         "rolling-shutter solver",
     )
-    acceleration: Acceleration = field(default_factory=Acceleration)
     base_frame: str = setting(
         "",
         "Frame of the body whose pose and twist are published, connected to the camera by TF; "
         "empty: the camera's optical frame",
-        read_only=True,
+        fixed=True,
     )
     odom_frame: str = setting(
-        "odom", "Frame of the odometry, for publish_tf map_to_odom", read_only=True
+        "odom", "Frame of the odometry, for publish_tf map_to_odom", fixed=True
     )
     publish_tf: str = setting(
         PublishTf.NONE.value,
@@ -295,9 +336,9 @@ class NodeConfig(LocalizerConfig):
         "",
         "Map that keypoints are matched with: a .npz or .ply file or a sparse model of COLMAP; "
         "empty: none, or the one published on map_points",
-        read_only=True,
+        fixed=True,
     )
-    map_frame: str = setting("map", "Frame of the points in map_file", read_only=True)
+    map_frame: str = setting("map", "Frame of the points in map_file", fixed=True)
     matching: Matching = field(default_factory=Matching)
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 

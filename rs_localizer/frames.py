@@ -32,11 +32,12 @@ from rs_localizer.io.maps import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transform_tree import TransformTree
-from rs_localizer.io.transforms import TransformError, Transforms
+from rs_localizer.io.transforms import NotYetError, TransformError, Transforms
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.moments import pose_at, twist_at
 from rs_localizer.mounting import base_pose, base_twist, find_mounting
+from rs_localizer.oddities import oddities
 from rs_localizer.solvers import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -53,10 +54,12 @@ _STILL = Estimate(
     linear_velocity=np.zeros(3),
     inliers=np.zeros(0, dtype=np.bool_),
     residuals=np.zeros(0),
-    covariance=np.zeros((12, 12)),
+    joint_covariance=np.zeros((18, 18)),
     global_shutter_inliers=0,
     iterations=0,
 )
+
+_NO_TRANSFORM = "no_transform"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +79,17 @@ class Refusal:
         return False
 
 
+@dataclass(frozen=True, slots=True)
+class Waiting(Refusal):
+    """A localized frame whose mounting is known for earlier times only.
+
+    It is refused, unless somebody asks for it again.
+    """
+
+    again: Callable[[], Frame | Refusal]
+    patience: float  # s, for which this makes sense
+
+
 class FrameLocalizer:
     """Localizes correspondences, or keypoints by a map, with the latest camera and settings.
 
@@ -87,9 +101,8 @@ class FrameLocalizer:
         config: settings; assigning :attr:`config` changes them from the next frame on.
         notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
             (a recording that starts over), ``map_changed`` (another frame of the points),
-            ``map_replaced``, ``map_incomplete``, ``map_is_camera`` (points in the camera's own
-            frame), ``camera_changed`` and ``too_many_keypoints``. Frames are localized all the
-            same.
+            ``map_replaced``, ``map_incomplete``, ``camera_changed``, ``too_many_keypoints`` and
+            those of :func:`rs_localizer.oddities.oddities`. Frames are localized all the same.
         transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
 
@@ -270,7 +283,9 @@ class FrameLocalizer:
             self._say_if_too_many(keypoints)
             if self._tracker is not None and self._config.matching.gate > 0.0:
                 prior = self._tracker.prediction(self._middle_row_ns(keypoints.stamp_ns))
-                if prior is not None and (result := self._match(keypoints, prior)):
+                result = None if prior is None else self._match(keypoints, prior)
+                # Without its mounting a pose is none the worse.
+                if result or (result is not None and result.reason == _NO_TRANSFORM):
                     return result
         return self._match(keypoints, None)
 
@@ -298,12 +313,8 @@ class FrameLocalizer:
     def _localize(self, cloud: Correspondences) -> Frame | Refusal:
         if self._calibration is None:
             return Refusal("no_camera_info", "no usable camera_info has come yet")
-        if cloud.frame == self._calibration.frame:
-            self._notice(
-                "map_is_camera",
-                f"the points are given in {cloud.frame!r}, which is the camera's own frame: "
-                "header.frame_id of the cloud (or map) must name the frame of x, y, z",
-            )
+        for name, text in oddities(cloud, self._camera, self._calibration.frame).items():
+            self._notice(name, text)
         given = (cloud.points, cloud.pixels, cloud.scores)
         if self._tracker is None:
             result = self._localizer.localize(*given)
@@ -373,10 +384,11 @@ class FrameLocalizer:
         try:
             mounting = find_mounting(self.transforms, frame.body_frame, base, stamp_ns, span_ns)
         except TransformError as error:
-            return Refusal(
-                "no_transform",
-                f"from the camera {frame.body_frame!r} to base_frame {base!r}: {error}",
-            )
+            text = f"from the camera {frame.body_frame!r} to base_frame {base!r}: {error}"
+            if not isinstance(error, NotYetError):
+                return Refusal(_NO_TRANSFORM, text)
+            patience = self._config.transform_tolerance
+            return Waiting(_NO_TRANSFORM, text, lambda: self.mounted(frame), patience)
         return replace(
             frame,
             body_frame=base,
@@ -395,4 +407,4 @@ def _build(
         and config.readout_time > 0.0
         and find_solver(config.solver).rolling_shutter
     )
-    return camera, localizer, Tracker(localizer, config.acceleration) if follows else None
+    return camera, localizer, Tracker(localizer) if follows else None

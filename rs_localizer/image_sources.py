@@ -12,19 +12,20 @@ import numpy as np
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.frames import Refusal
+from rs_localizer.image_clock import ImageClock
 from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.images import Image
-from rs_localizer.io.messages import make_header
+from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.lab.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.lab.video import read_video
 from rs_localizer.marker_frames import read
+from rs_localizer.replay import CARRIED_TYPES, as_tf2
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 SUFFIXES = (".jpg", ".jpeg", ".png")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts")
 
-# A time of 0 means "none" to ROS.
-_START_NS = 1_000_000_000
 # Names of image files that are a time in ns, as EuRoC's and TUM-VI's: from 1973 (before, a name
 # may be a time of today in us) to what a stamp of ROS can hold.
 _EARLIEST_NS, _LATEST_NS = 10**17, 2**31 * 10**9
@@ -41,33 +42,48 @@ class Shot:
     image: Image | Refusal
     camera_info: Any  # sensor_msgs/CameraInfo
     compressed: Any | None  # the image as sensor_msgs/CompressedImage, where it was compressed
+    recorded_ns: int  # when it was recorded; of a file, its stamp
 
 
-def from_video(path: Path, camera: Camera, rate: float) -> Iterator[Shot]:
-    """The images of a video: image ``k`` has the time ``k / rate``.
+@dataclass(frozen=True, slots=True, eq=False)
+class Carried:
+    """A message of a bag that is no image, and that replay will need."""
+
+    topic: str
+    recorded_ns: int
+    message: Any
+
+
+def from_video(path: Path, camera: Camera, clock: ImageClock) -> Iterator[Shot]:
+    """The images of a video.
 
     Raises:
-        ValueError: when it cannot be read.
+        ValueError: when it cannot be read, or has no times and the clock no rate.
     """
-    for index, (jpeg, gray) in enumerate(read_video(path)):
-        stamp_ns = _START_NS + round(index * 1e9 / rate)
-        image = Image(stamp_ns, CAMERA_FRAME, gray)
-        yield _shot(image, camera, jpeg, "jpeg")
+    for jpeg, gray, seconds in read_video(path):
+        now = clock.relative(None if seconds is None else round(1e9 * seconds))
+        if now is None:
+            lost = Refusal("no_time", "OpenCV does not tell its presentation time")
+            yield Shot(lost, make_camera_info(camera, 0), None, 0)
+        else:
+            yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")
 
 
-def from_files(files: list[Path], camera: Camera, rate: float | None) -> Iterator[Shot]:
+def from_files(files: list[Path], camera: Camera, clock: ImageClock) -> Iterator[Shot]:
     """JPEG and PNG files; their names are times in ns, or they follow each other at a rate."""
-    for index, file in enumerate(files):
-        stamp_ns = int(file.stem) if rate is None else _START_NS + round(index * 1e9 / rate)
+    timed = have_times(files)
+    for file in files:
+        now = clock.absolute(int(file.stem)) if timed else clock.relative(None)
+        assert now is not None  # a clock without a rate has refused
         data = file.read_bytes()
         name = "png" if file.suffix.lower() == ".png" else "jpeg"
-        seconds, nanoseconds = divmod(stamp_ns, 10**9)
+        seconds, nanoseconds = divmod(now, 10**9)
         stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
         header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
         found = read(SimpleNamespace(header=header, format=name, data=data))
         if isinstance(found, Refusal):
             found = Refusal(found.reason, f"{file.name}: {found.detail}")
-        yield _shot(found, camera, data, name, stamp_ns)
+        yield _shot(found, camera, data, name, now)
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -82,6 +98,21 @@ def image_files(folder: Path) -> list[Path]:
     if all(file.stem.isdecimal() for file in files):
         return sorted(files, key=lambda file: int(file.stem))
     return sorted(files)
+
+
+def holds_images(path: Path) -> str:
+    """What a path that is no recording holds of images, as ``is a video``; empty: nothing."""
+    if path.is_dir():
+        found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return f"is a folder of {found} images" if found else ""
+    if path.suffix.lower() in SUFFIXES:
+        return "is an image"
+    return "is a video" if path.is_file() and path.suffix.lower() in _VIDEOS else ""
+
+
+def image_topics(bag: BagReader) -> list[str]:
+    """Topics of a bag with images."""
+    return sorted(topic for topic, kind in bag.topics.items() if kind in IMAGE_TYPES)
 
 
 def have_times(files: list[Path]) -> bool:
@@ -111,41 +142,44 @@ def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option
 
 def from_bag(
     bag: BagReader, image_topic: str, info_topic: str | None, camera: Camera | None
-) -> Iterator[Shot]:
-    """The images of a bag, each with the latest CameraInfo (before the first one: the first)."""
-    topics = [image_topic]
+) -> Iterator[Shot | Carried]:
+    """The images of a bag, each with the latest CameraInfo (before the first one: the first).
+
+    Between them comes what replay needs besides: transforms and inertial measurements.
+    """
+    carried = [topic for topic, kind in bag.topics.items() if kind in CARRIED_TYPES]
+    topics = [image_topic, *carried]
     latest: Any = None
     if info_topic is not None:
         topics.append(info_topic)
         latest = next((message for _, _, message in bag.messages([info_topic])), None)
         if latest is None:
             raise SourceError(f"{bag.path} has no message on {info_topic}; give --calibration")
-    for topic, _, message in bag.messages(topics):
+    for topic, recorded_ns, message in bag.messages(topics):
         if topic == info_topic:
             latest = message
-            continue
-        image = read(message)
-        compressed = message if hasattr(message, "format") else None
-        if camera is not None:
-            yield _shot(image, camera, compressed)
+        elif topic in carried:
+            yield Carried(topic, recorded_ns, as_tf2(message))
         else:
-            yield Shot(image, latest, compressed)
+            image = read(message)
+            compressed = message if hasattr(message, "format") else None
+            info = latest
+            if camera is not None:  # the image knows its frame, on which transforms hang
+                frame = str(message.header.frame_id) or CAMERA_FRAME
+                info = make_camera_info(camera, stamp_ns(message), frame)
+            yield Shot(image, info, compressed, recorded_ns)
 
 
 def _shot(
-    image: Image | Refusal,
-    camera: Camera,
-    compressed: Any,
-    name: str | None = None,
-    stamp_ns: int = 0,
+    image: Image | Refusal, camera: Camera, data: bytes, format_: str, stamp: int = 0
 ) -> Shot:
+    """An image of a file."""
     if isinstance(image, Image):
-        stamp_ns = image.stamp_ns
-    if name is not None:
-        compressed = make_message(
-            IMAGE_TYPES[1],
-            header=make_header(make_message, stamp_ns, CAMERA_FRAME),
-            format=name,
-            data=np.frombuffer(compressed, np.uint8),
-        )
-    return Shot(image, make_camera_info(camera, stamp_ns), compressed)
+        stamp = image.stamp_ns
+    compressed = make_message(
+        IMAGE_TYPES[1],
+        header=make_header(make_message, stamp, CAMERA_FRAME),
+        format=format_,
+        data=np.frombuffer(data, np.uint8),
+    )
+    return Shot(image, make_camera_info(camera, stamp), compressed, stamp)

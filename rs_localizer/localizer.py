@@ -2,42 +2,50 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.config import LocalizerConfig
+from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.acceptance import refusal
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.inputs import checked, distinct, median_point
-from rs_localizer.core.mirror import settle
+from rs_localizer.core.observations import Observations
 from rs_localizer.core.posterior import Posterior
 from rs_localizer.core.prior import (
     Prior,
     PriorTerms,
     held_terms,
+    motion_terms,
     state_in,
-    velocity_terms,
     with_measurements,
     with_motion,
 )
-from rs_localizer.core.ransac import Candidate, Observations
+from rs_localizer.core.ransac import Candidate
 from rs_localizer.core.refine import step_between
-from rs_localizer.core.sampling import IntArray, generator
+from rs_localizer.core.sampling import generator
+from rs_localizer.core.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, settle
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.searching import Frame, MotionSearch
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers import Solver, find_solver
 
 # A prediction may be off by this multiple of the inlier threshold.
 _PREDICTION_SCALE = 16.0
-# Squared Mahalanobis distance of a prediction; a chi-squared variable of 12 degrees of freedom
+# Squared Mahalanobis distance of a prediction; a chi-squared variable of 18 degrees of freedom
 # exceeds this once in a million.
-_MOST_INNOVATION = 51.0
+_MOST_INNOVATION = 62.0
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
+# Where the readout time is unknown, that of a slow camera: its motion per readout is the largest.
+_UNKNOWN_READOUT_TIME = 0.03
+# Accelerations change at the pace of two hertz, rad/s.
+_JERK_RATE = 4.0 * math.pi
+# Third derivative of the cubic among the polynomials of the shaking.
+_JERK_OF_CUBIC = 120.0
 # Points farther away than this (m) are faults, and their squares would be infinite.
 _FARTHEST_POINT = 1e9
 
@@ -58,19 +66,11 @@ class Localizer:
     ) -> None:
         if config is not None and settings:
             raise ValueError(f"give either config or settings, got both: {', '.join(settings)}")
-        try:
-            self.config = config or LocalizerConfig(**settings)  # type: ignore[arg-type]
-        except TypeError as error:
-            raise ValueError(f"unknown setting: {error}") from None
+        self.config = config or localizer_config(settings)
         self.camera = camera
         self._solver = find_solver(self.config.solver)
         self._search = MotionSearch(camera, self.config, self._solver)
-        deviations = self.config.velocity_prior
-        self._terms = (
-            velocity_terms(deviations.angular, deviations.linear)
-            if self._solver.rolling_shutter
-            else held_terms()
-        )
+        self._terms, self._assumed = assumptions(camera, self.config, self._solver)
 
     def warm_up(self) -> None:
         """Compile every kernel that :meth:`localize` may need, or load it from the cache."""
@@ -81,7 +81,7 @@ class Localizer:
         depth = 2.0 + np.arange(count) % 3
         points = depth[:, None] * np.column_stack([rays, np.ones(count)])
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-        prior = Prior(motion=still, covariance=1e-4 * np.eye(12), gravity=(0.0, 0.0, 1.0),
+        prior = Prior(motion=still, covariance=1e-4 * np.eye(18), gravity=(0.0, 0.0, 1.0),
                       gravity_deviation=1.0, gravity_in_map=(0.0, 0.0, 1.0))  # fmt: skip
         self.localize(points, pixels, np.arange(count, dtype=np.float64), prior)
         self.localize(points, pixels)
@@ -165,6 +165,7 @@ class Localizer:
             None if scores is None else np.argsort(-scores[usable], kind="stable"),
             terms if prior is None else with_measurements(terms, prior),
             generator(self.config.seed),
+            _with_experience(self._assumed, prior),
         )
 
     def _track(self, frame: Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
@@ -191,10 +192,11 @@ class Localizer:
         return result
 
     def _final(self, frame: Frame, best: Candidate, terms: PriorTerms) -> Posterior:
-        # Unless more is known of this very frame than the velocity prior of the configuration.
-        may_rest = len(terms.informations) == 1 and self._solver.rolling_shutter
+        # Unless more is known of this very frame than the prior of the configuration.
+        may_rest = self._assumed.may_rest and len(terms.informations) == 1
+        assumed = replace(frame.assumed, may_rest=may_rest)
         threshold = self.config.inlier_threshold
-        return settle(frame.observations, best.state, terms, threshold, may_rest)
+        return settle(frame.observations, best.state, terms, threshold, assumed)
 
     def _accept(
         self, frame: Frame, start: Candidate, best: Candidate, posterior: Posterior
@@ -225,9 +227,50 @@ class Localizer:
             translation=state[9:12] - rotation @ frame.centre,
             angular_velocity=state[12:15],
             linear_velocity=state[15:18],
+            angular_acceleration=state[18:21],
+            linear_acceleration=state[21:24],
             inliers=inliers,
             residuals=residuals,
-            covariance=posterior.covariance,
+            joint_covariance=posterior.covariance,
+            shake=posterior.shake,
+            model_error=posterior.model_error,
+            of_shake_sizes=posterior.of_shake_sizes,
+            of_field_sizes=posterior.of_field_sizes,
             global_shutter_inliers=self._search.global_shutter_inliers(frame, start),
             iterations=best.samples,
         )
+
+
+def assumptions(
+    camera: Camera, config: LocalizerConfig, solver: Solver
+) -> tuple[PriorTerms, Assumed]:
+    """What the configuration assumes of motion, camera and map, per readout."""
+    readout_time = camera.readout_time or _UNKNOWN_READOUT_TIME
+    velocity, acceleration = config.velocity_prior, config.acceleration
+    terms = (
+        motion_terms(
+            (velocity.angular * readout_time, velocity.linear * readout_time),
+            (acceleration.angular * readout_time**2, acceleration.linear * readout_time**2),
+        )
+        if solver.rolling_shutter
+        else held_terms()
+    )
+    jerk = acceleration.angular * _JERK_RATE * readout_time**3
+    return terms, Assumed(
+        shake=jerk / _JERK_OF_CUBIC,
+        map_deviation=config.map_deviation,
+        focal_length=camera.focal_length,
+        of_shake_sizes=np.zeros(SHAKE_SIZES),
+        of_field_sizes=np.zeros(FIELD_SIZES),
+        may_rest=solver.rolling_shutter and min(velocity.angular, velocity.linear) > 0.0,
+        rolling=solver.rolling_shutter,
+    )
+
+
+def _with_experience(assumed: Assumed, prior: Prior | None) -> Assumed:
+    """The assumptions and what the frames before say of shaking and model error."""
+    if prior is None or prior.of_shake_sizes is None or prior.of_field_sizes is None:
+        return assumed
+    return replace(
+        assumed, of_shake_sizes=prior.of_shake_sizes, of_field_sizes=prior.of_field_sizes
+    )

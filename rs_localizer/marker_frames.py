@@ -13,12 +13,12 @@ from typing import Any, Literal
 import numpy as np
 
 from rs_localizer.config import DetectorConfig
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.frames import Refusal
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_compressed_image, read_image
 from rs_localizer.io.messages import Make, MessageError
-from rs_localizer.markers.detection import Detections, MarkerDetector
+from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
 from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
@@ -104,7 +104,7 @@ class FrameDetector:
 
     def warm_up(self) -> None:
         """Compile the kernels."""
-        self._detector.warm_up()
+        warm_up()
 
     @property
     def seconds(self) -> tuple[float, float]:

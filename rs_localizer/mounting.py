@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Pose, Twist
 from rs_localizer.io.transforms import Transform, Transforms
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.frames import FrameLocalizer, Refusal
-from rs_localizer.io.bags import BagError, BagReader
+from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transform_tree import TransformTree
@@ -24,6 +25,8 @@ NO_FRAMES = ("bad_camera_info", "bad_map")
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 _OLD_TF_TYPE = "tf/msg/tfMessage"  # of ROS 1 before tf2
+CARRIED_TYPES = (TF_TYPE, _OLD_TF_TYPE, "sensor_msgs/msg/Imu")
+"""Types of topics that a recording made from another one keeps, because replay may need them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +81,11 @@ def find_topics(
     return Topics(camera, None, _find(bag, "keypoints", keypoints), map_points)
 
 
+def has_frames(bag: BagReader) -> bool:
+    """Whether there is anything to localize: a cloud of any kind."""
+    return _INPUTS["correspondences"] in bag.topics.values()
+
+
 def _named(bag: BagReader, name: str) -> list[str]:
     """Topics of the type of an input that end in its name."""
     kind = _INPUTS[name]
@@ -113,6 +121,13 @@ def _find(bag: BagReader, name: str, given: str | None) -> str:
 def tf_topics(bag: BagReader, *types: str) -> list[str]:
     """Those of /tf_static and /tf that the recording has, as one of these types."""
     return [topic for topic in ("/tf_static", "/tf") if bag.topics.get(topic) in types]
+
+
+def as_tf2(message: Any) -> Any:
+    """A message of :data:`CARRIED_TYPES`, in the type that ROS 2 has for it."""
+    if message.__msgtype__ != _OLD_TF_TYPE:
+        return message
+    return make_message(TF_TYPE, transforms=message.transforms)
 
 
 def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> TransformTree:

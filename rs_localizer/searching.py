@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.observations import Observations
 from rs_localizer.core.posterior import WIDEST_GATE
 from rs_localizer.core.prior import PriorTerms, held_terms
-from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, Observations, search
-from rs_localizer.core.sampling import IntArray, Pool, Random
+from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, search
+from rs_localizer.core.sampling import Pool, Random
 from rs_localizer.core.scoring import optimize
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.settling import Assumed
 from rs_localizer.solvers import Solver, find_solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -43,6 +43,7 @@ class Frame:
     ranking: IntArray | None  # observed points from the best to the worst
     terms: PriorTerms  # velocity prior and whatever else is known but the pose
     random: Random
+    assumed: Assumed
 
 
 class MotionSearch:
@@ -51,9 +52,7 @@ class MotionSearch:
     def __init__(self, camera: Camera, config: LocalizerConfig, solver: Solver) -> None:
         self._config = config
         self._solver = solver
-        K, binning = camera.K, camera.binning
-        # In delivered pixels.
-        self._focal_length = math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1])
+        self._focal_length = camera.focal_length
 
     def find(self, frame: Frame) -> tuple[Candidate, Candidate]:
         """The global-shutter start and the motion found from it; the start may not be found."""
@@ -188,7 +187,7 @@ class MotionSearch:
     def global_shutter_inliers(self, frame: Frame, start: Candidate) -> int:
         """How many points a global-shutter pose explains at the inlier threshold."""
         threshold = self._config.inlier_threshold
-        still = np.concatenate([start.state[:12], np.zeros(6)])
+        still = np.concatenate([start.state[:12], np.zeros(12)])
         pose = self.optimize(frame, still, 2.0 * _SCORE_SCALE * threshold, held_terms())
         return int(np.count_nonzero(frame.observations.squared_errors(pose.state) < threshold**2))
 

@@ -42,6 +42,7 @@ class Setting:
     maximum: float | None
     choices: tuple[str, ...]
     read_only: bool
+    fixed: bool  # once the node is configured
 
 
 def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:

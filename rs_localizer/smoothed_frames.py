@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.config import PoseTime
-from rs_localizer.core.sampling import IntArray
+from rs_localizer.core.arrays import IntArray
 from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.outputs import Frame
 from rs_localizer.moments import pose_at, twist_at

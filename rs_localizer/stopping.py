@@ -11,9 +11,13 @@ import os
 import signal
 from collections.abc import Iterator
 from types import FrameType
-from typing import Self
+from typing import ClassVar, Self
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# What shells report of a program that a signal ended: 130 for Ctrl-C, 143 for SIGTERM.
+_SIGNALLED = 128
+INTERRUPTED = _SIGNALLED + signal.SIGINT
+"""Exit code after Ctrl-C."""
 
 
 class _Signals(abc.ABC):
@@ -23,9 +27,13 @@ class _Signals(abc.ABC):
     send theirs at the same time.
     """
 
+    code: ClassVar[int] = 0
+    """What shells report of a program that was ended by the signal that came, to whichever of
+    several that are entered within each other; 0: none has come."""
+
     def __init__(self) -> None:
         self.requested = False
-        self._at_once: tuple[int, str] | None = None
+        self._at_once: tuple[int | None, str] | None = None
 
     def __enter__(self) -> Self:
         for number in _SIGNALS:
@@ -37,7 +45,7 @@ class _Signals(abc.ABC):
             signal.signal(number, signal.SIG_IGN)
 
     @contextlib.contextmanager
-    def at_once(self, code: int = 0, text: str = "") -> Iterator[None]:
+    def at_once(self, code: int | None = 0, text: str = "") -> Iterator[None]:
         """While importing or compiling: a signal ends the process here and now.
 
         Both take long. Compiling cannot be interrupted, and an exception inside an import may be
@@ -45,7 +53,7 @@ class _Signals(abc.ABC):
         written atomically.
 
         Args:
-            code: exit code.
+            code: exit code; None: :attr:`code`.
             text: written to stderr.
         """
         before, self._at_once = self._at_once, (code, text)
@@ -55,6 +63,7 @@ class _Signals(abc.ABC):
             self._at_once = before
 
     def _take(self, number: int, frame: FrameType | None) -> None:
+        _Signals.code = _SIGNALLED + number
         self._leave_if_at_once()
         first, self.requested = not self.requested, True
         if first:
@@ -64,7 +73,7 @@ class _Signals(abc.ABC):
         if self._at_once is not None:
             code, text = self._at_once
             os.write(2, text.encode())
-            os._exit(code)
+            os._exit(self.code if code is None else code)
 
     @abc.abstractmethod
     def _stop(self) -> None:
@@ -88,7 +97,7 @@ class StopRequest(_Signals):
     """
 
     @contextlib.contextmanager
-    def at_once(self, code: int = 0, text: str = "") -> Iterator[None]:
+    def at_once(self, code: int | None = 0, text: str = "") -> Iterator[None]:
         """As of all; what was requested before it is not put off until it is over."""
         with super().at_once(code, text):
             if self.requested:

@@ -2,13 +2,16 @@
 
 A single image sees the camera's velocity only through the shutter, and the linear part badly; two
 poses a frame apart show it well. The tracker is the extended Kalman filter that brings both
-together: its state is the camera's pose and velocities with their covariance, its motion model
-constant velocities under random accelerations, its measurement update the localizer's maximum a
-posteriori estimate with the prediction as prior (an iterated update).
+together: its state is the camera's pose, velocities and accelerations with their covariance, its
+motion model accelerations that fade within a tenth of a second while new ones come (Singer,
+"Estimating optimal tracking filter performance for manned maneuvering targets", 1970), its
+measurement update the localizer's maximum a posteriori estimate with the prediction as prior (an
+iterated update).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +19,20 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
-from rs_localizer.core.prior import Prior
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.model_error import shake_in_the_middle
+from rs_localizer.core.prior import Prior, state_in
+from rs_localizer.core.refine import step_between
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.state import (
+    ANGULAR,
+    ANGULAR_ACCELERATION,
+    LINEAR,
+    LINEAR_ACCELERATION,
+    MOVE,
+    PARAMETERS,
+    TURN,
+)
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers import find_solver
@@ -29,53 +43,133 @@ _LONGEST_GAP = 0.5
 _MOST_FAILURES = 5
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
+# Time (s) in which accelerations fade: hands and drones change them about twice a second.
+_FADING = 0.1
+# What a frame says of shaking and model error fades by this from frame to frame, and counts as part
+# of what an independent frame would say: the next frame shows much the same.
+_MEMORY = 0.95
+_INDEPENDENT = 0.3
+# How fast surprises change the accelerations that are expected (exponent), and how much at most.
+_LEARNING = 0.2
+_MOST_JOLTS = 1e4
+# Below this part of the time of fading the closed form of the noise is rounding errors.
+_SHORT = 0.03
 
-# Blocks of the covariance: camera turn, camera position, angular, linear velocity.
-_PHI, _RHO, _OMEGA, _V = (slice(k, k + 3) for k in (0, 3, 6, 9))
 
+def predict(
+    motion: Motion, covariance: Array, readouts: float, fading: float
+) -> tuple[Motion, Array]:
+    """The motion and its covariance (18,18) some readout times later.
 
-def predict(motion: Motion, covariance: Array, readouts: float) -> tuple[Motion, Array]:
-    """The motion and its covariance (12,12) some readout times later, at constant velocities.
-
-    The pose moves on by ``R exp(readouts omega)`` and ``c + readouts R v``; all four parts of the
-    error are carried to first order into the camera axes of then.
+    Accelerations fade by ``exp(-1)`` in ``fading`` readouts. The pose moves on by ``R exp(theta)``
+    and ``c + R way``; all parts of the error are carried to first order into the camera axes of
+    then.
     """
-    rotation, translation = motion.at(readouts)
-    velocity = motion.linear_velocity_at(readouts)
-    later = Motion(rotation, translation, motion.angular_velocity, velocity)
-    back = so3.exp(-readouts * motion.angular_velocity)  # then_from_now
-    turned = readouts * so3.right_jacobian(readouts * motion.angular_velocity)
-    transport = np.eye(12)
-    transport[_PHI, _PHI] = back
-    transport[_PHI, _OMEGA] = turned
-    transport[_RHO, _RHO] = back
-    transport[_RHO, _PHI] = -readouts * back @ so3.hat(motion.linear_velocity)
-    transport[_RHO, _V] = readouts * back
-    transport[_V, _V] = back
-    transport[_V, _OMEGA] = so3.hat(velocity) @ turned
+    left = math.exp(-readouts / fading)
+    # What a unit of acceleration adds to the velocity and to the way.
+    faster = fading * (1.0 - left)
+    farther = fading * (readouts - faster)
+    angle = readouts * motion.angular_velocity + farther * motion.angular_acceleration
+    way = readouts * motion.linear_velocity + farther * motion.linear_acceleration
+    back = so3.exp(-angle)  # then_from_now
+    turned = so3.right_jacobian(angle)
+    velocity = back @ (motion.linear_velocity + faster * motion.linear_acceleration)
+    later = Motion(
+        back @ motion.rotation,
+        back @ (motion.translation - way),
+        turned @ (motion.angular_velocity + faster * motion.angular_acceleration),
+        velocity,
+        angular_acceleration=left * motion.angular_acceleration,
+        linear_acceleration=left * back @ motion.linear_acceleration,
+    )
+    transport = np.eye(PARAMETERS)
+    transport[TURN, TURN] = back
+    transport[TURN, ANGULAR] = readouts * turned
+    transport[TURN, ANGULAR_ACCELERATION] = farther * turned
+    transport[MOVE, MOVE] = back
+    transport[MOVE, TURN] = -back @ so3.hat(way)
+    transport[MOVE, LINEAR] = readouts * back
+    transport[MOVE, LINEAR_ACCELERATION] = farther * back
+    # Without acceleration the body rate stays what it is, however far the camera turns.
+    mean = farther / readouts
+    transport[ANGULAR, ANGULAR_ACCELERATION] = mean * np.eye(3) + (faster - mean) * turned
+    transport[LINEAR, LINEAR] = back
+    transport[LINEAR, LINEAR_ACCELERATION] = faster * back
+    transport[LINEAR, ANGULAR] = readouts * so3.hat(velocity) @ turned
+    transport[LINEAR, ANGULAR_ACCELERATION] = farther * so3.hat(velocity) @ turned
+    transport[ANGULAR_ACCELERATION, ANGULAR_ACCELERATION] = left * np.eye(3)
+    transport[LINEAR_ACCELERATION, LINEAR_ACCELERATION] = left * back
     return later, transport @ covariance @ transport.T
 
 
 def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:
-    """Covariance (12,12) that random accelerations add to a prediction over ``dt`` s.
+    """Covariance (18,18) that new accelerations add to a prediction over ``dt`` s.
 
-    Those of white noise that changes the velocity by the deviation times ``dt``. An acceleration
-    that is constant from frame to frame would tie the change of velocity to the way, and where the
-    poses are sharp the filter then rings: it takes every deviation of the way twice, to and fro.
+    The deviations are those of the accelerations themselves, at any time (Singer's model in closed
+    form).
     """
-    block = np.array(
-        [[dt**2 / 3.0, 0.5 * dt * readout_time], [0.5 * dt * readout_time, readout_time**2]]
-    )
-    block *= dt**2
-    covariance = np.zeros((12, 12))
-    for deviation, pose, velocity in (
-        (acceleration.angular, _PHI, _OMEGA),
-        (acceleration.linear, _RHO, _V),
-    ):
-        for i, rows in enumerate((pose, velocity)):
-            for j, columns in enumerate((pose, velocity)):
+    x = dt / _FADING
+    if x < _SHORT:
+        # White noise on the acceleration, to first order.
+        upper = [[x**5 / 10.0, x**4 / 4.0, x**3 / 3.0], [0.0, 2.0 * x**3 / 3.0, x**2]]
+        last = 2.0 * x
+    else:
+        e, e2 = math.exp(-x), math.exp(-2.0 * x)
+        upper = [
+            [
+                1.0 - e2 + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * e,
+                e2 + 1.0 - 2.0 * e + 2.0 * x * e - 2.0 * x + x**2,
+                1.0 - e2 - 2.0 * x * e,
+            ],
+            [0.0, 4.0 * e - 3.0 - e2 + 2.0 * x, e2 + 1.0 - 2.0 * e],
+        ]
+        last = 1.0 - e2
+    block = np.array([*upper, [0.0, 0.0, last]])
+    block = np.triu(block) + np.triu(block, 1).T
+    # Way, velocity per readout and acceleration per readout squared of a unit acceleration.
+    units = np.array([_FADING**2, _FADING * readout_time, readout_time**2])
+    block *= np.outer(units, units)
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    angular, linear = (TURN, ANGULAR, ANGULAR_ACCELERATION), (MOVE, LINEAR, LINEAR_ACCELERATION)
+    for deviation, parts in ((acceleration.angular, angular), (acceleration.linear, linear)):
+        for i, rows in enumerate(parts):
+            for j, columns in enumerate(parts):
                 covariance[rows, columns] = deviation**2 * block[i, j] * np.eye(3)
     return covariance
+
+
+def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
+    """The motion without its shaking, its covariance (18,18), and that of the shaking.
+
+    A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
+    somewhere else on it.
+    """
+    values, slopes = shake_in_the_middle(len(estimate.shake))
+    turn, rate = values @ estimate.shake, slopes @ estimate.shake
+    # As if turned back in its own axes: exp(-[-turn]x) R.
+    turned = so3.exp(turn)
+    motion = Motion(
+        turned @ estimate.rotation,
+        turned @ estimate.translation,
+        estimate.angular_velocity - rate,
+        estimate.linear_velocity,
+        angular_acceleration=estimate.angular_acceleration,
+        linear_acceleration=estimate.linear_acceleration,
+    )
+    count = len(estimate.joint_covariance)
+    jacobian = np.eye(PARAMETERS, count)
+    coefficients = (count - PARAMETERS) // 3
+    if coefficients:
+        values, slopes = shake_in_the_middle(coefficients)
+        jacobian[TURN, PARAMETERS:] = -np.kron(values[None], np.eye(3))
+        jacobian[ANGULAR, PARAMETERS:] = -np.kron(slopes[None], np.eye(3))
+    swing = np.zeros((PARAMETERS, PARAMETERS))
+    squares = np.mean(estimate.shake**2, axis=1)
+    if len(squares):
+        values, slopes = shake_in_the_middle(len(squares))
+        swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
+        swing[ANGULAR, ANGULAR] = (slopes**2 @ squares) * np.eye(3)
+    return motion, jacobian @ estimate.joint_covariance @ jacobian.T, swing
 
 
 @dataclass(slots=True)
@@ -85,6 +179,9 @@ class _Track:
     estimate: Estimate
     time_ns: int
     share: float  # of inliers among the points
+    of_shake_sizes: Array  # what all frames so far say of shaking and model error
+    of_field_sizes: Array
+    jolts: float  # how many times the configured accelerations, squared
     failures: int = 0  # frames without a pose since then
 
 
@@ -95,13 +192,12 @@ class Tracker:
         localizer: its camera must have a readout time, because the velocities of one image are
             per readout, and its solver must be one for rolling shutters, because a global shutter
             knows no velocities.
-        acceleration: standard deviations of the camera's accelerations.
 
     Raises:
         ValueError: without a readout time, or with a global-shutter solver.
     """
 
-    def __init__(self, localizer: Localizer, acceleration: Acceleration) -> None:
+    def __init__(self, localizer: Localizer) -> None:
         if not localizer.camera.readout_time > 0.0:
             raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
         if not find_solver(localizer.config.solver).rolling_shutter:
@@ -109,7 +205,6 @@ class Tracker:
                 f"tracking needs velocities, which solver {localizer.config.solver} does not find"
             )
         self.localizer = localizer
-        self.acceleration = acceleration
         self._track: _Track | None = None
 
     def reset(self) -> None:
@@ -125,9 +220,19 @@ class Tracker:
         if not 0.0 < dt <= _LONGEST_GAP:
             return None
         readout_time = self.localizer.camera.readout_time
-        motion, covariance = predict(track.estimate, track.estimate.covariance, dt / readout_time)
-        covariance = covariance + acceleration_covariance(self.acceleration, dt, readout_time)
-        return Prior(motion=motion, covariance=covariance)
+        acceleration = self.localizer.config.acceleration
+        motion, covariance, swing = unshaken(track.estimate)
+        motion, covariance = predict(
+            motion, covariance, dt / readout_time, _FADING / readout_time
+        )
+        covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
+        covariance += swing
+        return Prior(
+            motion=motion,
+            covariance=covariance,
+            of_shake_sizes=track.of_shake_sizes,
+            of_field_sizes=track.of_field_sizes,
+        )
 
     def localize(
         self, time_ns: int, points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None = None
@@ -148,8 +253,39 @@ class Tracker:
                 if self._track.failures >= _MOST_FAILURES:
                     self._track = None
             return result
-        found = float(np.mean(result.inliers))
-        if result.tracked:
-            found = (1.0 - _NEWEST) * share + _NEWEST * found
-        self._track = _Track(result, time_ns, found)
+        self._track = _followed(self._track, prior, result, time_ns)
         return result
+
+
+def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_ns: int) -> _Track:
+    """The track and its newest frame."""
+    share = float(np.mean(found.inliers))
+    if track is None or prior is None:
+        return _Track(found, time_ns, share, found.of_shake_sizes, found.of_field_sizes, 1.0)
+    if found.tracked:
+        share = (1.0 - _NEWEST) * track.share + _NEWEST * share
+    surprise = _surprise(prior, found)
+    return _Track(
+        found,
+        time_ns,
+        share,
+        _MEMORY * track.of_shake_sizes + _INDEPENDENT * found.of_shake_sizes,
+        _MEMORY * track.of_field_sizes + _INDEPENDENT * found.of_field_sizes,
+        float(np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS)),
+    )
+
+
+def _surprise(prior: Prior, found: Estimate) -> float:
+    """How many times farther than predicted the motion has changed, squared; 1 is as predicted.
+
+    The squared step from the prediction to the estimate, in standard deviations of the prediction,
+    is expected to be what the points decide of the parameters.
+    """
+    assert prior.motion is not None
+    assert prior.covariance is not None
+    scale = 1.0 / np.sqrt(np.diag(prior.covariance))
+    information = np.linalg.inv(prior.covariance * np.outer(scale, scale)) * np.outer(scale, scale)
+    step = step_between(state_in(prior.motion, np.zeros(3)), state_in(found, np.zeros(3)))
+    posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
+    expected = PARAMETERS - float(np.einsum("ij,ji->", information, posterior))
+    return float(step @ information @ step) / max(expected, 1.0)

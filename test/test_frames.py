@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.prior import Prior
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.bags import make_message
@@ -71,7 +71,7 @@ class MockLocalizer:
             linear_velocity=MOTION.linear_velocity,
             inliers=np.arange(len(points)) % 2 == 0,
             residuals=pixels[:, 0] - 100.0,
-            covariance=np.eye(12),
+            joint_covariance=np.eye(18),
             global_shutter_inliers=4,
             iterations=10,
         )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.types import Estimate
 from rs_localizer.moments import pose_at, twist_at
 
@@ -19,44 +20,71 @@ TAUS = [-0.5, 0.0, 0.3, -7.0]
 RATES = [0.0, 1e-6, 0.5, 3.0]
 
 
-def estimate(rate: float, seed: int = 0) -> Estimate:
+# Polynomials of the shaking.
+SHAKING = 3
+DEVIATIONS = [0.003, 0.01, 0.02, 0.05, 0.01, 0.02, *[0.002] * SHAKING]
+
+
+def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float = 0.0) -> Estimate:
     rng = np.random.default_rng(seed)
-    root = rng.normal(size=(12, 12)) * np.repeat([0.003, 0.01, 0.02, 0.05], 3)[:, None]
+    size = 3 * len(DEVIATIONS)
+    root = rng.normal(size=(size, size)) / np.sqrt(size) * np.repeat(DEVIATIONS, 3)[:, None]
     direction = rng.normal(size=3)
     return Estimate(
         rotation=Rotation.from_rotvec(rng.normal(size=3)).as_matrix(),
         translation=rng.normal(size=3),
         angular_velocity=rate * direction / np.linalg.norm(direction),
         linear_velocity=rate * rng.normal(size=3),
+        angular_acceleration=acceleration * rng.normal(size=3),
+        linear_acceleration=acceleration * rng.normal(size=3),
+        shake=shake * rng.normal(size=(SHAKING, 3)),
         inliers=np.ones(20, dtype=bool),
         residuals=np.ones(20),
-        covariance=root @ root.T,
+        joint_covariance=root @ root.T,
         global_shutter_inliers=10,
         iterations=100,
     )
 
 
-def disturbed(motion: Motion, error: Array) -> Motion:
-    """The motion with errors in the order of ``Estimate.covariance``, by its definition."""
-    phi, rho, d_omega, d_v = error.reshape(4, 3)
+def disturbed(motion: Estimate, error: Array) -> Estimate:
+    """The motion with errors in the order of its joint covariance, by its definition."""
+    phi, rho, d_omega, d_v, d_alpha, d_a = error[:18].reshape(6, 3)
     map_from_camera = motion.rotation.T
     centre = -map_from_camera @ motion.translation + map_from_camera @ rho
     rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
-    return Motion(
-        rotation,
-        -rotation @ centre,
-        motion.angular_velocity + d_omega,
-        motion.linear_velocity + d_v,
+    return replace(
+        motion,
+        rotation=rotation,
+        translation=-rotation @ centre,
+        angular_velocity=motion.angular_velocity + d_omega,
+        linear_velocity=motion.linear_velocity + d_v,
+        angular_acceleration=motion.angular_acceleration + d_alpha,
+        linear_acceleration=motion.linear_acceleration + d_a,
+        shake=motion.shake + error[18:].reshape(-1, 3),
     )
 
 
-def pose(motion: Motion, tau: float) -> tuple[Array, Array]:
+def shake(motion: Estimate, tau: float) -> Array:
+    """Legendre polynomials of 2 tau, the smaller the higher, less value and slope at 0."""
+    turn = np.zeros(3)
+    for degree, coefficients in enumerate(motion.shake, start=2):
+        series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
+        value, slope = legendre.legval(0.0, series), legendre.legval(0.0, legendre.legder(series))
+        turn += (legendre.legval(2 * tau, series) - value - slope * 2 * tau) * coefficients
+    return turn
+
+
+def pose(motion: Estimate, tau: float) -> tuple[Array, Array]:
     """Rotation map_from_camera and camera centre."""
-    rotation, translation = motion.at(tau)
-    return rotation.T, -rotation.T @ translation
+    angle = tau * motion.angular_velocity + 0.5 * tau**2 * motion.angular_acceleration
+    way = tau * motion.linear_velocity + 0.5 * tau**2 * motion.linear_acceleration
+    map_from_camera = motion.rotation.T
+    turned = Rotation.from_rotvec(angle) * Rotation.from_rotvec(shake(motion, tau))
+    centre = map_from_camera @ (way - motion.translation)
+    return map_from_camera @ turned.as_matrix(), centre
 
 
-def pose_error(motion: Motion, tau: float, error: Array) -> Array:
+def pose_error(motion: Estimate, tau: float, error: Array) -> Array:
     """Displacement, and rotation about fixed map axes, that an error brings."""
     rotation, position = pose(motion, tau)
     turned, moved = pose(disturbed(motion, error), tau)
@@ -64,7 +92,7 @@ def pose_error(motion: Motion, tau: float, error: Array) -> Array:
     return np.concatenate([moved - position, about_fixed_axes])
 
 
-def twist(motion: Motion, tau: float) -> Array:
+def twist(motion: Estimate, tau: float) -> Array:
     """Linear and angular velocity in body axes, by central differences of the poses."""
     step = 1e-5
     before, after, now = pose(motion, tau - step), pose(motion, tau + step), pose(motion, tau)
@@ -74,9 +102,11 @@ def twist(motion: Motion, tau: float) -> Array:
     return np.concatenate([linear, angular])
 
 
-def numerical_jacobian(function: Callable[[Array], Array], step: float) -> Array:
+def numerical_jacobian(
+    function: Callable[[Array], Array], step: float, size: int = 3 * len(DEVIATIONS)
+) -> Array:
     columns = [
-        (function(step * unit) - function(-step * unit)) / (2.0 * step) for unit in np.eye(12)
+        (function(step * unit) - function(-step * unit)) / (2.0 * step) for unit in np.eye(size)
     ]
     return np.array(columns).T
 
@@ -84,20 +114,29 @@ def numerical_jacobian(function: Callable[[Array], Array], step: float) -> Array
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
 def test_pose(rate: float, tau: float) -> None:
-    motion = estimate(rate)
+    motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
     rotation, position = pose(motion, tau)
     result = pose_at(motion, tau)
-    assert np.allclose(result.rotation, rotation, atol=1e-14)
-    assert np.allclose(result.position, position, atol=1e-14)
+    assert np.allclose(result.rotation, rotation, atol=1e-13)
+    assert np.allclose(result.position, position, atol=1e-13)
 
 
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
 def test_twist_is_the_rate_of_change_of_the_pose(rate: float, tau: float) -> None:
-    motion = estimate(rate)
+    motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
     result = twist_at(motion, tau, READOUT_TIME)
     expected = twist(motion, tau)
     assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
+
+
+def test_many_rows_are_single_rows() -> None:
+    motion, taus = estimate(0.5, acceleration=0.1, shake=0.003), np.array([-0.5, 0.0, 0.37])
+    rotations, translations = motion.at_rows(taus)
+    for tau, rotation, translation in zip(taus, rotations, translations, strict=True):
+        map_from_camera, position = pose(motion, tau)
+        assert np.allclose(rotation.T, map_from_camera, atol=1e-13)
+        assert np.allclose(-rotation.T @ translation, position, atol=1e-13)
 
 
 @pytest.mark.parametrize("tau", TAUS)
@@ -105,7 +144,7 @@ def test_twist_is_the_rate_of_change_of_the_pose(rate: float, tau: float) -> Non
 def test_pose_covariance(rate: float, tau: float) -> None:
     motion = estimate(rate)
     jacobian = numerical_jacobian(lambda error: pose_error(motion, tau, error), 1e-5)
-    expected = jacobian @ motion.covariance @ jacobian.T
+    expected = jacobian @ motion.joint_covariance @ jacobian.T
     assert np.allclose(pose_at(motion, tau).covariance, expected, rtol=1e-6, atol=1e-9)
 
 
@@ -113,17 +152,37 @@ def test_pose_covariance(rate: float, tau: float) -> None:
 @pytest.mark.parametrize("rate", RATES)
 def test_twist_covariance(rate: float, tau: float) -> None:
     motion = estimate(rate)
-    jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-3)
-    expected = jacobian @ motion.covariance @ jacobian.T
+    # Polynomials far outside the readout are no shaking.
+    covariance = motion.joint_covariance[:18, :18]
+    motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=covariance)
+    jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-4, 18)
+    expected = jacobian @ motion.joint_covariance @ jacobian.T
     found = twist_at(motion, tau, READOUT_TIME).covariance
     assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("tau", [-0.5, 0.2, 0.5])
+@pytest.mark.parametrize(("acceleration", "shake"), [(0.01, 0.0), (0.0, 0.001), (0.05, 0.001)])
+def test_covariances_of_an_uneven_motion(acceleration: float, shake: float, tau: float) -> None:
+    """To first order of acceleration (the default deviation is 0.01) and shaking."""
+    motion = estimate(0.2, acceleration=acceleration, shake=shake)
+    for found, function, step in (
+        (pose_at(motion, tau).covariance, lambda error: pose_error(motion, tau, error), 1e-5),
+        (twist_at(motion, tau, READOUT_TIME).covariance,
+         lambda error: twist(disturbed(motion, error), tau), 1e-4),
+    ):  # fmt: skip
+        jacobian = numerical_jacobian(function, step)
+        expected = jacobian @ motion.joint_covariance @ jacobian.T
+        scale = np.sqrt(np.diag(expected))
+        assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale),
+                           atol=0.005)  # fmt: skip
+
+
 def test_covariances_cover_what_is_published() -> None:
     # No derivative at all: the scatter of poses and twists of many disturbed motions.
-    motion, tau = estimate(0.5), -0.5
+    motion, tau = estimate(0.5, acceleration=0.01, shake=0.003), -0.5
     rng = np.random.default_rng(3)
-    errors = rng.multivariate_normal(np.zeros(12), 0.01 * motion.covariance, size=4000)
+    errors = rng.multivariate_normal(np.zeros(27), 0.01 * motion.joint_covariance, size=4000)
     poses = np.array([pose_error(motion, tau, error) for error in errors])
     now = twist(motion, tau)
     twists = np.array([twist(disturbed(motion, error), tau) - now for error in errors])

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 import rs_localizer.frames
 from rs_localizer.broadcasts import Broadcast, broadcast
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate
 from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.bags import make_message
@@ -84,7 +84,8 @@ def robot() -> TransformTree:
 
 def estimate() -> Estimate:
     rng = np.random.default_rng(0)
-    root = rng.normal(size=(12, 12)) * np.repeat([0.003, 0.01, 0.02, 0.05], 3)[:, None]
+    deviations = np.repeat([0.003, 0.01, 0.02, 0.05, 0.01, 0.02], 3)
+    root = rng.normal(size=(18, 18)) * deviations[:, None]
     return Estimate(
         rotation=Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(),
         translation=np.array([0.1, -0.2, 2.0]),
@@ -92,7 +93,7 @@ def estimate() -> Estimate:
         linear_velocity=np.array([0.02, 0.05, -0.01]),
         inliers=np.ones(8, dtype=bool),
         residuals=np.ones(8),
-        covariance=root @ root.T,
+        joint_covariance=root @ root.T,
         global_shutter_inliers=4,
         iterations=10,
     )
@@ -100,7 +101,7 @@ def estimate() -> Estimate:
 
 def disturbed(motion: Motion, error: Array) -> Motion:
     """The motion with errors in the order of ``Estimate.covariance``, by its definition."""
-    phi, rho, d_omega, d_v = error.reshape(4, 3)
+    phi, rho, d_omega, d_v, d_alpha, d_a = error.reshape(6, 3)
     map_from_camera = motion.rotation.T
     centre = -map_from_camera @ motion.translation + map_from_camera @ rho
     rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
@@ -109,6 +110,8 @@ def disturbed(motion: Motion, error: Array) -> Motion:
         -rotation @ centre,
         motion.angular_velocity + d_omega,
         motion.linear_velocity + d_v,
+        angular_acceleration=motion.angular_acceleration + d_alpha,
+        linear_acceleration=motion.linear_acceleration + d_a,
     )
 
 
@@ -205,7 +208,7 @@ def localized(result: tuple[Frame | Refusal, NodeConfig]) -> Frame:
 
 
 def covariance(function: Callable[[Array], Array], of: Array, step: float) -> Array:
-    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(12)]
+    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(18)]
     jacobian = np.array(columns).T
     result: Array = jacobian @ of @ jacobian.T
     return result
@@ -248,11 +251,11 @@ def test_every_quantity(
     assert np.allclose(frame.pose.rotation, pose[:3, :3], atol=1e-12)
     assert np.allclose([*frame.twist.linear, *frame.twist.angular], twist, atol=2e-6)
     expected = covariance(
-        lambda error: truth.pose_error(published, error), estimate().covariance, 1e-5
+        lambda error: truth.pose_error(published, error), estimate().joint_covariance, 1e-5
     )
     assert np.allclose(frame.pose.covariance, expected, rtol=1e-6, atol=1e-9)
     expected = covariance(
-        lambda error: truth.twist_error(published, error), estimate().covariance, 1e-3
+        lambda error: truth.twist_error(published, error), estimate().joint_covariance, 1e-3
     )
     assert np.allclose(frame.twist.covariance, expected, atol=1e-5 * np.abs(expected).max())
 
@@ -294,7 +297,7 @@ def test_covariances_cover_what_is_published(localize: Any, robot: TransformTree
     frame = localized(localize(robot))
     truth = Chain(estimate(), middle=5.0 + 0.5 * READOUT_TIME)
     errors = np.random.default_rng(3).multivariate_normal(
-        np.zeros(12), 0.01 * estimate().covariance, size=3000
+        np.zeros(18), 0.01 * estimate().joint_covariance, size=3000
     )
     assert frame.twist is not None
     for function, found in (

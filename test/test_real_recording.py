@@ -6,10 +6,9 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer import data
-from rs_localizer.config import Acceleration
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.observations import Observations
 from rs_localizer.core.prior import PriorTerms, state_in
-from rs_localizer.core.ransac import Observations
 from rs_localizer.core.refine import refine
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
@@ -42,16 +41,16 @@ def residual(camera: Camera, cloud, start: rsl.Motion, velocities) -> tuple[rsl.
         cloud.points - centre, rays, camera.row_time(cloud.pixels), camera.pixel_jacobian(rays),
         camera.row_time_gradient,
     )  # fmt: skip
-    held = np.concatenate([np.eye(3).ravel(), np.zeros(3), velocities])
-    precision = np.diag(np.concatenate([np.zeros(6), np.full(6, 1e12)]))
+    held = np.concatenate([np.eye(3).ravel(), np.zeros(3), velocities, np.zeros(6)])
+    precision = np.diag(np.concatenate([np.zeros(6), np.full(12, 1e12)]))
     state = state_in(start, centre)
-    state[12:] = velocities
+    state[12:] = held[12:]
     state = refine(
         observations.packed, state, camera.row_time_gradient, 1e6, 0.0,
         PriorTerms(precision[None], held[None], np.zeros(7)), 0.1, 2, 50, 1e-6,
     )[0]  # fmt: skip
     rotation = state[:9].reshape(3, 3)
-    motion = rsl.Motion(rotation, state[9:12] - rotation @ centre, state[12:15], state[15:])
+    motion = rsl.Motion(rotation, state[9:12] - rotation @ centre, state[12:15], state[15:18])
     return motion, float(np.sqrt(observations.squared_errors(state).mean()))
 
 
@@ -115,7 +114,7 @@ def test_the_reversed_scan_direction_makes_it_worse_than_a_global_shutter(record
 
 def test_the_tracked_twist_is_that_of_the_poses(recording):
     calibration, clouds = recording
-    tracker = Tracker(rsl.Localizer(calibration.camera(READOUT, "top_to_bottom")), Acceleration())
+    tracker = Tracker(rsl.Localizer(calibration.camera(READOUT, "top_to_bottom")))
     results = [
         tracker.localize(cloud.stamp_ns + round(READOUT / 2 * 1e9), cloud.points, cloud.pixels)
         for cloud in clouds

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rs_localizer.config import DetectorConfig, NodeConfig, VelocityPrior
+from rs_localizer.config import DetectorConfig, NodeConfig, VelocityPrior, localizer_config
 from rs_localizer.settings import (
     SettingsError,
     build,
@@ -159,3 +159,13 @@ def test_assignments_that_are_none(text: str) -> None:
 def test_wrong_values(values: dict[str, Any], fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
         build(values)
+
+
+def test_a_misspelled_keyword_names_the_one_that_was_meant() -> None:
+    assert localizer_config({"seed": 3}).seed == 3
+    with pytest.raises(ValueError, match=r"'inlier_treshold' is no .*did you mean 'inlier_t"):
+        localizer_config({"inlier_treshold": 2.0})
+    with pytest.raises(ValueError, match="'colour' is no setting of the localizer; there are sol"):
+        localizer_config({"colour": 1})
+    with pytest.raises(ValueError, match="solver must be one of p3p"):
+        localizer_config({"solver": "p4p"})

@@ -13,12 +13,14 @@ from tqdm import tqdm
 
 from rs_localizer.arguments import number
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.detect import find_map, is_bag
+from rs_localizer.cli.detect import find_map
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.image_clock import ImageClock
 from rs_localizer.image_sources import (
     IMAGE_TYPES,
     INFO_TYPE,
+    Carried,
     Shot,
     find_topic,
     from_bag,
@@ -27,12 +29,13 @@ from rs_localizer.image_sources import (
     have_times,
     image_files,
 )
-from rs_localizer.io.bags import BagReader, open_bag
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration import read_calibration, write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.map_files import read_map_file
 from rs_localizer.lab.calibration_plots import save_plots
+from rs_localizer.lab.video import has_times
 from rs_localizer.marker_frames import FrameDetector
 from rs_localizer.recordings import read_recording
 from rs_localizer.replay import find_topics
@@ -170,30 +173,41 @@ def _unknown(size: tuple[int, int]) -> Camera:
 
 
 @contextmanager
-def _files(args: argparse.Namespace) -> Iterator[Iterator[Shot]]:
+def _files(args: argparse.Namespace) -> Iterator[Iterator[Shot | Carried]]:
     """The images of a video or folder."""
     path: Path = args.recording
     known = args.calibration is not None
     camera = read_calibration(args.calibration) if known else _unknown((2, 2))
+    clock = ImageClock(args.rate)
     if not path.is_dir():
-        if args.rate is None:
-            raise UsageError("a video has no time stamps: give --rate; the readout time scales "
-                             "with it")  # fmt: skip
-        yield from_video(path, camera, args.rate)
+        if args.rate is None and not has_times(path):
+            raise UsageError("this video has no presentation times: give --rate; the readout time "
+                             "scales with it")  # fmt: skip
+        yield from_video(path, camera, clock)
+        _tell_clock(clock)
         return
     files = image_files(path)
     if args.rate is None and not have_times(files):
         raise UsageError("the names of the files are no times in ns: give --rate")
-    yield from_files(files, camera, args.rate)
+    yield from_files(files, camera, clock)
+    _tell_clock(clock)
 
 
-def _detected(args: argparse.Namespace, shots: Iterator[Shot]) -> _Source:
+def _tell_clock(clock: ImageClock) -> None:
+    print(clock.told())
+    if fault := clock.fault():
+        print(f"warning: {fault}")
+
+
+def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Source:
     """Markers or a board in images."""
     detector = FrameDetector(DetectorConfig(), lambda name, text: None, find_map(args))
     detector.warm_up()
     images: list[Observed] = []
     camera, size, count = None, (0, 0), 0
     for shot in tqdm(shots, unit="image", desc="detect", disable=None):
+        if isinstance(shot, Carried):
+            continue
         count += 1
         if not isinstance(shot.image, Image):
             continue

@@ -35,7 +35,6 @@ from rs_localizer.lab.true_motion import RecordedMotion
 from rs_localizer.settings import build, load_params_file
 
 _GLOBAL, _ROLLING = "global_shutter", "rolling_shutter"
-_NAMES = {_ROLLING: "rolling shutter", _GLOBAL: "P3P (one pose per image)"}
 # The part of the hand's motion that is flown (s): it begins slowly and ends in quick turns.
 _FLIGHT_START, _FLIGHT_DURATION = 8.0, 18.0
 _FLIGHT_CAMERA = Camera(
@@ -78,6 +77,7 @@ def run(args: argparse.Namespace) -> None:
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     methods = {_ROLLING: {"solver": args.solver}, _GLOBAL: {"solver": "p3p"}}
+    names = {_ROLLING: args.solver, _GLOBAL: "p3p (one pose per image)"}
     with tempfile.TemporaryDirectory() as directory, session_type(Path(directory)) as session:
         print(f"two live nodes below {session.namespace}: solver {args.solver} and solver p3p")
         most = _QUICK_FRAMES if args.quick else None
@@ -95,10 +95,10 @@ def run(args: argparse.Namespace) -> None:
             total = len(recording.clouds)
             with tqdm(total=total, unit="frame", desc=title, disable=None) as bar:
                 answers = session.play(recording, readout_time, methods, bar.update)
-            results = {_NAMES[name]: compare(answers[name], recording.truth) for name in methods}
+            results = {names[name]: compare(answers[name], recording.truth) for name in methods}
             acts.append(Act(recording, readout_time, results))
             print(f"\n{table(title, recording, results)}", flush=True)
-        by_us, by_p3p = _NAMES[_ROLLING], _NAMES[_GLOBAL]
+        by_us, by_p3p = names[_ROLLING], names[_GLOBAL]
         print(scene.draw(cube, acts[2].results, by_us, by_p3p, args.out / CUBE))
         print(f"\n{args.out / CUBE}")
         for name, figure in _pictures(*acts[:2]).items():

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import shlex
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +19,11 @@ from rs_localizer.cli import UsageError
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.detect import Recorded, record
+from rs_localizer.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.image_sources import (
     IMAGE_TYPES,
     INFO_TYPE,
+    Carried,
     Shot,
     find_topic,
     from_bag,
@@ -28,17 +32,26 @@ from rs_localizer.image_sources import (
     have_times,
     image_files,
 )
-from rs_localizer.io.bags import STORAGES, open_bag
-from rs_localizer.io.calibration import read_calibration
+from rs_localizer.io.bags import STORAGES, is_bag, open_bag
+from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.whole import told
 from rs_localizer.lab.recording import PARAMETERS, write_parameters
+from rs_localizer.lab.video import has_times
 from rs_localizer.marker_frames import FrameDetector
+from rs_localizer.markers.consistency import other_units
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Chessboard
+from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
 from rs_localizer.settings import settings
 
-_BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+_CHESSBOARD, _CIRCLES, _ASYMMETRIC = "chessboard", "circles", "asymmetric_circles"
+_INVERTED = "inverted_"
+_PATTERNS = [
+    inverted + kind
+    for inverted in ("", _INVERTED)
+    for kind in (_CHESSBOARD, _CIRCLES, _ASYMMETRIC)
+]
 # A board on its own is the map: its first corner is the origin, x along the rows, y from row to
 # row, z away from the viewer.
 _BOARD_AXES = np.diag([1.0, -1.0, -1.0])
@@ -55,10 +68,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     markers = parser.add_argument_group("what to look for")
     markers.add_argument("--map", type=Path, metavar="FILE", help="marker map")
     markers.add_argument(
-        "--board", metavar="6x4", help="instead: a chessboard, inner corners along a row x rows"
+        "--board",
+        metavar="6x4",
+        help="instead: a board, inner corners (or circles) along a row x rows",
+    )
+    markers.add_argument(
+        "--pattern",
+        choices=_PATTERNS,
+        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
     )
     above = number(0.0, above=True)
-    markers.add_argument("--square", type=above, metavar="M", help="side of its squares")
+    markers.add_argument(
+        "--square",
+        type=above,
+        metavar="M",
+        help="side of its squares in metres, or distance of its rows of circles",
+    )
     markers.add_argument(
         "--min-side",
         type=number(0.0),
@@ -71,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--calibration",
         type=Path,
         metavar="FILE",
-        help="YAML of ROS' camera_calibration or of BoofCV (default: the bag's camera_info)",
+        help=f"{CALIBRATION_KINDS} (default: the bag's camera_info)",
     )
     longest = settings()["readout_time"].maximum or 0.0
     camera.add_argument(
@@ -90,7 +115,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate",
         type=above,
         metavar="HZ",
-        help="images per second of a video, or of files whose names are no times in ns",
+        help="images per second, instead of the presentation times of a video, or for files whose "
+        "names are no times in ns",
+    )
+    camera.add_argument(
+        "--start",
+        type=number(0.0),
+        metavar="S",
+        help="time of the first image of a video or folder (default: "
+        f"{DEFAULT_START_NS * 1e-9:g}, since ROS takes 0 for none; of names that are times, their "
+        "own)",
     )
     bag = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
     bag.add_argument("--image", metavar="TOPIC")
@@ -111,7 +145,11 @@ def run(args: argparse.Namespace) -> None:
     config = DetectorConfig(min_side=args.min_side)
     detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
     detector.warm_up()
+    clock: ImageClock | None = None
     if is_bag(args.images):
+        for name in ("rate", "start"):
+            if getattr(args, name) is not None:
+                raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
         with open_bag(args.images) as bag:
             camera = None if args.calibration is None else read_calibration(args.calibration)
             topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
@@ -120,14 +158,16 @@ def run(args: argparse.Namespace) -> None:
                 info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
             shots = from_bag(bag, topic, info, camera)
             recorded = _record(args, shots, bag.count([topic]), detector)
-        _copy_parameters(args)
     else:
-        shots, total = _files(args)
-        recorded = _record(args, shots, total, detector)
-    if args.readout_time is not None:
-        direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
-        write_parameters(args.out, args.readout_time, direction)
+        start_ns = None if args.start is None else round(args.start * 1e9)
+        clock = ImageClock(args.rate, start_ns)
+        files, total = _files(args, clock)
+        recorded = _record(args, files, total, detector)
+    with told(args.out):
+        _write_parameters(args)
     _tell(args, recorded, notices)
+    _warn(args, recorded, clock)
+    _tell_next(args)
     if args.timing:
         _tell_times(recorded.images, *detector.seconds)
 
@@ -139,54 +179,64 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
     )
 
 
-def is_bag(path: Path) -> bool:
-    if path.is_dir():
-        holds = {file.suffix for file in path.iterdir()}
-        return (path / "metadata.yaml").exists() or bool(holds & set(_BAG_SUFFIXES))
-    return path.suffix in _BAG_SUFFIXES
-
-
 def find_map(args: argparse.Namespace) -> MarkerMap:
     if (args.map is None) == (args.board is None):
         raise UsageError("give either --map or --board")
     if args.map is not None:
-        if args.square is not None:
-            raise UsageError("--square goes with --board")
-        return read_marker_map(args.map)
+        for name in ("square", "pattern"):
+            if getattr(args, name) is not None:
+                raise UsageError(f"--{name} goes with --board")
+        marker_map = read_marker_map(args.map)
+        for fault in other_units(marker_map):
+            print(f"warning: {args.map}: {fault}", file=sys.stderr)
+        return marker_map
     if args.square is None:
         raise UsageError("--board needs --square")
     try:
         columns, rows = (int(word) for word in args.board.split("x"))
     except ValueError:
         raise UsageError(f"--board must be of the form 6x4, got {args.board!r}") from None
-    middle = 0.5 * args.square * np.array([columns - 1, rows - 1, 0])
+    pattern = args.pattern or _CHESSBOARD
+    inverted, kind = pattern.startswith(_INVERTED), pattern.removeprefix(_INVERTED)
     try:
-        board = Chessboard(columns, rows, args.square, Pose(middle, _BOARD_AXES))
+        if kind == _CHESSBOARD:
+            board: Board = Chessboard(columns, rows, args.square, inverted=inverted)
+        else:
+            board = CircleGrid(columns, rows, args.square, kind == _ASYMMETRIC, inverted)
     except ValueError as error:
         raise UsageError(f"--board: {error}") from error
-    return MarkerMap(boards=(board,))
+    # The first corner to the origin.
+    pose = Pose(-_BOARD_AXES @ board.points[0], _BOARD_AXES)
+    marker_map = MarkerMap(boards=(replace(board, pose=pose),))
+    for fault in other_units(marker_map):
+        raise UsageError(f"--square: {fault}")
+    return marker_map
 
 
-def _files(args: argparse.Namespace) -> tuple[Iterator[Shot], int | None]:
+def _files(
+    args: argparse.Namespace, clock: ImageClock
+) -> tuple[Iterator[Shot], int | None]:
     for name in ("image", "camera_info"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
     if args.calibration is None:
         raise UsageError("a video or folder has no camera_info: give --calibration")
     files = image_files(args.images) if args.images.is_dir() else None
-    rate = args.rate
-    if files is not None and rate is None and not have_times(files):
+    if args.rate is None and files is not None and not have_times(files):
         raise UsageError("the names of the files are no times in ns: give --rate")
-    if files is None and rate is None:
-        raise UsageError("a video has no time stamps: give --rate")
+    if args.rate is None and files is None and not has_times(args.images):
+        raise UsageError("this video has no presentation times: give --rate")
     camera: Camera = read_calibration(args.calibration)
     if files is None:
-        return from_video(args.images, camera, rate), None
-    return from_files(files, camera, rate), len(files)
+        return from_video(args.images, camera, clock), None
+    return from_files(files, camera, clock), len(files)
 
 
 def _record(
-    args: argparse.Namespace, shots: Iterator[Shot], total: int | None, detector: FrameDetector
+    args: argparse.Namespace,
+    shots: Iterator[Shot] | Iterator[Shot | Carried],
+    total: int | None,
+    detector: FrameDetector,
 ) -> Recorded:
     with tqdm(total=total, unit="image", desc="detect", disable=None) as progress:
         return record(
@@ -195,14 +245,19 @@ def _record(
             args.out,
             storage=args.storage,
             with_images=args.with_images,
+            scan_direction=args.scan_direction or ScanDirection.TOP_TO_BOTTOM,
             done=progress.update,
+            tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )
 
 
-def _copy_parameters(args: argparse.Namespace) -> None:
-    """The shutter of a recording, as simulate writes it beside its images."""
+def _write_parameters(args: argparse.Namespace) -> None:
+    """The shutter: as given, or as simulate writes it beside the images of a recording."""
     beside = args.images / PARAMETERS
-    if args.readout_time is None and args.images.is_dir() and beside.exists():
+    if args.readout_time is not None:
+        direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
+        write_parameters(args.out, args.readout_time, direction)
+    elif is_bag(args.images) and beside.exists():
         shutil.copy(beside, args.out / PARAMETERS)
 
 
@@ -218,8 +273,26 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
         print(f"{recorded.images - recorded.with_corners} images show nothing of the map")
     for detail in recorded.refused.values():
         print(f"images that cannot be read are left out, the first one because {detail}")
+    if recorded.carried:
+        kept = ", ".join(f"{topic} ({count})" for topic, count in recorded.carried.items())
+        print(f"kept for replay: {kept}")
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
+
+
+def _warn(args: argparse.Namespace, recorded: Recorded, clock: ImageClock | None) -> None:
+    """What the times are, and all that speaks against what was given."""
+    faults = [*recorded.faults]
+    if clock is not None:
+        print(clock.told())
+        faults.append(clock.fault() or "")
+    if args.readout_time is not None:
+        faults.append(readout_fault(args.readout_time, recorded.period) or "")
+    for fault in filter(None, faults):
+        print(f"warning: {fault}")
+
+
+def _tell_next(args: argparse.Namespace) -> None:
     out = shlex.quote(str(args.out))
     with_parameters = (args.out / PARAMETERS).exists()
     shutter = f"--params {out}/{PARAMETERS}" if with_parameters else "-p readout_time:=SECONDS"

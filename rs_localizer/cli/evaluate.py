@@ -10,7 +10,8 @@ import numpy as np
 from rs_localizer.arguments import number
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
-from rs_localizer.io.trajectories import Trajectory, read_twists
+from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
+from rs_localizer.lab.alignment import aligned
 from rs_localizer.lab.metrics import (
     Errors,
     Summary,
@@ -20,6 +21,23 @@ from rs_localizer.lab.metrics import (
     twist_errors,
 )
 from rs_localizer.lab.recording import CORRESPONDENCES_TOPIC
+from rs_localizer.lab.time_offset import (
+    TimeOffset,
+    estimate_offset,
+    interpolated,
+    interpolated_twists,
+    shifted,
+)
+
+_AUTO = "auto"
+# An offset is worth a warning when errors without it are larger by this factor.
+_WORSE = 1.5
+
+
+def _offset_argument(text: str) -> str:
+    if text != _AUTO:
+        number()(text)
+    return text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +59,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest difference of times that are compared (default: %(default)s)",
     )
     parser.add_argument(
-        "--ate", action="store_true", help="also ATE and RPE, after alignment (needs evo)"
+        "--offset",
+        type=_offset_argument,
+        metavar=f"S|{_AUTO}",
+        help="add this to the times of EST, and interpolate TRUTH; "
+        f"{_AUTO}: by how much the clocks differ, which is told in any case",
+    )
+    parser.add_argument(
+        "--ate",
+        action="store_true",
+        help="also ATE and RPE, after alignment by positions and orientations (needs evo)",
     )
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw trajectories and errors")
 
@@ -49,32 +76,96 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     estimate = _read(args.estimate, args.pose_topic, args.twist_topic, args.twists)
     truth = _read(args.truth, args.truth_pose_topic, args.truth_twist_topic, args.truth_twists)
+    found = estimate_offset(estimate.poses, truth.poses)
     tolerance_ns = round(args.tolerance * 1e9)
+    whole = len(estimate.poses)
+    if args.offset is not None:
+        seconds = _offset(args.offset, found)
+        estimate, truth = _moved(estimate, truth, seconds)
+        tolerance_ns = 0
+        print(f"{seconds:+.4f} s are added to the times of {args.estimate}")
     poses = pose_errors(estimate.poses, truth.poses, tolerance_ns)
     if len(poses.stamps_ns) == 0:
         raise ValueError(
             f"no pose of {args.estimate} is within {args.tolerance:g} s of one of {args.truth}: "
-            f"{_span(estimate.poses)} against {_span(truth.poses)}"
+            f"{_span(estimate.poses)} against {_span(truth.poses)}{_hint(found)}"
         )
     twists = None
     if estimate.twists is not None and truth.twists is not None:
         twists = twist_errors(estimate.twists, truth.twists, tolerance_ns)
-    print(f"{len(poses.stamps_ns)} of {len(estimate.poses)} poses compared")
-    print(f"{_coverage(args.truth, estimate.poses, truth.poses, tolerance_ns)}\n")
+    print(f"{len(poses.stamps_ns)} of {whole} poses compared")
+    if args.offset is None:
+        print(_coverage(args.truth, estimate.poses, truth.poses, tolerance_ns))
+        _print_offset(found)
+    print()
     _print_table(poses, twists)
     if args.ate:
         _print_ate(estimate.poses, truth.poses, tolerance_ns)
     if args.plot is not None:
-        from rs_localizer.lab import plots
+        _plot(args.plot, estimate.poses, truth.poses, poses, twists)
 
-        args.plot.mkdir(parents=True, exist_ok=True)
-        drawn = (
-            plots.trajectories(truth.poses, {"estimate": estimate.poses}),
-            plots.errors({"estimate": poses}, {"estimate": twists} if twists else {}),
+
+def _offset(given: str, found: TimeOffset | None) -> float:
+    if given != _AUTO:
+        return float(number()(given))
+    if found is None:
+        raise ValueError(
+            "the motion does not tell a time offset: too short, too little turning, or not the "
+            "same motion; give it with --offset SECONDS"
         )
-        for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
-            plots.save(figure, args.plot / name)
-            print(f"{args.plot / name}")
+    return found.seconds
+
+
+def _moved(estimate: Motions, truth: Motions, seconds: float) -> tuple[Motions, Motions]:
+    """The estimate at other times, and the truth at just these."""
+    poses = shifted(estimate.poses, seconds)
+    inside, true = interpolated(truth.poses, poses.stamps_ns)
+    twists, true_twists = estimate.twists, truth.twists
+    if twists is not None and true_twists is not None:
+        stamps = twists.stamps_ns + round(seconds * 1e9)
+        twists = Twists(stamps, twists.angular, twists.linear)
+        true_twists = interpolated_twists(true_twists, stamps)
+    return Motions(poses.part(inside), twists), Motions(true, true_twists)
+
+
+def _hint(found: TimeOffset | None) -> str:
+    if found is None:
+        return ""
+    return (
+        f"; the motions agree when {found.seconds:+.4f} s are added to its times: --offset {_AUTO}"
+    )
+
+
+def _print_offset(found: TimeOffset | None) -> None:
+    """What the time offset is; a warning where it matters."""
+    if found is None:
+        print("time offset: not to be told from this motion")
+        return
+    before, after = found.before, found.after
+    print(
+        f"time offset: {round(found.seconds, 4) + 0.0:+.4f} s to be added (angular speeds "
+        f"correlate by {found.correlation:.3f})"
+    )
+    if not before < _WORSE * after:  # NaN compares false
+        print(
+            f"warning: with this offset the median orientation error is {after:.3f} deg, without "
+            f"it {before:.3f} deg: the clocks differ; apply it with --offset {_AUTO}"
+        )
+
+
+def _plot(
+    directory: Path, estimate: Trajectory, truth: Trajectory, poses: Errors, twists: Errors | None
+) -> None:
+    from rs_localizer.lab import plots
+
+    directory.mkdir(parents=True, exist_ok=True)
+    drawn = (
+        plots.trajectories(truth, {"estimate": estimate}),
+        plots.errors({"estimate": poses}, {"estimate": twists} if twists else {}),
+    )
+    for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
+        plots.save(figure, directory / name)
+        print(f"{directory / name}")
 
 
 def _coverage(
@@ -125,17 +216,15 @@ def _print_ate(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> No
             "--ate needs the package evo, which is not installed: pip install evo"
         ) from error
     rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
-    pair = []
-    for part in (truth.part(true_rows), estimate.part(rows)):
-        pair.append(
-            trajectory.PoseTrajectory3D(
-                part.positions,
-                np.roll(part.quaternions, 1, axis=1),  # evo puts w first
-                (part.stamps_ns - estimate.stamps_ns[0]) * 1e-9,
-            )
+    true_part, part = truth.part(true_rows), estimate.part(rows)
+    true, estimated = (
+        trajectory.PoseTrajectory3D(
+            poses.positions,
+            np.roll(poses.quaternions, 1, axis=1),  # evo puts w first
+            (poses.stamps_ns - part.stamps_ns[0]) * 1e-9,
         )
-    true, estimated = pair
-    estimated.align(true)
+        for poses in (true_part, aligned(part, true_part))
+    )
     parts = metrics.PoseRelation
     for name, metric in (
         ("ATE (m rms)", metrics.APE(parts.translation_part)),

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-import yaml
 from tqdm import tqdm
 
 from rs_localizer import data
@@ -22,10 +21,11 @@ from rs_localizer.lab.experiments.report import (
 )
 from rs_localizer.lab.experiments.results import Context, Result, Verdict
 from rs_localizer.lab.experiments.table import EXPERIMENTS
+from rs_localizer.settings import load_params_file
 
 T = TypeVar("T")
 
-# All experiments with so many trials take at most ten minutes on two cores.
+# All experiments with so many trials take about a quarter of an hour on two cores.
 _TRIALS = 2000
 
 
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=_TRIALS,
         metavar="N",
         help="simulated frames per point of a curve; recordings and timings are cut in proportion, "
-        "and below 500 compile times are left out (default: %(default)s, at most ten minutes in "
+        "and below 500 compile times are left out (default: %(default)s, a quarter of an hour in "
         "all on two cores)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")
@@ -81,10 +81,16 @@ def run(args: argparse.Namespace) -> None:
 
 def _context(name: str, trials: int, seed: int) -> Context:
     webcam = data.path(data.WEBCAM)
-    parameters = yaml.safe_load((webcam / "parameters.yaml").read_text(encoding="utf-8"))
-    readout_time = parameters["rs_localizer"]["ros__parameters"]["readout_time"]
+    readout_time = load_params_file(webcam / "parameters.yaml")["readout_time"]
     return Context(
-        trials, seed, partial(_track, name), webcam, readout_time, data.path(data.HAND_MOTION)
+        trials,
+        seed,
+        partial(_track, name),
+        webcam,
+        readout_time,
+        data.path(data.HAND_MOTION),
+        data.path(data.SLOW_HAND_MOTION),
+        data.path(data.GLOBAL_SHUTTER_TAGS),
     )
 
 

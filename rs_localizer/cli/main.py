@@ -1,12 +1,15 @@
 """``rs_localizer COMMAND``: finds the command, turns its faults into one line and an exit code.
 
-Exit codes: 0 done, 1 the work failed, 2 wrong usage.
+Exit codes: 0 done, 1 the work failed, 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM, and 141
+when who reads the output goes away (``| head``).
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -14,6 +17,11 @@ from dataclasses import dataclass
 
 import rs_localizer
 from rs_localizer.cli import UsageError
+from rs_localizer.missing import explain
+from rs_localizer.stopping import INTERRUPTED
+
+# What shells report of a program whose output nobody reads any more: 128 + SIGPIPE.
+_SIGPIPE = 141
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +84,11 @@ COMMANDS = {
         "what a map of landmarks holds; one file from another: COLMAP, PLY, NPZ",
         "rs_localizer map convert sparse/0 map.npz",
     ),
+    "warm": Command(
+        "rs_localizer.cli.warm",
+        "compile all kernels now, for images and installers; the first start is then as any other",
+        "rs_localizer warm",
+    ),
     "experiments": Command(
         "rs_localizer.cli.experiments",
         "the experiments of the literature and ours: curves, figures, a verdict on every claim",
@@ -114,22 +127,37 @@ def main(
         arguments = parser.parse_args(words[1:])
     except SystemExit as end:  # argparse has said all there is to say
         return int(end.code or 0)
+    except ImportError as error:
+        return _fail(name, explain(error), 1)
     try:
         module.run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return _unheard()
     except UsageError as error:
         return _fail(name, str(error), 2)
     except (ValueError, OSError) as error:
         return _fail(name, str(error), 1)
+    except ImportError as error:  # of what only some of its work needs
+        return _fail(name, explain(error), 1)
     except MemoryError as error:
         return _fail(name, f"the memory does not suffice: {error}", 1)
     except KeyboardInterrupt:
-        return _fail(name, "interrupted", 1)
+        return _fail(name, "interrupted", INTERRUPTED)
     return 0
 
 
 def _fail(name: str, text: str, code: int) -> int:
     print(f"rs_localizer {name}: {' '.join(text.split())}", file=sys.stderr)
     return code
+
+
+def _unheard() -> int:
+    """Nobody reads the output any more; to say so would be heard by nobody either."""
+    with contextlib.suppress(OSError, ValueError):
+        # What is left in the buffer would be written at the end of the process, and fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return _SIGPIPE
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -11,6 +11,7 @@ from rs_localizer.cli import UsageError
 from rs_localizer.io.map_files import WRITERS, read_map_file
 from rs_localizer.io.maps import Map
 from rs_localizer.io.maps_ply import write_ply
+from rs_localizer.io.whole import whole_files
 
 _KINDS = "a .npz or .ply file or a folder of COLMAP"
 
@@ -25,8 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--database",
             type=Path,
             metavar="FILE",
-            help="COLMAP's, for the descriptors (default: database.db in the folder or one of the "
-            "two above)",
+            help="COLMAP's, for the descriptors (default: database.db, or the only database of any "
+            "name, in the folder or one of the two above)",
         )
     convert.add_argument("out", type=Path, metavar="OUT", help=" or ".join(WRITERS))
     convert.add_argument("--text", action="store_true", help="write .ply as text")
@@ -40,10 +41,11 @@ def run(args: argparse.Namespace) -> None:
     landmarks = read_map_file(args.file, "map", args.database)
     _describe(args.file, landmarks)
     if args.action == "convert":
-        if args.text:
-            write_ply(args.out, landmarks, binary=False)
-        else:
-            WRITERS[args.out.suffix](args.out, landmarks)
+        with whole_files(args.out):
+            if args.text:
+                write_ply(args.out, landmarks, binary=False)
+            else:
+                WRITERS[args.out.suffix](args.out, landmarks)
         print(f"written to {args.out}")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from rs_localizer.arguments import integer, number
 from rs_localizer.cli import UsageError
+from rs_localizer.io.whole import whole_files
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
@@ -103,11 +104,13 @@ def _make(args: argparse.Namespace) -> None:
     target = Path(f"{args.out}.{args.format}")
     map_file = Path(f"{args.out}.yaml")
     pages = plan(marker_map, args.page)
-    for path in (*page_files(target, len(pages)), map_file):
+    written = (*page_files(target, len(pages)), map_file)
+    for path in written:
         if path.exists() and not args.overwrite:
             raise ValueError(f"{path} exists already; it is replaced with --overwrite")
-    files = write_pages(pages, target)
-    write_marker_map(map_file, marker_map)
+    with whole_files(*written):
+        files = write_pages(pages, target)
+        write_marker_map(map_file, marker_map)
     shown = str(files[0]) if len(files) == 1 else f"{files[0]} ... {files[-1].name}"
     count = f"{len(pages)} page{'s' if len(pages) > 1 else ''} of {args.page}"
     print(f"{shown}: {count}; print at 100 % and measure the bar")

@@ -3,43 +3,42 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import shlex
-import shutil
 import time
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.broadcasts import broadcast
 from rs_localizer.cli import UsageError
+from rs_localizer.cli.replay_result import (
+    BRIDGED,
+    POSES,
+    RESULT,
+    TWISTS,
+    fresh,
+    write_bridged,
+    write_frame,
+    write_texts,
+)
+from rs_localizer.cli.replay_ros import play
+from rs_localizer.cli.replay_summary import Tally, print_summary
 from rs_localizer.config import NodeConfig
-from rs_localizer.core import so3
 from rs_localizer.frames import FrameLocalizer
-from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, open_bag
+from rs_localizer.image_sources import holds_images, image_topics
+from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.outputs import Frame, messages
-from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
-from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.replay import (
     NO_FRAMES,
-    TF_TYPE,
     Topics,
     find_topics,
     find_transforms,
+    has_frames,
     replay,
-    tf_topics,
 )
-from rs_localizer.settings import NODE_NAME, build, load_params_file, parse_assignment
+from rs_localizer.settings import build, load_params_file, parse_assignment
 from rs_localizer.smoothed_frames import smooth_frames
-
-# What replay writes into its output directory.
-POSES, TWISTS, RESULT, BRIDGED = "poses.txt", "twists.txt", "result", "bridged.txt"
-# Notices of a frame that could not follow the one before.
-_RESTARTS = ("time_went_back", "map_changed")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     graph.add_argument(
         "--ros",
         action="store_true",
-        help="publish the recording, with /clock and its /tf, for a live node",
+        help="publish the recording, images too, with /clock and its /tf, for live nodes",
     )
     graph.add_argument(
         "--rate",
@@ -105,14 +104,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     _check_usage(args)
+    if not is_bag(args.bag) and (pictures := holds_images(args.bag)):
+        raise ValueError(f"{args.bag} {pictures}, not matches: first {_detect_command(args.bag)}")
     if args.ros:
         with open_bag(args.bag) as bag:
-            _play(bag, _find_topics(bag, args), args.rate or 1.0)
+            only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
+            play(bag, None if only_images else _find_topics(bag, args), args.rate or 1.0)
         return
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
     config = _config(args.params, args.assignments + given)
     notices: Counter[str] = Counter()
     with open_bag(args.bag) as bag:
+        if image_topics(bag) and not has_frames(bag):
+            raise ValueError(
+                f"{args.bag} holds images, not matches: first {_detect_command(args.bag)}"
+            )
         topics = _find_topics(bag, args)
         if topics.keypoints and not topics.map_points and not config.map_file:
             raise ValueError(
@@ -124,9 +130,25 @@ def run(args: argparse.Namespace) -> None:
         if args.smooth and config.readout_time == 0.0:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
-        _prepare(out, args.overwrite)
-        _hint(args.bag, args.params)
-        _replay(bag, topics, localizer, notices, out, args.storage, args.smooth, args.rate)
+        with fresh(out, args.overwrite):
+            _hint(args.bag, args.params)
+            tally = _replay(bag, topics, localizer, notices, out, args)
+        _tell(tally, config, out)
+        if not tally.frames:
+            raise ValueError(
+                f"no frame of {bag.path} was localized; of the last one, {tally.last_refusal}"
+            )
+
+
+def _detect_command(path: Path) -> str:
+    """What finds the matches in images."""
+    source = shlex.quote(str(path))
+    calibration = "" if is_bag(path) else " --calibration camera.yaml"
+    seen = shlex.quote(f"{path.resolve().with_suffix('').name}_seen")
+    return (
+        f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {seen} (or --board "
+        f"6x4 --square 0.03 instead of --map), then: rs_localizer replay {seen}"
+    )
 
 
 def _find_topics(bag: BagReader, args: argparse.Namespace) -> Topics:
@@ -169,23 +191,6 @@ def _config(params: Path | None, assignments: list[str]) -> NodeConfig:
     return config
 
 
-def _prepare(out: Path, overwrite: bool) -> None:
-    if out.exists() and not overwrite:
-        raise ValueError(f"{out} exists; choose another --out, or --overwrite")
-    if out.exists() and not _is_ours(out):
-        raise ValueError(f"{out} is no result of replay; --overwrite leaves it as it is")
-    out.mkdir(parents=True, exist_ok=True)
-    for name in (POSES, TWISTS, BRIDGED):
-        (out / name).unlink(missing_ok=True)
-    if (out / RESULT / "metadata.yaml").exists():  # nothing but a recording is removed
-        shutil.rmtree(out / RESULT)
-
-
-def _is_ours(out: Path) -> bool:
-    """Whether a directory holds an earlier result, or nothing."""
-    return out.is_dir() and ((out / RESULT / "metadata.yaml").is_file() or not any(out.iterdir()))
-
-
 def _hint(bag: Path, params: Path | None) -> None:
     file = (bag if bag.is_dir() else bag.parent) / "parameters.yaml"
     if params is None and file.is_file():
@@ -198,168 +203,46 @@ def _replay(
     localizer: FrameLocalizer,
     notices: Counter[str],
     out: Path,
-    storage: str,
-    smooth: bool,
-    rate: float | None,
-) -> None:
+    args: argparse.Namespace,
+) -> Tally:
     localizer.warm_up()
-    frames: list[Frame] = []
-    last = "nothing came"
-    refused: Counter[str] = Counter()
-    not_sent = 0
-    total = bag.count([topics.frames])
+    tally = Tally(total=bag.count([topics.frames]), notices=notices)
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
-        BagWriter(out / RESULT, storage) as writer,
-        tqdm(total=total, unit="frame", desc="replay", disable=None) as bar,
+        BagWriter(out / RESULT, args.storage) as writer,
+        tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
         for recorded_ns, result in replay(bag, topics, localizer):
             if result:
-                frames.append(result)
-                if not smooth:
-                    not_sent += not _write_frame(writer, result, localizer, recorded_ns)
+                tally.frames.append(result)
+                if not args.smooth:
+                    tally.not_sent += not write_frame(writer, result, localizer, recorded_ns)
             else:
-                refused[result.reason] += 1
-                last = f"{result.reason}: {result.detail}"
+                tally.refused[result.reason] += 1
+                tally.last_refusal = f"{result.reason}: {result.detail}"
             bar.update(1 if result or result.reason not in NO_FRAMES else 0)
-        localized = len(frames)
-        if smooth and frames:
+        if args.smooth and tally.frames:
             stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            smoothed = smooth_frames(localizer, frames, stamps, rate)
-            frames = smoothed.frames
-            for frame in frames:
-                not_sent += not _write_frame(writer, frame, localizer, frame.input_stamp_ns)
-            text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in smoothed.bridged)
-            (out / BRIDGED).write_text(text, encoding="utf-8")
-    seconds = time.perf_counter() - start
-    repeated = _write_texts(out, frames)
-    _print_summary(total, localized, frames, refused, notices, repeated, not_sent, seconds)
-    if smooth and frames:
-        print(f"{'samples of the smoothed motion':40} {len(frames):8}")
-        print(f"{f'  bridged, listed in {BRIDGED}':40} {len(smoothed.bridged):8}")
-        print(f"{'  left out, not determined':40} {smoothed.undetermined:8}")
-    moving = any(frame.twist for frame in frames)
-    if frames and not moving:
-        print(f"no twists: {_why_no_twists(localizer.config)}")
-    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}")
-    if not frames:
-        raise ValueError(f"no frame of {bag.path} was localized; of the last one, {last}")
+            tally.smoothed = smooth_frames(localizer, tally.frames, stamps, args.rate)
+            for frame in tally.written:
+                tally.not_sent += not write_frame(writer, frame, localizer, frame.input_stamp_ns)
+            write_bridged(out, tally.smoothed.bridged)
+    tally.seconds = time.perf_counter() - start
+    tally.repeated = write_texts(out, tally.written, localizer.config)
+    return tally
 
 
-def _write_frame(
-    writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
-) -> bool:
-    """Write all messages of a frame; whether its transform could be told."""
-    for name, message in messages(frame, writer.make).items():
-        writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
-    return _write_transform(writer, frame, localizer, recorded_ns)
-
-
-def _write_transform(
-    writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
-) -> bool:
-    """Write what publish_tf asks for; whether it could be told."""
-    try:
-        item = broadcast(frame, localizer.config, localizer.transforms)
-    except TransformError:
-        return False
-    if item is not None:
-        transform = make_transform(
-            writer.make, item.stamp_ns, item.parent, item.child, item.parent_from_child
-        )
-        writer.write("/tf", writer.make(TF_TYPE, transforms=[transform]), recorded_ns)
-    return True
-
-
-def _write_texts(out: Path, frames: list[Frame]) -> int:
-    """Write poses and twists in the order of their stamps; how many stamps came repeatedly."""
-    stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
-    first = np.unique(stamps, return_index=True)[1]
-    once = [frames[i] for i in first]
-    write_tum(
-        out / POSES,
-        Trajectory(
-            stamps_ns=stamps[first],
-            positions=np.array([f.pose.position for f in once]).reshape(-1, 3),
-            quaternions=np.array([_quaternion(f) for f in once]).reshape(-1, 4),
-        ),
-    )
-    moving = [(f.stamp_ns, f.twist) for f in once if f.twist is not None]
-    if moving:
-        twists = Twists(
-            stamps_ns=np.array([stamp for stamp, _ in moving], dtype=np.int64),
-            angular=np.array([twist.angular for _, twist in moving]),
-            linear=np.array([twist.linear for _, twist in moving]),
-        )
-        write_twists(out / TWISTS, twists)
-    return len(frames) - len(once)
-
-
-def _quaternion(frame: Frame) -> so3.Array:
-    return so3.quaternion(np.ascontiguousarray(frame.pose.rotation))
-
-
-def _print_summary(
-    total: int,
-    localized: int,
-    frames: list[Frame],
-    refused: Counter[str],
-    notices: Counter[str],
-    repeated: int,
-    not_sent: int,
-    seconds: float,
-) -> None:
-    rows = [("frames", total), ("localized", localized)]
-    rows += [(f"  refused: {reason}", count) for reason, count in refused.most_common()]
-    for name, count in notices.most_common():
-        rows.append((f"{'started afresh' if name in _RESTARTS else 'noticed'}: {name}", count))
-    dropped = sum(frame.dropped for frame in frames)
-    rows += [("rows dropped (not finite)", dropped)] if dropped else []
-    rows += [("stamps repeated, not in the text files", repeated)] if repeated else []
-    rows += [("without a transform on /tf", not_sent)] if not_sent else []
-    for name, count in rows:
-        print(f"{name:40} {count:8}")
-    print(f"{'frames per second':40} {total / seconds:8.0f}")
+def _tell(tally: Tally, config: NodeConfig, out: Path) -> None:
+    print_summary(tally, config)
+    moving = any(frame.twist for frame in tally.written)
+    if tally.frames and not moving:
+        print(f"no twists: {_why_no_twists(config)}")
+    bridged = f", {BRIDGED}" if tally.smoothed else ""
+    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}{bridged}")
 
 
 def _why_no_twists(config: NodeConfig) -> str:
     if config.readout_time == 0.0:
         return "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
     return f"solver {config.solver} estimates no velocities"
-
-
-def _play(bag: BagReader, topics: Topics, rate: float) -> None:
-    try:  # by name: whoever has no ROS replays offline
-        play = importlib.import_module("rs_localizer.ros.player").play
-    except ImportError as error:
-        raise ValueError(
-            f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(README.md)"
-        ) from error
-    names = (*_playable_transforms(bag), *topics.names)
-    total = bag.count(names)
-    played = play(
-        tqdm(bag.messages(names), total=total, unit="message", desc="play", disable=None),
-        {name: bag.topics[name] for name in names},
-        rate,
-        latched=() if topics.map_points is None else (topics.map_points,),
-    )
-    frames = bag.count([topics.frames])
-    print(f"{frames} frames published in {played.seconds:.1f} s")
-    for topic, count in played.poses.items():
-        print(f"{count} poses heard on {topic}")
-    if not played.poses:
-        print(f"no node {NODE_NAME} was there to publish poses")
-
-
-def _playable_transforms(bag: BagReader) -> list[str]:
-    topics = tf_topics(bag, TF_TYPE)
-    try:
-        importlib.import_module("tf2_msgs.msg")
-    except ImportError:
-        if topics:
-            missing = "tf2_msgs is not installed (ros-jazzy-tf2-msgs)"
-            print(f"not played: {' and '.join(topics)}, {missing}")
-        return []
-    return topics

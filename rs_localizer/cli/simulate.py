@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,10 @@ from rs_localizer.cli.simulated_camera import (
     option,
     stamps_of,
 )
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.io.map_files import write_map_file
+from rs_localizer.io.whole import whole
 from rs_localizer.lab.image_sequence import FORMATS, Encoding, rendered_frames
 from rs_localizer.lab.landmarks import described, keypoint_rows
 from rs_localizer.lab.recording import (
@@ -117,22 +117,25 @@ def _write_points(args: argparse.Namespace) -> None:
     rng = np.random.default_rng(args.seed)
     landmarks = described(room(_way(motion), rng), MAP_FRAME, rng)
     counts: list[int] = []
-    with BagWriter(args.out, args.storage) as bag:
-        frames = simulate_frames(
-            camera, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
-        )
-        for frame in tqdm(frames, total=len(stamps), unit="frame", desc="simulate", disable=None):
-            if args.keypoints:
-                write_simulated(bag, camera, frame, keypoint_rows(frame, landmarks, rng))
-            else:
-                write_simulated(bag, camera, frame)
-            counts.append(len(frame.points))
-    if not any(counts):
-        shutil.rmtree(args.out)
-        raise ValueError(
-            f"none of the {len(stamps)} frames sees any point; nothing is written to {args.out}"
-        )
-    write_parameters(args.out, args.readout_time, args.scan_direction)
+    with whole(args.out):
+        with BagWriter(args.out, args.storage) as bag:
+            frames = simulate_frames(
+                camera, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
+            )
+            total = len(stamps)
+            for frame in tqdm(frames, total=total, unit="frame", desc="simulate", disable=None):
+                if args.keypoints:
+                    write_simulated(bag, camera, frame, keypoint_rows(frame, landmarks, rng))
+                else:
+                    write_simulated(bag, camera, frame)
+                counts.append(len(frame.points))
+        if not any(counts):
+            raise ValueError(
+                f"none of the {len(stamps)} frames sees any point; nothing is written to {args.out}"
+            )
+        write_parameters(args.out, args.readout_time, args.scan_direction)
+        if args.keypoints:
+            write_map_file(args.out / MAP, landmarks)
     print(
         f"{args.out}: {len(stamps)} frames in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s, "
         f"{np.mean(counts):.0f} points each{_fewer(counts, args.points)}"
@@ -141,7 +144,6 @@ def _write_points(args: argparse.Namespace) -> None:
     poses = shlex.quote(f"{args.out}_poses")
     given = f"--params {out}/{PARAMETERS}"
     if args.keypoints:
-        write_map_file(args.out / MAP, landmarks)
         given += f" --map {out}/{MAP}"
     print(f"next: rs_localizer replay {out} {given} --out {poses}")
 
@@ -153,16 +155,18 @@ def _write_images(args: argparse.Namespace) -> None:
     settings = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
     renderer = Renderer(camera, scene.planes, settings)
     encoding = Encoding(args.format, round(args.quality))
-    with BagWriter(args.out, args.storage) as bag:
-        frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
-        for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
-            write_rendered(bag, camera, frame)
-    write_parameters(args.out, args.readout_time, args.scan_direction)
+    with whole(args.out):
+        with BagWriter(args.out, args.storage) as bag:
+            frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
+            for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
+                write_rendered(bag, camera, frame)
+        write_parameters(args.out, args.readout_time, args.scan_direction)
+        if scene.marker_map is not None:
+            write_marker_map(args.out / MARKER_MAP, scene.marker_map)
     said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
     if scene.marker_map is None:
         print(said)
         return
-    write_marker_map(args.out / MARKER_MAP, scene.marker_map)
     print(f"{said}, {len(scene.marker_map.markers)} markers on three walls")
     out = shlex.quote(str(args.out))
     found = shlex.quote(f"{args.out}_markers")

@@ -6,16 +6,21 @@ import math
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.observations import Observations
 from rs_localizer.core.posterior import Posterior
-from rs_localizer.core.ransac import Observations
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray, Failure, Reason
+from rs_localizer.core.types import Failure, Reason
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
+# Errors that neighbouring rows share although the motion follows vibration, in standard deviations.
+_MOST_AGREEMENT = 3.0
+_NOISE_FREE = 0.01  # px; less is rounding errors
+# Errors of map and lens, root mean square, in inlier thresholds.
+_MOST_MODEL_ERROR = 0.4
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
 # does so fits anything. See :meth:`Observations.row_paces`.
 _LEAST_PACE = 0.25
@@ -67,6 +72,19 @@ def refusal(
             f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
             "too small for the noise",
+        )
+    if rolling and posterior.agreement > _MOST_AGREEMENT and posterior.noise > _NOISE_FREE:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "
+            f"standard deviations, {posterior.noise:.2g} px): the camera vibrates faster than its "
+            "rows can tell, or the scan direction is another one",
+        )
+    if rolling and posterior.model_error > _MOST_MODEL_ERROR * threshold:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
+            "or the map is wrong by more than a pose could bear",
         )
     pace = _median(observations.row_paces(state), posterior.inliers)
     if pace < _LEAST_PACE:

@@ -11,13 +11,14 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from numbers import Integral, Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.checks import Matrix, Vector, numbers, pixel_count
 
 
 class ScanDirection(StrEnum):
@@ -45,6 +46,7 @@ _COEFFICIENTS = {
 }
 # OpenCV's own default of five iterations leaves errors of pixels at the rim of wide lenses.
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+_LONGEST_READOUT = 1.0  # s: more than any camera takes for a picture of a moving world
 # Pixels; a lens is neither a needle's eye nor a telescope of the next galaxy.
 _LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e9
 # A pixel that does not come back to itself has no bearing: it lies beyond the model's range.
@@ -68,7 +70,7 @@ class Camera:
     Args:
         width, height: size of the full sensor image to which K belongs, pixels.
         K: (3,3) intrinsic matrix without skew.
-        D: distortion coefficients in OpenCV's order (empty: none).
+        D: distortion coefficients in OpenCV's order (empty or None: none).
         distortion_model: ``plumb_bob``, ``rational_polynomial`` or ``equidistant``.
         readout_time: s from the first to the last row of the full sensor; 0 = unknown.
         scan_direction: see :class:`ScanDirection`.
@@ -92,10 +94,26 @@ class Camera:
     binning: tuple[int, int] = (1, 1)
     roi: Roi | None = None
 
+    if TYPE_CHECKING:  # what may be given; the fields say what it becomes
+        def __init__(
+            self,
+            width: int | float,
+            height: int | float,
+            K: Matrix,
+            D: Vector | None = None,
+            distortion_model: str = ...,
+            readout_time: float = ...,
+            scan_direction: str = ...,
+            binning: tuple[int, int] = ...,
+            roi: Roi | None = None,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         set_field = object.__setattr__  # the dataclass is frozen; this is its constructor
-        K = np.array(self.K, dtype=np.float64)
-        D = np.array(self.D, dtype=np.float64).ravel()
+        K = numbers("K", self.K)
+        D = np.zeros(0) if self.D is None else numbers("D", self.D).ravel()
+        set_field(self, "width", pixel_count("width", self.width))
+        set_field(self, "height", pixel_count("height", self.height))
         if K.shape != (3, 3) or not np.all(np.isfinite(K)):
             raise ValueError(f"K must be a finite 3x3 matrix, got {K.tolist()}")
         if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
@@ -125,10 +143,15 @@ class Camera:
                 f"scan_direction must be one of {', '.join(ScanDirection)}; "
                 f"got {self.scan_direction!r}"
             ) from None
-        if not all(isinstance(size, Integral) and size > 1 for size in (self.width, self.height)):
-            raise ValueError(f"the image must be at least 2x2, got {self.width!r}x{self.height!r}")
+        if min(self.width, self.height) < 2:
+            raise ValueError(f"the image must be at least 2x2, got {self.width}x{self.height}")
         if not isinstance(self.readout_time, Real) or not 0.0 <= self.readout_time < math.inf:
             raise ValueError(f"readout_time must be 0 or more seconds, got {self.readout_time!r}")
+        if self.readout_time > _LONGEST_READOUT:
+            raise ValueError(
+                f"readout_time must be at most {_LONGEST_READOUT:g} s, got {self.readout_time:g}: "
+                f"it is in seconds; {self.readout_time:g} ms are {1e-3 * self.readout_time:g}"
+            )
         if not all(isinstance(step, Integral) and step > 0 for step in self.binning):
             raise ValueError(f"binning must be two numbers of 1 or more, got {self.binning}")
         if not (_LEAST_FOCAL < K[0, 0] < _MOST_FOCAL and _LEAST_FOCAL < K[1, 1] < _MOST_FOCAL):
@@ -203,6 +226,12 @@ class Camera:
             (self.width, self.height) if self.roi is None else (self.roi.width, self.roi.height)
         )
         return width // self.binning[0], height // self.binning[1]
+
+    @property
+    def focal_length(self) -> float:
+        """Geometric mean of the two focal lengths, in delivered pixels."""
+        K, binning = self.K, self.binning
+        return math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1])
 
     def rays(self, pixels: Array) -> Array:
         """Undistorted bearings (n,2), ``x/z, y/z``, of raw pixels (n,2).

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.vectors import absolute, load, root, store, uniform, where_less
 
 _EPSILON = 2.0**-52

@@ -7,9 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 
 
 def checked(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -10,13 +11,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array, log
+from rs_localizer.core.so3 import log
+from rs_localizer.core.state import (
+    ACCELERATIONS,
+    ANGULAR,
+    LINEAR,
+    MOTION_PARAMETERS,
+    PARAMETERS,
+    STATE_SIZE,
+)
 
 # A precision that holds a velocity at its mean whatever the points say.
 _HOLDING = 1e18
 _LEAST_DEVIATION = 1e-9
+# A tenth of the speed goes with the accelerations of the whole.
+_JOLTS = 10.0
+_WALKING = 0.1
 # Numbers whose squares are finite.
 _MOST = 1e100
 
@@ -27,9 +40,12 @@ class Prior:
 
     Args:
         motion, covariance: expected motion and its (12,12) covariance, in the order of
-            ``Estimate.covariance``; infinite variances leave a parameter free.
+            ``Estimate.covariance``, or (18,18) with its accelerations, in the order of
+            ``Estimate.joint_covariance``; infinite variances leave a parameter free.
         angular_velocity, angular_velocity_deviation: a gyroscope's body rate (3,) in camera axes
             times the readout time (rad per readout), and its standard deviation.
+        of_shake_sizes, of_field_sizes: what the frames before say of shaking and model error, as
+            the fields of ``Estimate`` of these names.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
             along ``gravity_in_map``, of any length, and the standard deviation of its direction
             in rad.
@@ -45,6 +61,8 @@ class Prior:
     gravity: ArrayLike | None = None
     gravity_deviation: float = math.nan
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
+    of_shake_sizes: Array | None = None
+    of_field_sizes: Array | None = None
 
     def __post_init__(self) -> None:
         if (self.motion is None) != (self.covariance is None):
@@ -72,17 +90,20 @@ class Prior:
 class PriorTerms(NamedTuple):
     """A prior as the kernels take it: a sum of Gaussians, and a direction."""
 
-    informations: Array  # (k,12,12)
-    references: Array  # (k,18) states of their means
+    informations: Array  # (k,18,18)
+    references: Array  # (k,24) states of their means
     gravity: Array  # (7,) in the map, in the camera, precision
 
 
 _NO_GRAVITY = np.zeros(7)
-_STILL = np.concatenate([np.eye(3).ravel(), np.zeros(9)])
+_STILL = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
 
 
 def _check_motion(motion: Motion) -> None:
-    for name in ("rotation", "translation", "angular_velocity", "linear_velocity"):
+    for name in (
+        "rotation", "translation", "angular_velocity", "linear_velocity",
+        "angular_acceleration", "linear_acceleration",
+    ):  # fmt: skip
         shape = (3, 3) if name == "rotation" else (3,)
         if np.shape(getattr(motion, name)) != shape:
             raise ValueError(
@@ -98,8 +119,8 @@ def _check_motion(motion: Motion) -> None:
 
 
 def _check_covariance(covariance: Array) -> None:
-    if covariance.shape != (12, 12):
-        raise ValueError(f"covariance must be (12,12), got {covariance.shape}")
+    if covariance.shape not in ((MOTION_PARAMETERS,) * 2, (PARAMETERS,) * 2):
+        raise ValueError(f"covariance must be (12,12) or (18,18), got {covariance.shape}")
     known = ~np.isinf(np.diag(covariance))
     if not np.any(known):
         return  # everything is free: the motion is only a first guess
@@ -113,16 +134,34 @@ def _check_covariance(covariance: Array) -> None:
         raise ValueError("covariance must be positive definite")
 
 
-def velocity_terms(angular: float, linear: float) -> PriorTerms:
-    """Zero-mean prior of these standard deviations per readout; 0: none."""
-    precisions = [0.0 if d == 0.0 else d**-2 for d in (angular, linear)]
+def motion_terms(velocities: Sequence[float], accelerations: Sequence[float]) -> PriorTerms:
+    """Zero-mean prior of these standard deviations, each angular and linear; 0: none.
+
+    Args:
+        velocities: rad and m per readout.
+        accelerations: rad and m per readout squared.
+    """
+    precisions = [0.0 if d == 0.0 else d**-2 for d in (*velocities, *accelerations)]
     return _single(np.diag(np.concatenate([np.zeros(6), np.repeat(precisions, 3)])), _STILL)
 
 
 @cache
 def held_terms() -> PriorTerms:
-    """A global shutter: velocities are zero."""
-    return _single(np.diag(np.concatenate([np.zeros(6), np.full(6, _HOLDING)])), _STILL)
+    """A global shutter: velocities and accelerations are zero."""
+    return _single(np.diag(np.concatenate([np.zeros(6), np.full(12, _HOLDING)])), _STILL)
+
+
+def slower_terms(terms: PriorTerms, part: float) -> PriorTerms:
+    """The prior of a motion whose typical turn rate is this part of the configured one.
+
+    Neither travel nor accelerations slow down as much: who hardly turns may walk, and jolts come
+    at any speed.
+    """
+    informations = terms.informations.copy()
+    informations[0, ANGULAR] /= part**2
+    informations[0, LINEAR] /= max(part, _WALKING) ** 2
+    informations[0, ACCELERATIONS] /= min(_JOLTS * part, 1.0) ** 2
+    return terms._replace(informations=informations)
 
 
 def held_beside(terms: PriorTerms) -> PriorTerms:
@@ -131,7 +170,7 @@ def held_beside(terms: PriorTerms) -> PriorTerms:
 
 
 def gravity_cost(terms: PriorTerms, state: Array) -> float:
-    """What a state (18,) costs by the measured direction of gravity, in noise variances."""
+    """What a state (24,) costs by the measured direction of gravity, in noise variances."""
     gravity = terms.gravity
     error = state[:9].reshape(3, 3) @ gravity[:3] - gravity[3:6]
     return float(gravity[6] * (error @ error))
@@ -145,9 +184,10 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
     """The terms and what a prior says but for the motion: angular velocity and gravity."""
     informations, references, gravity = terms
     if prior.angular_velocity is not None:
-        information = np.zeros((12, 12))
-        information[6:9, 6:9] = np.eye(3) / prior.angular_velocity_deviation**2
-        reference = np.concatenate([_STILL[:12], prior.angular_velocity, np.zeros(3)])
+        information = np.zeros((PARAMETERS, PARAMETERS))
+        information[ANGULAR, ANGULAR] = np.eye(3) / prior.angular_velocity_deviation**2
+        reference = _STILL.copy()
+        reference[12:15] = prior.angular_velocity
         informations = np.concatenate([informations, information[None]])
         references = np.concatenate([references, reference[None]])
     if prior.gravity is not None:
@@ -168,20 +208,27 @@ def with_motion(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
     """
     if prior.motion is None or prior.covariance is None:
         return terms
+    own = terms.informations
+    if len(prior.covariance) == PARAMETERS:  # it knows the accelerations better than a default
+        own = own.copy()
+        own[0, ACCELERATIONS] = 0.0
     return PriorTerms(
-        np.concatenate([terms.informations, _inverse(prior.covariance)[None]]),
+        np.concatenate([own, _inverse(np.asarray(prior.covariance, float))[None]]),
         np.concatenate([terms.references, state_in(prior.motion, centre)[None]]),
         terms.gravity,
     )
 
 
 def state_in(motion: Motion, centre: Array) -> Array:
-    """State (18,) of a motion for points taken relative to ``centre`` (3,)."""
+    """State (24,) of a motion for points taken relative to ``centre`` (3,)."""
     rotation = np.asarray(motion.rotation, float)
     translation = motion.translation + rotation @ centre
     return np.concatenate(
-        [rotation.ravel(), translation, motion.angular_velocity, motion.linear_velocity]
-    )
+        [
+            rotation.ravel(), translation, motion.angular_velocity, motion.linear_velocity,
+            motion.angular_acceleration, motion.linear_acceleration,
+        ]
+    )  # fmt: skip
 
 
 def _unit(vector: ArrayLike) -> Array:
@@ -192,11 +239,11 @@ def _unit(vector: ArrayLike) -> Array:
 
 
 def _inverse(covariance: Array) -> Array:
-    """Information of a covariance, zero for parameters of infinite variance."""
-    information = np.zeros((12, 12))
+    """Information (18,18) of a covariance, zero for parameters of infinite variance."""
+    information = np.zeros((PARAMETERS, PARAMETERS))
     known = np.flatnonzero(np.isfinite(np.diag(covariance)))
     block = np.ix_(known, known)
-    information[block] = np.linalg.inv(np.asarray(covariance, float)[block])
+    information[block] = np.linalg.inv(covariance[block])
     return information
 
 
@@ -210,10 +257,14 @@ def add_prior(
     information: Array,
     slope: Array,
 ) -> float:
-    """Add the prior's part, times ``weight``, to the normal equations; returns its cost."""
+    """Add the prior's part, times ``weight``, to the normal equations; returns its cost.
+
+    These are of all 18 parameters, or of the first 12, while the accelerations are what they are.
+    """
     cost = 0.0
-    offset = np.empty(12)
-    pulled = np.empty(12)
+    size = len(slope)
+    offset = np.empty(PARAMETERS)
+    pulled = np.empty(PARAMETERS)
     # Derivative of the offset by a step: identity but for the rotation and position blocks.
     by_turn, by_move = np.empty((3, 3)), np.empty((3, 3))
     for term in range(len(informations)):
@@ -224,19 +275,20 @@ def add_prior(
         first = 0 if posed else 6
         for i in range(6):
             offset[i] = 0.0
-            offset[6 + i] = state[12 + i] - reference[12 + i]
+        for i in range(6, PARAMETERS):
+            offset[i] = state[6 + i] - reference[6 + i]
         if posed:
             _pose_offset(state, reference, offset, by_turn, by_move)
-        for i in range(first, 12):
+        for i in range(first, PARAMETERS):
             total = 0.0
-            for j in range(first, 12):
+            for j in range(first, PARAMETERS):
                 total += prior[i, j] * offset[j]
             pulled[i] = weight * total
             cost += offset[i] * pulled[i]
         if not posed:
-            for i in range(6, 12):
+            for i in range(6, size):
                 slope[i] += pulled[i]
-                for j in range(6, 12):
+                for j in range(6, size):
                     information[i, j] += weight * prior[i, j]
             continue
         _add_posed(prior, pulled, by_turn, by_move, weight, information, slope)
@@ -256,8 +308,9 @@ def _add_posed(
     slope: Array,
 ) -> None:
     """Add J^T P J and J^T p, where J is the identity but for the blocks of turn and move."""
+    size = len(slope)
     half = prior.copy()  # P J
-    for i in range(12):
+    for i in range(size):
         for j in range(3):
             turned, moved = 0.0, 0.0
             for k in range(3):
@@ -265,20 +318,20 @@ def _add_posed(
                 moved += prior[i, 3 + k] * by_move[k, j]
             half[i, j], half[i, 3 + j] = turned, moved
     for i in range(3):
-        for j in range(12):
+        for j in range(size):
             turned, moved = 0.0, 0.0
             for k in range(3):
                 turned += by_turn[k, i] * half[k, j]
                 moved += by_move[k, i] * half[3 + k, j]
             information[i, j] += weight * turned
             information[3 + i, j] += weight * moved
-            information[6 + i, j] += weight * half[6 + i, j]
-            information[9 + i, j] += weight * half[9 + i, j]
         for k in range(3):
             slope[i] += by_turn[k, i] * pulled[k]
             slope[3 + i] += by_move[k, i] * pulled[3 + k]
-        slope[6 + i] += pulled[6 + i]
-        slope[9 + i] += pulled[9 + i]
+    for i in range(6, size):
+        slope[i] += pulled[i]
+        for j in range(size):
+            information[i, j] += weight * half[i, j]
 
 
 @kernel

@@ -11,51 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.observations import Observations
 from rs_localizer.core.prior import PriorTerms
-from rs_localizer.core.residuals import pack, row_paces, squared_errors
-from rs_localizer.core.sampling import IntArray, Pool, Random, draw
+from rs_localizer.core.sampling import Pool, Random, draw
 from rs_localizer.core.scoring import best_models, optimize
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.state import STATE_SIZE
 
 MODEL_SIZE = 18
 
 # Of every block this many hypotheses are optimised: a six-point model of inliers alone is often
 # not the first in a block, because noise makes it miss most of the other inliers.
 _KEEP = 2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observations:
-    """The points of one frame, ready for the kernels."""
-
-    points: Array  # (n,3) m, in a frame near them
-    rays: Array  # (n,2)
-    tau: Array  # (n,)
-    row_range: float  # of tau
-    row_time_gradient: Array  # (2,) per pixel
-    packed: Array
-
-    @classmethod
-    def of(
-        cls, points: Array, rays: Array, tau: Array, by_ray: Array, row_time_gradient: Array
-    ) -> Observations:
-        """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2)."""
-        packed = pack(points, rays, tau, by_ray)
-        return cls(points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed)
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def squared_errors(self, state: Array) -> Array:
-        """Squared reprojection errors (n,) in raw pixels."""
-        errors: Array = squared_errors(self.packed, len(self), state, self.row_time_gradient)
-        return errors
-
-    def row_paces(self, state: Array) -> Array:
-        """How much faster than the image points the rows move (n,): 1 at rest, 0 in step."""
-        paces: Array = row_paces(self.packed, len(self), state, self.row_time_gradient)
-        return paces
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +47,7 @@ class Hypotheses:
 class Candidate:
     """The best motion so far."""
 
-    state: Array  # (18,) of model B
+    state: Array  # (24,) of model B
     cost: float  # truncated, squared pixels
     samples: int = 0  # drawn until then
 
@@ -89,7 +56,7 @@ class Candidate:
         return bool(np.isfinite(self.cost))
 
 
-NOTHING = Candidate(np.zeros(18), math.inf)
+NOTHING = Candidate(np.zeros(STATE_SIZE), math.inf)
 
 
 def search(

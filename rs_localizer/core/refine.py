@@ -1,20 +1,23 @@
 """Refinement of a motion on many points: Levenberg-Marquardt in model B, with a prior.
 
 Parameters of a step, as in ``Estimate.covariance``: the camera turns by ``exp([phi]x)`` in its own
-axes, moves by ``rho`` along them, and the two velocities change additively.
+axes, moves by ``rho`` along them, and velocities and accelerations change additively.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms, add_prior
 from rs_localizer.core.residuals import normal_equations
-from rs_localizer.core.so3 import Array, exp, log
-from rs_localizer.core.view import PARAMETERS, STATE_SIZE
+from rs_localizer.core.so3 import exp, log
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 
 _MOST_DAMPING = 1e8
+# Pivots of a matrix of unit diagonal below this are rounding errors.
+_SINGULAR = 1e-15
 # More damping does not get along the flat valleys of planes that turn fast, less loses planes that
 # face the camera.
 _ANNEALING_DAMPING = 1e-4
@@ -23,7 +26,7 @@ _ANNEALING_RATIO = 0.6
 
 @kernel
 def apply_step(state: Array, step: Array) -> Array:
-    """The state moved by a step (12,)."""
+    """The state moved by a step (18,), or (12,) that leaves the accelerations."""
     turn = exp(-step[0:3])
     moved = np.empty(STATE_SIZE)
     for i in range(3):
@@ -36,13 +39,13 @@ def apply_step(state: Array, step: Array) -> Array:
             + turn[i, 1] * (state[10] - step[4])
             + turn[i, 2] * (state[11] - step[5])
         )
-    for i in range(6):
-        moved[12 + i] = state[12 + i] + step[6 + i]
+    for i in range(12, STATE_SIZE):
+        moved[i] = state[i] + (step[i - 6] if i - 6 < len(step) else 0.0)
     return moved
 
 
 def step_between(state: Array, other: Array) -> Array:
-    """The step (12,) that leads from one state to another."""
+    """The step (18,) that leads from one state to another."""
     turn = state[:9].reshape(3, 3) @ other[:9].reshape(3, 3).T
     return np.concatenate([log(turn), state[9:12] - turn @ other[9:12], other[12:] - state[12:]])
 
@@ -65,7 +68,7 @@ def solve_positive(matrix: Array, right: Array) -> tuple[Array, bool]:
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
             if i == j:
-                if not total > 1e-15:
+                if not total > _SINGULAR:
                     return right, False
                 factor[i, i] = np.sqrt(total)
             else:
@@ -127,24 +130,26 @@ def refine(
 
     Args:
         data: packed points, with weights.
-        start: state (18,).
+        start: state (24,).
         gradient: (2,) row time by pixel.
         scale, softness: of the robust loss, see :mod:`rs_localizer.core.residuals`.
         prior: see :mod:`rs_localizer.core.prior`.
         noise: standard deviation of the pixels, against which the prior is weighed.
-        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.core.view.View`).
+        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.core.view.View`); 1 holds the
+            accelerations.
         iterations: most steps.
         tolerance: a step that gains less than this, in noise variances, is the last one.
 
     Returns:
-        state (18,), information (12,12) times the noise variance, cost, and whether a step
-        was accepted as the last one or nothing more was to be gained.
+        state (24,), information (18,18) or (12,12) times the noise variance, cost, and whether a
+        step was accepted as the last one or nothing more was to be gained.
     """
     state = start.copy()
-    information = np.empty((PARAMETERS, PARAMETERS))
-    slope = np.empty(PARAMETERS)
-    next_information = np.empty((PARAMETERS, PARAMETERS))
-    next_slope = np.empty(PARAMETERS)
+    size = MOTION_PARAMETERS if looks == 1 else PARAMETERS
+    information = np.empty((size, size))
+    slope = np.empty(size)
+    next_information = np.empty((size, size))
+    next_slope = np.empty(size)
     cost = _posterior(
         data, state, gradient, scale, softness, prior, noise, looks, information, slope
     )
@@ -152,12 +157,12 @@ def refine(
     converged = False
     for _ in range(iterations):
         damped = information.copy()
-        for i in range(PARAMETERS):
+        for i in range(size):
             damped[i, i] *= 1.0 + damping
         step, solved = solve_positive(damped, -slope)
         gain = 0.0
         if solved:
-            for i in range(PARAMETERS):
+            for i in range(size):
                 gain -= step[i] * slope[i]
             trial = apply_step(state, step)
             trial_cost = _posterior(
@@ -197,12 +202,12 @@ def anneal(
     No step is tried twice: the next scale judges the points anew (graduated non-convexity).
     """
     state = start
-    information = np.empty((PARAMETERS, PARAMETERS))
-    slope = np.empty(PARAMETERS)
+    information = np.empty((MOTION_PARAMETERS, MOTION_PARAMETERS))
+    slope = np.empty(MOTION_PARAMETERS)
     scale = first_scale
     while scale > last_scale:
         _posterior(data, state, gradient, scale, 1.0, prior, noise, 1, information, slope)
-        for i in range(PARAMETERS):
+        for i in range(MOTION_PARAMETERS):
             information[i, i] *= 1.0 + _ANNEALING_DAMPING
         step, solved = solve_positive(information, -slope)
         if not solved:
@@ -213,34 +218,60 @@ def anneal(
 
 
 @kernel
-def invert_information(information: Array) -> tuple[Array, float]:
-    """Inverse of an information matrix and the smallest eigenvalue of its scaled form.
+def inverted(matrix: Array) -> Array:
+    """Inverse of a symmetric positive definite matrix by Cholesky; NaN where it is none.
 
-    The scaled form has a unit diagonal, so that units do not matter; where it is singular, or not
-    finite, the inverse is NaN.
+    Scaled to a unit diagonal first, so that units do not matter, nor parameters that a prior holds.
     """
-    size = len(information)
+    size = len(matrix)
     inverse = np.empty((size, size))
-    inverse[:] = np.nan
     scale = np.empty(size)
+    half = np.zeros((size, size))  # inverse of the factor
+    factor = np.empty((size, size))
+    inverse[:] = np.nan
+    for i in range(size):
+        if not matrix[i, i] > 0.0:
+            return inverse
+        scale[i] = 1.0 / np.sqrt(matrix[i, i])
+    for i in range(size):
+        for j in range(i + 1):
+            total = matrix[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = total / factor[j, j]
+            elif total > _SINGULAR:
+                factor[i, i] = np.sqrt(total)
+            else:
+                return inverse
+        half[i, i] = 1.0 / factor[i, i]
+        for j in range(i):
+            total = 0.0
+            for k in range(j, i):
+                total += factor[i, k] * half[k, j]
+            half[i, j] = -total * half[i, i]
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, size):
+                total += half[k, i] * half[k, j]
+            inverse[i, j] = total * scale[i] * scale[j]
+            inverse[j, i] = inverse[i, j]
+    return inverse
+
+
+@kernel
+def smallest_eigenvalue(information: Array) -> float:
+    """Of an information matrix scaled to a unit diagonal; 0 where it is none."""
+    size = len(information)
     scaled = np.empty((size, size))
     for i in range(size):
         if not information[i, i] > 0.0:
-            return inverse, 0.0
-        scale[i] = 1.0 / np.sqrt(information[i, i])
+            return 0.0
     for i in range(size):
         for j in range(size):
-            scaled[i, j] = information[i, j] * scale[i] * scale[j]
+            scaled[i, j] = information[i, j] / np.sqrt(information[i, i] * information[j, j])
             if not np.isfinite(scaled[i, j]):
-                return inverse, 0.0
-    values, vectors = np.linalg.eigh(scaled)
-    smallest = values[0]
-    if not smallest > 0.0:
-        return inverse, smallest
-    for i in range(size):
-        for j in range(size):
-            total = 0.0
-            for k in range(size):
-                total += vectors[i, k] * vectors[j, k] / values[k]
-            inverse[i, j] = scale[i] * scale[j] * total
-    return inverse, smallest
+                return 0.0
+    smallest: float = np.linalg.eigvalsh(scaled)[0]
+    return smallest

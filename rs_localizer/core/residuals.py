@@ -1,44 +1,49 @@
 """Reprojection errors of many points under one motion, and their normal equations.
 
-Points lie ``LANES`` at a time in the lanes, see :func:`pack`; a motion (model B of
-:mod:`rs_localizer.core.shutter`) is a state of 18 numbers: rotation (9, row-major), translation,
-angular velocity, linear velocity. What a point's error is stands in :mod:`rs_localizer.core.view`.
+Points lie ``LANES`` at a time in the lanes, see :func:`pack`; a motion is a state of
+:mod:`rs_localizer.core.state`. What a point's error is stands in :mod:`rs_localizer.core.view`.
 """
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES, Lanes, Vector, traced, traced_sums
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.view import (
-    PARAMETERS,
-    POINT_SIZE,
-    STATE_SIZE,
-    UNIFORM_SIZE,
-    View,
-    still_cost,
-)
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.core.view import POINT_SIZE, SHAKE_SIZE, UNIFORM_SIZE, View, still_cost
 
-# What a point gives to the normal equations: two rows of the weighted Jacobian, each with its
-# weighted error as the last column, and the cost.
-_COLUMNS = PARAMETERS + 1
-_ROWS_SIZE = 2 * _COLUMNS + 1
 # So many blocks at a time stay in the fast caches.
 _CHUNK = 32
-# The products of all pairs of columns, in tiles whose sums fit the registers.
-_GROUPS = (range(4), range(4, 8), range(8, _COLUMNS))
 
 
 def _tile(higher: range, lower: range) -> list[tuple[int, int]]:
     return [(i, j) for i in higher for j in lower if j <= i]
 
 
-_TILES = [_tile(_GROUPS[a], _GROUPS[b]) for a in range(len(_GROUPS)) for b in range(a + 1)]
+def _tiles(parameters: int) -> list[list[tuple[int, int]]]:
+    """All pairs of columns, the last of which is the error, in tiles whose sums fit registers."""
+    columns = parameters + 1
+    groups = [range(k, min(k + 4, columns)) for k in range(0, columns, 4)]
+    if len(groups[-1]) == 1:
+        groups[-2:] = [range(groups[-2].start, columns)]
+    return [_tile(groups[a], groups[b]) for a in range(len(groups)) for b in range(a + 1)]
+
+
+# What a point gives to the normal equations: two rows of the weighted Jacobian, each with its
+# weighted error as the last column, and the cost. With one look the 12 parameters of a search.
+_ROWS_SIZE = 2 * (MOTION_PARAMETERS + 1) + 1
+_CLOSER_ROWS_SIZE = 2 * (PARAMETERS + 1) + 1
+_TILES, _CLOSER_TILES = _tiles(MOTION_PARAMETERS), _tiles(PARAMETERS)
 _PAIRS = np.array([pair for tile in _TILES for pair in tile])
+_CLOSER_PAIRS = np.array([pair for tile in _CLOSER_TILES for pair in tile])
+# What :func:`linearized` says of a point: twice the error, its derivatives by the parameters and by
+# a turn at its row; and the row time.
+_LINE = 1 + PARAMETERS + 3
 
 
 def _squared_error(values: list[Lanes]) -> Vector:
@@ -46,7 +51,7 @@ def _squared_error(values: list[Lanes]) -> Vector:
 
 
 def _pace(values: list[Lanes]) -> Vector:
-    return [View(values, looks=1).pace]
+    return [View(values, looks=2).pace]
 
 
 def _cost(values: list[Lanes]) -> Vector:
@@ -64,8 +69,14 @@ def _rows(looks: int, values: list[Lanes]) -> Vector:
     return [weight * x for row, error in rows for x in (*row, error)] + [cost]
 
 
-def _products(tile: list[tuple[int, int]], values: list[Lanes]) -> Vector:
-    first, second = values[:_COLUMNS], values[_COLUMNS : 2 * _COLUMNS]
+def _lines(values: list[Lanes]) -> Vector:
+    view = View(values, looks=2, shaking=True)
+    lines = zip(view.error, view.jacobian(), view.by_shake(), strict=True)
+    return [x for error, row, turn in lines for x in (error, *row, *turn)] + [view.tau]
+
+
+def _products(columns: int, tile: list[tuple[int, int]], values: list[Lanes]) -> Vector:
+    first, second = values[:columns], values[columns : 2 * columns]
     return [first[i] * first[j] + second[i] * second[j] for i, j in tile]
 
 
@@ -79,9 +90,16 @@ _cost_lanes = traced(_cost, POINT_SIZE, UNIFORM_SIZE)
 _still_cost_lanes = traced(_still_cost, POINT_SIZE, UNIFORM_SIZE)
 _rows_lanes = traced(partial(_rows, 1), POINT_SIZE, UNIFORM_SIZE)
 _closer_rows_lanes = traced(partial(_rows, 2), POINT_SIZE, UNIFORM_SIZE)
-_sums = traced_sums(
-    _ROWS_SIZE, *((partial(_products, tile), len(tile)) for tile in _TILES), (_last, 1)
-)
+_lines_lanes = traced(_lines, POINT_SIZE + SHAKE_SIZE, UNIFORM_SIZE)
+
+
+def _summing(parameters: int, tiles: list[list[tuple[int, int]]]) -> Any:
+    parts = [(partial(_products, parameters + 1, tile), len(tile)) for tile in tiles]
+    return traced_sums(2 * (parameters + 1) + 1, *parts, (_last, 1))
+
+
+_sums = _summing(MOTION_PARAMETERS, _TILES)
+_closer_sums = _summing(PARAMETERS, _CLOSER_TILES)
 
 
 @kernel
@@ -192,15 +210,18 @@ def normal_equations(
     information: Array,
     slope: Array,
 ) -> float:
-    """Fill ``information`` (12,12) = J^T W J and ``slope`` (12,) = J^T W e; returns the cost.
+    """Fill ``information`` (p,p) = J^T W J and ``slope`` (p,) = J^T W e; returns the cost.
 
-    ``looks`` (1 or 2) at each point's row: see :class:`rs_localizer.core.view.View`.
+    ``looks`` at each point's row, see :class:`rs_localizer.core.view.View`: 1 for the 12
+    parameters of a search, 2 for all 18.
     """
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, gradient, scale, softness, uniform)
-    rows = np.empty((_CHUNK, _ROWS_SIZE * LANES))
-    sums = np.empty(len(_PAIRS) + 1)
-    totals = np.zeros(len(_PAIRS) + 1)
+    pairs = _PAIRS if looks == 1 else _CLOSER_PAIRS
+    size = _ROWS_SIZE if looks == 1 else _CLOSER_ROWS_SIZE
+    rows = np.empty((_CHUNK, size * LANES))
+    sums = np.empty(len(pairs) + 1)
+    totals = np.zeros(len(pairs) + 1)
     for start in range(0, len(data), _CHUNK):
         count = min(_CHUNK, len(data) - start)
         for block in range(count):
@@ -208,14 +229,60 @@ def normal_equations(
                 _rows_lanes(data[start + block], uniform, rows[block])
             else:
                 _closer_rows_lanes(data[start + block], uniform, rows[block])
-        _sums(rows, count, sums)
+        if looks == 1:
+            _sums(rows, count, sums)
+        else:
+            _closer_sums(rows, count, sums)
         totals += sums
-    for k in range(len(_PAIRS)):
-        i, j = _PAIRS[k, 0], _PAIRS[k, 1]
-        if i < PARAMETERS:
+    parameters = len(slope)
+    for k in range(len(pairs)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        if i < parameters:
             information[i, j] = totals[k]
             information[j, i] = totals[k]
-        elif j < PARAMETERS:
+        elif j < parameters:
             slope[j] = totals[k]
     cost: float = totals[-1]
     return cost
+
+
+@kernel
+def linearized(
+    data: Array, count: int, state: Array, gradient: Array, shake: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Each point's error and its derivatives at a motion and what the camera turns beside it.
+
+    Args:
+        data: packed points, ``count`` of them; weights are ignored.
+        state, gradient: as above.
+        shake: (count,6) the camera's turn at each measured row, in its own axes, and the rate.
+
+    Returns:
+        errors (count,2) px, derivatives (count,2,18) by the parameters and (count,2,3) by a turn
+        of the camera at this row alone, row times (count,).
+    """
+    uniform = np.empty(UNIFORM_SIZE * LANES)
+    spread_state(state, gradient, 1.0, 0.0, uniform)
+    block_data = np.zeros((POINT_SIZE + SHAKE_SIZE) * LANES)
+    lines = np.empty((2 * _LINE + 1) * LANES)
+    errors, by_motion = np.empty((count, 2)), np.empty((count, 2, PARAMETERS))
+    by_turn, tau = np.empty((count, 2, 3)), np.empty(count)
+    for block in range(len(data)):
+        first = block * LANES
+        block_data[: POINT_SIZE * LANES] = data[block]
+        here = min(LANES, count - first)
+        for lane in range(here):
+            for k in range(SHAKE_SIZE):
+                block_data[(POINT_SIZE + k) * LANES + lane] = shake[first + lane, k]
+        _lines_lanes(block_data, uniform, lines)
+        for lane in range(here):
+            i = first + lane
+            for row in range(2):
+                at = row * _LINE
+                errors[i, row] = lines[at * LANES + lane]
+                for k in range(PARAMETERS):
+                    by_motion[i, row, k] = lines[(at + 1 + k) * LANES + lane]
+                for k in range(3):
+                    by_turn[i, row, k] = lines[(at + 1 + PARAMETERS + k) * LANES + lane]
+            tau[i] = lines[2 * _LINE * LANES + lane]
+    return errors, by_motion, by_turn, tau

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.jit import kernel
-from rs_localizer.core.so3 import Array
 
-IntArray = NDArray[np.int64]
 Random = NDArray[np.uint64]  # (1,), the state of the generator
 
 

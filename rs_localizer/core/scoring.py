@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms
 from rs_localizer.core.refine import anneal, refine
 from rs_localizer.core.residuals import truncated_cost
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.view import STATE_SIZE
+from rs_localizer.core.state import STATE_SIZE
 
 # Of local optimisation, at the last scale.
 _ITERATIONS = 3
@@ -20,7 +20,7 @@ _TOLERANCE = 1.0
 @kernel
 def state_of_model(model: Array) -> Array:
     """State (model B) of a solver's model A (18,): ``omega = -w``, ``v = w x C - t``."""
-    state = np.empty(STATE_SIZE)
+    state = np.zeros(STATE_SIZE)
     for k in range(12):
         state[k] = model[k]
     c, w, t = model[9:12], model[12:15], model[15:18]
@@ -35,7 +35,7 @@ def state_of_model(model: Array) -> Array:
 def best_models(
     models: Array, data: Array, gradient: Array, scale: float, keep: int, bar: float
 ) -> tuple[Array, Array]:
-    """States (keep,18) and costs (keep,) of the models (k,18,h) with the least truncated error.
+    """States (keep,24) and costs (keep,) of the models (k,18,h) with the least truncated error.
 
     A model is left as soon as its cost exceeds that of the worst kept one, or ``bar``. Places that
     no model takes have infinite cost.

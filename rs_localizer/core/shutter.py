@@ -1,53 +1,75 @@
 """The rolling-shutter motion model: row time -> pose -> camera point -> pixel.
 
 Row time ``tau`` is -0.5 at the first exposed row (or column) of the full sensor image and 0.5 at
-the last. Over the readout the camera centre moves on a straight line and the camera turns at a
-constant body rate (model B of the project):
+the last. Over the readout the camera turns and its centre moves, both under constant acceleration
+(model B of the project):
 
-    camera_point(tau) = exp(-tau [omega]x) (R X + t - tau v)
+    camera_point(tau) = exp(-[tau omega + tau^2/2 alpha]x) (R X + t - tau v - tau^2/2 a)
 
 with ``R, t`` the pose camera_from_map at ``tau = 0``, ``omega`` the camera's body rate in rad per
-readout and ``v`` the velocity of its centre in metres per readout, along the camera axes at
-``tau = 0``. In the literature's letters (Kukelova et al., ACCV 2018): ``w = -omega``; model A
+readout and ``v`` the velocity of its centre in metres per readout, both along the camera axes at
+``tau = 0``, and their changes ``alpha`` and ``a``. The minimal solvers know no accelerations.
+ In the literature's letters (Kukelova et al., ACCV 2018): ``w = -omega``; model A
 there has ``exp(tau [w]x) R X + t + tau t_drift``, so ``t_drift = w x t - v``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """A camera pose at the middle row and the velocities during the readout (see the module)."""
+    """A camera pose at the middle row and how it changes during the readout (see the module)."""
 
     rotation: Array  # (3,3) camera_from_map at tau = 0
     translation: Array  # (3,) m, camera_from_map at tau = 0
-    angular_velocity: Array  # (3,) rad per readout, body rate in camera axes
+    angular_velocity: Array  # (3,) rad per readout, body rate in camera axes at tau = 0
     linear_velocity: Array  # (3,) m per readout, of the camera centre, in camera axes at tau = 0
+    # (3,) rad and m per readout squared, in camera axes at tau = 0
+    angular_acceleration: Array = field(default_factory=lambda: np.zeros(3), kw_only=True)
+    linear_acceleration: Array = field(default_factory=lambda: np.zeros(3), kw_only=True)
 
     def at(self, tau: float) -> tuple[Array, Array]:
         """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
-        turn = so3.exp(-tau * self.angular_velocity)
-        return turn @ self.rotation, turn @ (self.translation - tau * self.linear_velocity)
+        turn = so3.exp(-self.angle_at(tau))
+        return turn @ self.rotation, turn @ (self.translation - self.way_at(tau))
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
-        tau = np.asarray(tau, float)
-        turns = so3.exp_many(-tau[:, None] * self.angular_velocity)
-        moved = self.translation - tau[:, None] * self.linear_velocity
+        tau = np.asarray(tau, float)[:, None]
+        turns = so3.exp_many(-self.angle_at(tau))
+        moved = self.translation - self.way_at(tau)
         return turns @ self.rotation, np.einsum("nij,nj->ni", turns, moved)
+
+    def angle_at(self, tau: Any) -> Array:
+        """Rotation vector (3,) of the turn from the middle row to ``tau``."""
+        angle: Array = tau * self.angular_velocity + 0.5 * tau * tau * self.angular_acceleration
+        return angle
+
+    def way_at(self, tau: Any) -> Array:
+        """Way (3,) of the centre from the middle row to ``tau``, in camera axes at tau = 0."""
+        way: Array = tau * self.linear_velocity + 0.5 * tau * tau * self.linear_acceleration
+        return way
+
+    def angular_velocity_at(self, tau: float) -> Array:
+        """Body rate (3,) at ``tau``, rad per readout, in the camera axes of that moment."""
+        rate = self.angular_velocity + tau * self.angular_acceleration
+        body_rate: Array = so3.right_jacobian(self.angle_at(tau)) @ rate
+        return body_rate
 
     def linear_velocity_at(self, tau: float) -> Array:
         """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
-        return so3.exp(-tau * self.angular_velocity) @ self.linear_velocity
+        velocity = self.linear_velocity + tau * self.linear_acceleration
+        return so3.exp(-self.angle_at(tau)) @ velocity
 
 
 def from_model_a(rotation: Array, translation: Array, w: Array, drift: Array) -> Motion:

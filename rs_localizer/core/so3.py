@@ -7,11 +7,9 @@ Python and from other kernels alike.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
-
-Array = NDArray[np.float64]
 
 # Below this angle the series of the coefficients are exact to double precision.
 _SMALL_ANGLE = 1e-3

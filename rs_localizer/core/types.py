@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.model_error import shake_at
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
-
-BoolArray = NDArray[np.bool_]
+from rs_localizer.core.state import MOTION_PARAMETERS
 
 
 class Reason(StrEnum):
@@ -26,6 +26,7 @@ class Reason(StrEnum):
     DEGENERATE = "degenerate"
     IMPLAUSIBLE = "implausible"
     MIRRORED = "mirrored"
+    MODEL_ERROR = "model_error"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -34,14 +35,60 @@ class Estimate(Motion):
 
     ``covariance`` orders its 12 rows: rotation (the camera turns by exp of it, in its own axes),
     camera position in camera axes, angular velocity, linear velocity; units as the fields.
+    Accelerations and shaking are averaged out of it; ``joint_covariance`` has them behind, in the
+    order of ``rs_localizer.core.state`` and of ``shake``.
     """
 
     inliers: BoolArray  # (n,)
     residuals: Array  # (n,) reprojection error in raw pixels, NaN where a point was unusable
-    covariance: Array  # (12,12)
+    joint_covariance: Array  # (18 + 3 k, 18 + 3 k)
     global_shutter_inliers: int  # of the best global-shutter pose, at the same threshold
     iterations: int  # minimal samples drawn
+    # (k,3) rad: what the camera turns beside the motion, polynomials of the row time (see
+    # rs_localizer.core.model_error); most of it is vibration
+    shake: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
+    # What the frame says of how large shaking and model error are: logarithms of the odds of
+    # the sizes that rs_localizer.core.settling tries.
+    of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
+    of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
     tracked: bool = False  # found near a prior motion, without a search
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (12,12) of pose and velocities at tau = 0."""
+        return self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+
+    def shake_at(self, tau: float) -> tuple[Array, Array]:
+        """Turn (3,) of the camera beside the motion, and its rate (3,), at row time ``tau``."""
+        turn = shake_at(np.array([tau]), self.shake)[0]
+        return turn[:3], turn[3:]
+
+    def at(self, tau: float) -> tuple[Array, Array]:
+        """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
+        # No super(): a dataclass with slots is made anew.
+        rotation, translation = Motion.at(self, tau)
+        shaken = so3.exp(-self.shake_at(tau)[0])
+        return shaken @ rotation, shaken @ translation
+
+    def at_rows(self, tau: Array) -> tuple[Array, Array]:
+        """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
+        rotations, translations = Motion.at_rows(self, tau)
+        turns = shake_at(np.asarray(tau, float), self.shake)
+        shaken = so3.exp_many(-turns[:, :3])
+        return shaken @ rotations, np.einsum("nij,nj->ni", shaken, translations)
+
+    def angular_velocity_at(self, tau: float) -> Array:
+        """Body rate (3,) at ``tau``, rad per readout, in the camera axes of that moment."""
+        turn, rate = self.shake_at(tau)
+        body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self, tau)
+        shaken: Array = body_rate + so3.right_jacobian(turn) @ rate
+        return shaken
+
+    def linear_velocity_at(self, tau: float) -> Array:
+        """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
+        velocity: Array = so3.exp(-self.shake_at(tau)[0]) @ Motion.linear_velocity_at(self, tau)
+        return velocity
 
     @property
     def position(self) -> Array:

@@ -21,9 +21,9 @@ from numba.core import cgutils
 from numba.core.typing import templates
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES
-from rs_localizer.core.so3 import Array
 
 # Numba has types, but not for these.
 _get_or_insert_function: Any = cgutils.get_or_insert_function

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import sqlite3
 from collections.abc import Collection, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +16,14 @@ from types import TracebackType
 from typing import Any, Self
 
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_typestore
@@ -24,6 +33,14 @@ STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _SUFFIXES = (".mcap", ".db3", ".bag")
 # Fields that ROS 2 spells in lower case.
 _ROS1_FIELDS = {"sensor_msgs/msg/CameraInfo": {"D": "d", "K": "k", "R": "r", "P": "p"}}
+# Whoever plays a recording offers its topics as it says; on /tf_static everybody listens for what
+# was said before.
+_NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
+    _NO_LIMIT, _NO_LIMIT, QosLiveliness.AUTOMATIC, _NO_LIMIT, False,
+)  # fmt: skip
+_LATCHED_TOPICS = ("/tf_static",)
 
 
 class BagError(ValueError):
@@ -104,6 +121,14 @@ def open_bag(path: Path | str) -> Iterator[BagReader]:
         yield bag
 
 
+def is_bag(path: Path) -> bool:
+    """Whether a path looks like a recording, and not like a video or a folder of images."""
+    if path.is_dir():
+        holds = {file.suffix for file in path.iterdir()}
+        return (path / "metadata.yaml").exists() or bool(holds & set(_SUFFIXES))
+    return path.suffix in _SUFFIXES
+
+
 def _storage(path: Path) -> Path:
     """What rosbags opens for this path."""
     if not path.exists():
@@ -158,14 +183,14 @@ class BagWriter:
     """Writes a rosbag2 directory; a context manager.
 
     What was written before an exception (Ctrl-C among them) stays readable; without any message,
-    nothing is left.
+    nothing is left (see :mod:`rs_localizer.io.whole` for all or nothing).
 
     Args:
         path: the directory to create.
         storage: ``mcap`` or ``sqlite3``.
 
     Raises:
-        BagError: when the path exists or cannot be created.
+        BagError: when the path exists, cannot be created, or its disk takes no more.
     """
 
     def __init__(self, path: Path | str, storage: str = "mcap") -> None:
@@ -189,14 +214,29 @@ class BagWriter:
 
     def write(self, topic: str, message: Any, stamp_ns: int) -> None:
         """Append a message of :func:`make_message`; ``stamp_ns`` is its time of recording."""
+        data = typestore().serialize_cdr(message, message.__msgtype__)
+        with self._explained():
+            self._writer.write(self._connection(topic, message.__msgtype__), stamp_ns, data)
+
+    def _connection(self, topic: str, type_name: str) -> Any:
         connection = self._connections.get(topic)
         if connection is None:
             connection = self._writer.add_connection(
-                topic, message.__msgtype__, typestore=typestore()
+                topic,
+                type_name,
+                typestore=typestore(),
+                offered_qos_profiles=[_LATCHED] if topic in _LATCHED_TOPICS else [],
             )
             self._connections[topic] = connection
-        data = typestore().serialize_cdr(message, message.__msgtype__)
-        self._writer.write(connection, stamp_ns, data)
+        return connection
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            text = error.strerror if isinstance(error, OSError) else None
+            raise BagError(f"{self._path} cannot be written: {text or error}") from error
 
     def __exit__(
         self,
@@ -204,6 +244,11 @@ class BagWriter:
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._writer.close()
-        if exc is not None and not self._connections:
+        if exc is None:
+            with self._explained():
+                self._writer.close()
+            return
+        with contextlib.suppress(OSError, sqlite3.Error):  # a full disk takes no end either
+            self._writer.close()
+        if not self._connections:
             shutil.rmtree(self._path)  # nothing was written: leave nothing in the way

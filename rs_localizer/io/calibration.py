@@ -1,14 +1,31 @@
-"""Calibration files: those of ROS' camera_calibration and of BoofCV."""
+"""Calibration files of other programs -> Camera.
+
+Read are YAML of ROS' camera_calibration and of BoofCV, YAML and XML of OpenCV's FileStorage,
+Kalibr's camchain, COLMAP's ``cameras.txt``, and JSON (or plain YAML) with the usual names. Of a
+file of several cameras, the wanted one's name stands behind a ``#``: ``camchain.yaml#cam1``.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.io.calibration_colmap import colmap_camera, is_colmap
+from rs_localizer.io.calibration_fields import camera_of_fields, looks_like_fields
+from rs_localizer.io.calibration_text import choose, load_tree
+from rs_localizer.io.yaml_text import YamlError
+
+CALIBRATION_KINDS = (
+    "calibration file of ROS' camera_calibration, OpenCV (YAML, XML), Kalibr (camchain), COLMAP "
+    "(cameras.txt), BoofCV, or JSON with K, D, width and height"
+)
+# Who writes FILE#cam1 means a camera in a file; a name of a file may hold the sign, too.
+_CHOICE = re.compile(r"(.+)#([^/#]+)")
 
 
 class CalibrationError(ValueError):
@@ -16,41 +33,98 @@ class CalibrationError(ValueError):
 
 
 def read_calibration(path: Path | str) -> Camera:
-    """Camera of a YAML file of ROS' camera_calibration, or of BoofCV (pinhole models).
+    """Camera of a calibration file (see the module), with the readout time left at 0.
 
-    The readout time is in neither and left at 0.
+    Args:
+        path: the file; ``FILE#NAME`` chooses one of several cameras in it.
 
     Raises:
         CalibrationError: for anything else, saying what was found.
     """
-    path = Path(path)
+    path, chosen = _split(Path(path))
     try:
-        tree = load_yaml(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        camera = _camera(text, chosen)
     except OSError as error:
         raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
     except (YamlError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
-    keys = set(tree) if isinstance(tree, dict) else set()
-    for key, reader in (("camera_matrix", _ros), ("pinhole", _boofcv)):
-        if key in keys:
-            try:
-                return reader(tree)
-            except (KeyError, TypeError, ValueError) as error:
-                fault = f"no {error}" if isinstance(error, KeyError) else str(error)
-                raise CalibrationError(f"{path} is no usable calibration: {fault}") from error
-    raise CalibrationError(
-        f"{path} is no calibration: expected a camera_matrix (ROS) or a pinhole (BoofCV), found "
-        f"{', '.join(sorted(map(str, keys))) or 'neither'}"
+        raise CalibrationError(
+            f"{path} is no YAML, JSON or XML file: {' '.join(str(error).split())}"
+        ) from error
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        fault = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise CalibrationError(f"{path} is no usable calibration: {fault}") from error
+    if camera is None:
+        raise CalibrationError(
+            f"{path} is no calibration: expected a {CALIBRATION_KINDS}; {_found(text)}"
+        )
+    x, y = camera.K[:2, 2]
+    if not (0.0 < x < camera.width and 0.0 < y < camera.height):
+        raise CalibrationError(
+            f"{path} is no usable calibration: its principal point ({x:g}, {y:g}) lies outside of "
+            f"its image of {camera.width}x{camera.height}: are width and height exchanged, or of "
+            "another resolution?"
+        )
+    return camera
+
+
+def _split(path: Path) -> tuple[Path, str | None]:
+    match = _CHOICE.fullmatch(str(path))
+    if match is None or path.exists():
+        return path, None
+    return Path(match[1]), match[2]
+
+
+def _camera(text: str, chosen: str | None) -> Camera | None:
+    if is_colmap(text):
+        return colmap_camera(text, chosen)
+    tree = load_tree(text)
+    if not isinstance(tree, dict):
+        return None
+    cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
+    if cameras:
+        return _kalibr(choose(cameras, chosen))
+    if chosen is not None:
+        raise ValueError(f"it has no camera {chosen!r} to choose")
+    readers: tuple[tuple[bool, Callable[[dict[str, Any]], Camera]], ...] = (
+        (_is_kalibr(tree), _kalibr),
+        ("pinhole" in tree, _boofcv),
+        (looks_like_fields(tree), camera_of_fields),
     )
+    return next((reader(tree) for fits, reader in readers if fits), None)
 
 
-def _ros(tree: dict[str, Any]) -> Camera:
+def _found(text: str) -> str:
+    try:
+        tree = load_tree(text)
+    except YamlError:
+        tree = None
+    keys = sorted(map(str, tree)) if isinstance(tree, dict) else []
+    return f"found {', '.join(keys[:8]) or 'neither'}"
+
+
+def _is_kalibr(tree: Any) -> bool:
+    return isinstance(tree, dict) and {"camera_model", "intrinsics", "resolution"} <= set(tree)
+
+
+def _kalibr(tree: dict[str, Any]) -> Camera:
+    if tree["camera_model"] != "pinhole":
+        raise ValueError(
+            f"camera_model must be pinhole, found {tree['camera_model']!r}: calibrate with "
+            "pinhole-radtan or, for a wide lens, pinhole-equi"
+        )
+    models = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
+    name = tree.get("distortion_model", "none")
+    if name not in models:
+        raise ValueError(f"distortion_model must be one of {', '.join(models)}; found {name!r}")
+    fx, fy, cx, cy = map(float, tree["intrinsics"])
+    width, height = tree["resolution"]
     return Camera(
-        width=int(tree["image_width"]),
-        height=int(tree["image_height"]),
-        K=np.array(tree["camera_matrix"]["data"], np.float64).reshape(3, 3),
-        D=np.array(tree["distortion_coefficients"]["data"], np.float64),
-        distortion_model=tree["distortion_model"],
+        width=int(width),
+        height=int(height),
+        K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+        D=np.array([] if name == "none" else tree["distortion_coeffs"], np.float64),
+        distortion_model=models[name],
     )
 
 

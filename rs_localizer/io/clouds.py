@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import Make, MessageError, frame_id, make_header, stamp_ns
 
 # sensor_msgs/PointField: the number of a type and its NumPy code.

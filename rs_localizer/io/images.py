@@ -1,6 +1,7 @@
 """sensor_msgs/Image and CompressedImage -> gray images, raw rows where the sensor has them.
 
-There is no limit of size: 50 megapixels work, they only take long.
+50 megapixels work, they only take long. A compressed image may be small and its pixels many: what
+its header says is held against a limit before anything is decoded.
 """
 
 from __future__ import annotations
@@ -61,8 +62,11 @@ _FORMATS = (
 )
 # Pixels per byte that nothing can be packed better than: a PNG of one bit per pixel, all alike.
 _DENSEST = 8 * 1032
+# No camera has more; decoded they take 8 bytes each at most.
+_MOST_PIXELS = 150_000_000
 # JPEG's markers of frames, by which the size is given.
 _FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+_ALONE = {0x01, *range(0xD0, 0xD8)}
 # Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.
 _AS_IT_IS = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 
@@ -131,10 +135,15 @@ def read_compressed_image(message: Any) -> Image:
     # OpenCV fills what is missing with gray and says nothing.
     if not _ends_with(data, end):
         raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
-    if (size := _claimed_size(data.tobytes(), name)) and math.prod(size) > _DENSEST * len(data):
+    size = _claimed_size(data.tobytes(), name)
+    if size is None:
+        raise MessageError(
+            f"the {name} image of {len(data)} bytes cannot be decoded: no header tells its size"
+        )
+    if math.prod(size) > min(_DENSEST * len(data), _MOST_PIXELS):
         raise MessageError(
             f"the {name} image says that it is {size[0]} x {size[1]}, of which {len(data)} bytes "
-            "cannot tell"
+            f"cannot tell, or which is more than {_MOST_PIXELS // 1_000_000} megapixels"
         )
     if name == "PNG" and not _has_whole_chunks(data.tobytes()):
         raise MessageError(f"the PNG image of {len(data)} bytes has a chunk that is longer than it")
@@ -157,7 +166,8 @@ def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
         if marker in _FRAME_HEADERS:
             height, width = struct.unpack_from(">HH", data, position + 5)
             return width, height
-        position += 2 + length
+        # Markers may be filled up with more of 0xFF, and some stand alone.
+        position += 1 if marker == 0xFF else 2 if marker in _ALONE else 2 + length
     return None
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.clouds import Rows, read_rows
 from rs_localizer.io.maps import Descriptors, Ids, Map, MapError, make_map
 from rs_localizer.io.messages import MessageError, frame_id, stamp_ns

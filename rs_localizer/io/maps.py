@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 Ids = NDArray[np.int64]
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]

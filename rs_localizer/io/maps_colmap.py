@@ -32,15 +32,15 @@ def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
         folder: with ``points3D.bin`` or ``points3D.txt``.
         frame: of the model.
         database: default: ``database.db`` in the folder or in one of the two above it, where
-            COLMAP leaves it; without one the map has no descriptors.
+            COLMAP leaves it, or the only ``.db`` file there that has descriptors; without one the
+            map has no descriptors.
 
     Raises:
         MapError: for anything that is no model, OSError as any file.
     """
     model = read_model(folder)
     if database is None:
-        places = (folder, *folder.resolve().parents[:2])
-        database = next((p / DATABASE for p in places if (p / DATABASE).is_file()), None)
+        database = _find_database((folder, *folder.resolve().parents[:2]))
     if database is None:
         return make_map(model.points, model.ids, None, frame)
     try:
@@ -50,6 +50,29 @@ def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
     found = make_map(model.points[known], model.ids[known], descriptors, frame)
     unknown = len(known) - int(np.count_nonzero(known))
     return Map(found.points, found.ids, found.descriptors, frame, found.dropped + unknown)
+
+
+def _find_database(places: tuple[Path, ...]) -> Path | None:
+    for place in places:
+        if (place / DATABASE).is_file():
+            return place / DATABASE
+    for place in places:
+        found = [path for path in sorted(place.glob("*.db")) if _has_descriptors(path)]
+        if len(found) > 1:
+            names = ", ".join(path.name for path in found)
+            raise MapError(f"{place} has several databases of COLMAP, {names}: name one")
+        if found:
+            return found[0]
+    return None
+
+
+def _has_descriptors(path: Path) -> bool:
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as tables:
+            query = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name='descriptors'"
+            return bool(tables.execute(query).fetchone()[0])
+    except sqlite3.Error:
+        return False
 
 
 def _descriptors(model: Model, database: Path) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:

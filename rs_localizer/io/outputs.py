@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core import so3
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import Make, make_header

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gzip
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -18,7 +18,7 @@ from typing import Literal, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
 _QUATERNION_TOLERANCE = 0.01
@@ -80,10 +80,15 @@ def read_tum(path: Path | str) -> Trajectory:
     return Trajectory(stamps_ns, values[:, :3], values[:, 3:] / norms[:, None])
 
 
-def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a TUM file; what is read back is the same to the last bit."""
+def write_tum(path: Path | str, trajectory: Trajectory, about: Sequence[str] = ()) -> None:
+    """Write a TUM file; what is read back is the same to the last bit.
+
+    Args:
+        about: lines of comment before the data.
+    """
     values = np.hstack([trajectory.positions, trajectory.quaternions])
-    _write_table(Path(path), "t x y z qx qy qz qw", trajectory.stamps_ns, values)
+    title = (*about, "t x y z qx qy qz qw")
+    _write_table(Path(path), title, trajectory.stamps_ns, values)
 
 
 def read_twists(path: Path | str) -> Twists:
@@ -92,10 +97,10 @@ def read_twists(path: Path | str) -> Twists:
     return Twists(stamps_ns, values[:, :3], values[:, 3:])
 
 
-def write_twists(path: Path | str, twists: Twists) -> None:
-    """Write a twist file; what is read back is the same to the last bit."""
+def write_twists(path: Path | str, twists: Twists, about: Sequence[str] = ()) -> None:
+    """Write a twist file as :func:`write_tum` does."""
     values = np.hstack([twists.angular, twists.linear])
-    _write_table(Path(path), "t wx wy wz vx vy vz", twists.stamps_ns, values)
+    _write_table(Path(path), (*about, "t wx wy wz vx vy vz"), twists.stamps_ns, values)
 
 
 def split_at_gaps(trajectory: Trajectory, factor: float = 3.0) -> list[Trajectory]:
@@ -174,8 +179,10 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise TrajectoryError(f"{path} cannot be read as text: {error}") from error
 
 
-def _write_table(path: Path, title: str, stamps_ns: Iterable[int], values: Array) -> None:
+def _write_table(
+    path: Path, comments: Iterable[str], stamps_ns: Iterable[int], values: Array
+) -> None:
     with _open(path, "w") as file:
-        file.write(f"# {title}\n")
+        file.writelines(f"# {line}\n" for line in comments)
         for stamp_ns, row in zip(stamps_ns, values.tolist(), strict=True):
             file.write(f"{format_stamp(stamp_ns)} {' '.join(map(repr, row))}\n")

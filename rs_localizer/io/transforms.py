@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.messages import Make, make_header
 
 # How far the squared norm of a quaternion may be from one; tf2 ignores those that are farther.
@@ -23,6 +23,10 @@ _NORM_TOLERANCE = 1e-2
 
 class TransformError(ValueError):
     """There is no such transform; the text names the frames and says why."""
+
+
+class NotYetError(TransformError):
+    """The transform is known for earlier times only."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +53,7 @@ class Transforms(Protocol):
         """``target_from_source`` at a time; None: the latest.
 
         Raises:
+            NotYetError: when it is known for earlier times, and may still come.
             TransformError: when it is not known for that time.
         """
 

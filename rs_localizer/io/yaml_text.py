@@ -28,11 +28,12 @@ def load_yaml(text: str) -> Any:
         raise YamlError(f"it nests deeper than {_DEEPEST}") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # dates and numbers that are none
         raise YamlError(" ".join(str(error).split())) from error
-    _check(tree)
+    check_tree(tree)
     return tree
 
 
-def _check(tree: Any) -> None:
+def check_tree(tree: Any) -> None:
+    """Refuse, with a YamlError, what is larger or deeper than anything that people write."""
     waiting, count = [(tree, 0)], 0
     while waiting:
         value, depth = waiting.pop()

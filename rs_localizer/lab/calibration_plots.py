@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.calibration import Calibration
 from rs_localizer.trajectory.evidence import likelihood, without_readout
 

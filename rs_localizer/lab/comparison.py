@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.messages import stamp_ns

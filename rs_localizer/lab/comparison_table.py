@@ -8,7 +8,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.comparison import Recording, Result
 from rs_localizer.lab.metrics import Errors
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.lab.video import Image
 from rs_localizer.markers.prints import Marker
 

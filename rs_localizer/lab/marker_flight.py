@@ -21,9 +21,9 @@ from typing import TextIO
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences

@@ -6,7 +6,7 @@ too, so that a print in black and white can be read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from numpy.lib.stride_tricks import sliding_window_view
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.metrics import Errors, Stamps
+from rs_localizer.lab.palette import BLUE, ORANGE
 from rs_localizer.lab.video import Image
 
 
@@ -30,16 +31,20 @@ class _Style:
     layer: int
 
 
-# Light orange below, dark blue above; the truth is a wide grey road under both.
-_STYLES = (_Style("#0b3c8c", ".", "-", 3), _Style("#f08a24", "x", "--", 2))
+# Orange below, dark blue above; the truth is a wide grey road under both.
+_STYLES = (_Style(BLUE, ".", "-", 3), _Style(ORANGE, "x", "--", 2))
 _TRUTH = "#c9c9c9"
 _DPI = 130
+_WIDTH, _TITLES = 10.0, 1.1  # inches
 # A pause of more frames than this breaks the lines.
 _LONGEST_GAP = 4.0
 # Frames of the running median that is drawn through the single errors.
 _WINDOW = 15
 # Zero has no logarithm.
 _LEAST = 1e-9
+# Axes end beyond all but so many percent of the values at each end, by this share of what lies
+# between; of a few values, all are shown.
+_RARE, _ROOM, _ROOM_OF_DIGITS, _FEW = 1.0, 0.5, 0.15, 20
 # What is shown of an image around the points, and the longest arrow (px).
 _RIM = 80.0
 
@@ -50,7 +55,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def _figure(title: str, height: float) -> Figure:
-    figure = Figure(figsize=(10.0, height), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(_WIDTH, height), dpi=_DPI, layout="constrained")
     figure.suptitle(title)
     return figure
 
@@ -92,13 +97,35 @@ def trajectories(truth: Trajectory | None, estimates: Mapping[str, Trajectory]) 
                 zorder=style.layer,
                 label=name,
             )
-        axes.set_aspect("equal", adjustable="datalim")
+        everything = [truth, *estimates.values()] if truth is not None else [*estimates.values()]
+        ranges = [_range([one.positions[:, k] for one in everything], _ROOM) for k in (a, b)]
+        half = 0.5 * max(high - low for low, high in ranges)
+        for limit, (low, high) in zip((axes.set_xlim, axes.set_ylim), ranges, strict=True):
+            limit(0.5 * (low + high) - half, 0.5 * (low + high) + half)
+        axes.set_aspect("equal")
         axes.set_xlabel("x (m)")
         axes.set_ylabel(f"{'xyz'[b]} (m)")
         axes.text(0.03, 0.96, title, transform=axes.transAxes, va="top", style="italic")
         _tidy(axes)
     _legend(left, 3)
     return figure
+
+
+def _range(parts: Sequence[Array], room: float) -> tuple[float, float]:
+    """What nearly all values of all series are within, with some room beyond (as a share): a
+    single one far off must not shrink all others.
+    """
+    values = np.concatenate([np.asarray(part, np.float64) for part in parts])
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return -1.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    if len(values) >= _FEW:
+        rare = np.percentile(values, [_RARE, 100.0 - _RARE])
+        more = room * (rare[1] - rare[0])
+        low, high = max(low, float(rare[0] - more)), min(high, float(rare[1] + more))
+    rim = 0.05 * (high - low) or 0.1
+    return low - rim, high + rim
 
 
 def _draw_way(axes: Axes, truth: Trajectory, a: int, b: int) -> None:
@@ -129,6 +156,9 @@ def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
                 _draw_series(
                     axes, name, style, one.stamps_ns, np.maximum(values(one), _LEAST), start, unit
                 )
+        digits = [np.log10(np.maximum(values(one), _LEAST)) for one in series.values()]
+        low, high = _range(digits, _ROOM_OF_DIGITS)
+        axes.set_ylim(10.0**low, 10.0**high)
         _plain_numbers(axes)
         axes.set_ylabel(f"{label} ({unit})")
         _tidy(axes)
@@ -217,13 +247,16 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
         predicted: (n,2) where each method's pose puts them.
         title: what image it is.
     """
-    figure = _figure(
-        f"{title}: from where the pose puts the points to where they are seen", 4.9
-    )
+    low, high = pixels.min(axis=0) - _RIM, pixels.max(axis=0) + _RIM
+    wide, tall = np.maximum(high - low, 1.0)
+    # As high as the pictures are, side by side, with their titles: no band stays blank.
+    height = float(np.clip(_WIDTH / len(predicted) * tall / wide, 1.0, _WIDTH)) + _TITLES
+    figure = _figure(f"{title}: from where the pose puts points to where they are seen", height)
     longest = max(float(np.linalg.norm(pixels - seen, axis=1).max()) for seen in predicted.values())
     magnification = _round_down(_RIM / longest) if longest > 0.0 else 1.0
+    panels = figure.subplots(1, len(predicted), squeeze=False)[0]
     for axes, (name, style), seen in zip(
-        figure.subplots(1, len(predicted)), _methods(predicted), predicted.values(), strict=True
+        panels, _methods(predicted), predicted.values(), strict=True
     ):
         offset = pixels - seen
         rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
@@ -236,7 +269,6 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
         axes.set_xlabel(f"arrows {magnification:g} times enlarged")
         axes.set_xticks([])
         axes.set_yticks([])
-        low, high = pixels.min(axis=0) - _RIM, pixels.max(axis=0) + _RIM
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(high[1], low[1])
     return figure

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import make_header
@@ -42,7 +42,7 @@ def write_parameters(directory: Path, readout_time: float, scan_direction: str) 
     """The shutter of a recording as a params file beside its data, for ``replay --params``."""
     config = NodeConfig(readout_time=readout_time, scan_direction=scan_direction)
     (directory / PARAMETERS).write_text(
-        f"{NODE_NAME}:\n  ros__parameters:\n"
+        f"/**/{NODE_NAME}:\n  ros__parameters:\n"  # in whatever namespace
         f"    readout_time: {config.readout_time!r}\n"
         f"    scan_direction: {config.scan_direction}\n",
         encoding="utf-8",
@@ -141,12 +141,12 @@ def _vector(vector: Array) -> Any:
     return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def make_camera_info(camera: Camera, stamp_ns: int) -> Any:
+def make_camera_info(camera: Camera, stamp_ns: int, frame: str = CAMERA_FRAME) -> Any:
     """The sensor_msgs/CameraInfo of a camera."""
     roi = camera.roi
     return make_message(
         "sensor_msgs/msg/CameraInfo",
-        header=make_header(make_message, stamp_ns, CAMERA_FRAME),
+        header=make_header(make_message, stamp_ns, frame),
         height=camera.height,
         width=camera.width,
         distortion_model=str(camera.distortion_model),

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.lab.planes import TexturedPlane, pyramids
 from rs_localizer.lab.render_kernel import render_lines
 from rs_localizer.lab.simulation import middle_stamp

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 # Points of the map; enough that a narrow camera close to a wall still sees some hundreds.
 _POINTS = 30_000

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.lab.true_motion import TrueMotion, TrueState
 
 # No points closer than this (m): a lens sees them as a blur.

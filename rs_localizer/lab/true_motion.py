@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline, make_lsq_spline
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory, split_at_gaps
 
 # Camera axes (x right, y down, z forward) in the body axes of a recorded trajectory; columns are

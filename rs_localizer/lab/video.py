@@ -1,9 +1,11 @@
-"""Videos as numbered JPEG images."""
+"""Videos as JPEG images with their presentation times."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,11 +27,19 @@ class VideoError(ValueError):
     """A video that cannot be read; the message names the file."""
 
 
-def read_video(path: Path | str) -> Iterator[tuple[bytes, Image]]:
-    """The images of a video, each as JPEG and decoded as grey (height, width).
+class VideoImage(NamedTuple):
+    """One image of a video."""
 
-    A plain stream of JPEG images (``.mjpeg``) keeps its bytes; anything else that OpenCV reads is
-    compressed anew.
+    jpeg: bytes
+    image: Image  # grey (height, width)
+    seconds: float | None  # presentation time since the first image; None: the file does not say
+
+
+def read_video(path: Path | str) -> Iterator[VideoImage]:
+    """The images of a video, in the order of presentation.
+
+    A plain stream of JPEG images (``.mjpeg``) keeps its bytes and has no times; anything else that
+    OpenCV reads is compressed anew.
 
     Raises:
         VideoError: when the file is missing or holds no image.
@@ -40,21 +50,32 @@ def read_video(path: Path | str) -> Iterator[tuple[bytes, Image]]:
     with path.open("rb") as file:
         is_stream = file.read(2) == _JPEG_START
     found = False
-    for jpeg, image in _from_stream(path) if is_stream else _from_container(path):
+    for item in _from_stream(path) if is_stream else _from_container(path):
         found = True
-        yield jpeg, image
+        yield item
     if not found:
         raise VideoError(f"{path} holds no image that OpenCV can read")
 
 
-def _from_stream(path: Path) -> Iterator[tuple[bytes, Image]]:
+def _from_stream(path: Path) -> Iterator[VideoImage]:
     for jpeg in split_jpegs(path.read_bytes()):
         image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_IT_IS)
         if image is not None:
-            yield jpeg, np.asarray(image, np.uint8)
+            yield VideoImage(jpeg, np.asarray(image, np.uint8), None)
 
 
-def _from_container(path: Path) -> Iterator[tuple[bytes, Image]]:
+def has_times(path: Path | str) -> bool:
+    """Whether a video has presentation times; a single image needs none.
+
+    Raises:
+        VideoError: when it cannot be read.
+    """
+    first = list(itertools.islice(read_video(path), 2))
+    return first[-1].seconds is not None
+
+
+def _from_container(path: Path) -> Iterator[VideoImage]:
+    last = -1.0
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as with _AS_IT_IS
     try:
@@ -64,7 +85,14 @@ def _from_container(path: Path) -> Iterator[tuple[bytes, Image]]:
                 return
             _, jpeg = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
             grey = color if color.ndim == 2 else cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
-            yield jpeg.tobytes(), np.asarray(grey, np.uint8)
+            # Of the image just read. OpenCV 4.6 says 0 for those last images that a decoder with
+            # B frames holds back, and for all images of a raw stream.
+            seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
+            known = seconds > last
+            last = max(last, seconds)
+            yield VideoImage(
+                jpeg.tobytes(), np.asarray(grey, np.uint8), seconds if known else None
+            )
     finally:
         video.release()
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.planes import TexturedPlane
 from rs_localizer.lab.textures import collage
 from rs_localizer.lab.true_motion import TrueState

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import Gray
 from rs_localizer.markers.prints import Charuco, Chessboard
 
@@ -34,6 +36,8 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
     Returns:
         None when the whole board is not seen.
     """
+    if board.inverted:
+        image = np.asarray(cv2.bitwise_not(image), np.uint8)
     small, scale = _shrunk(image)
     if min(small.shape) < _SMALLEST_SEARCH:
         return None
@@ -45,7 +49,11 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
     gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     window = int(np.clip(_WINDOW_SHARE * min(gaps), *_WINDOW_RANGE))
     refined = _refine(_smooth(image), grid, window)
-    return _ordered(refined.reshape(board.rows, board.columns, 2), image, previous)
+    return ordered(
+        refined.reshape(board.rows, board.columns, 2),
+        previous,
+        lambda candidate: _starts_black(candidate, image),
+    )
 
 
 def find_charuco(
@@ -132,19 +140,26 @@ def _refine(smooth: Gray, corners: Array, window: int) -> Array:
     return np.asarray(refined, np.float64).reshape(-1, 2)
 
 
-def _ordered(grid: Array, image: Gray, previous: Array | None) -> Array:
+def ordered(
+    grid: Array, previous: Array | None, possible: Callable[[Array], bool] = lambda grid: True
+) -> Array:
+    """Pixels (n,2) of a grid (rows,columns,2) in the order of its print, row by row.
+
+    Of the orders that are ``possible``, the one that is closest to the ``previous`` pixels (n,2);
+    without them, the one that reads as text does.
+    """
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if along[0] * down[1] - along[1] * down[0] < 0.0:
         grid = grid[:, ::-1]  # a mirrored order would show the board from behind
     turns = range(4) if grid.shape[0] == grid.shape[1] else range(0, 4, 2)
     candidates = [np.rot90(grid, turn) for turn in turns]
-    black = [candidate for candidate in candidates if _starts_black(candidate, image)]
+    agreed = [candidate for candidate in candidates if possible(candidate)]
     if previous is not None:
         reference = previous.reshape(grid.shape)
-        costs = [float(np.abs(candidate - reference).sum()) for candidate in black or candidates]
+        costs = [float(np.abs(candidate - reference).sum()) for candidate in agreed or candidates]
     else:
-        costs = [float(candidate[0, 0].sum()) for candidate in black or candidates]
-    return (black or candidates)[int(np.argmin(costs))].reshape(-1, 2)
+        costs = [float(candidate[0, 0].sum()) for candidate in agreed or candidates]
+    return (agreed or candidates)[int(np.argmin(costs))].reshape(-1, 2)
 
 
 def _starts_black(grid: Array, image: Gray) -> bool:

@@ -10,19 +10,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.prints import Board, Chessboard, Marker
+from rs_localizer.markers.prints import Board, Marker
 
 # Prints within this distance of a plane (in sides of the marker) and this angle are in one.
 _SAME_PLANE, _PARALLEL = 0.2, np.cos(np.radians(5.0))
 # A marker this many times larger than the median has its size in another unit, and so have all of
 # them if they are larger than any that is printed (m).
 _OTHER_UNIT, _LARGEST = 20.0, 5.0
+# Squares and circles of boards are farther apart than this (m) on no print.
+_LARGEST_SQUARE = 2.0
 
 
 def problems(marker_map: MarkerMap) -> list[str]:
     """What is wrong with a map that could be read; empty if nothing is."""
     return [
-        *_other_units(marker_map.markers),
+        *other_units(marker_map),
         *(text for a, b in _near(_plates(marker_map)) for text in _pair(a, b)),
     ]
 
@@ -37,9 +39,8 @@ class _Plate:
             width = height = self.side = item.size
             self.rim = item.size / item.family.cells
         else:
-            more = 1 if isinstance(item, Chessboard) else 0
-            width, height = (item.columns + more) * item.square, (item.rows + more) * item.square
-            self.side = self.rim = item.square
+            width, height = item.extent
+            self.side = self.rim = item.spacing
         x, y = 0.5 * width, 0.5 * height
         # What :func:`_pair` looks at is within the reaches of both.
         self.reach = float(np.hypot(x, y)) + 2.0 * self.side
@@ -58,6 +59,17 @@ def _near(plates: list[_Plate]) -> Iterator[tuple[_Plate, _Plate]]:
         apart = np.linalg.norm(middles[k + 1 :] - middles[k], axis=1)
         for other in np.flatnonzero(apart <= reaches[k + 1 :] + reaches[k]).tolist():
             yield plate, plates[k + 1 + other]
+
+
+def other_units(marker_map: MarkerMap) -> Iterator[str]:
+    """What speaks for sizes that are not in metres."""
+    for board in marker_map.boards:
+        if board.spacing > _LARGEST_SQUARE:
+            yield (
+                f"{board.name} with {board.spacing:g} m from corner to corner: sizes are in "
+                f"metres; {1e-3 * board.spacing:g} would be {board.spacing:g} mm"
+            )
+    yield from _other_units(marker_map.markers)
 
 
 def _other_units(markers: tuple[Marker, ...]) -> Iterator[str]:

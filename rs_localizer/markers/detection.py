@@ -11,18 +11,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.chessboards import find_charuco, find_chessboard
+from rs_localizer.markers.circles import find_circles
 from rs_localizer.markers.dictionaries import DictionaryError, Gray, MarkerFinder
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import Family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.prints import Charuco, Chessboard
+from rs_localizer.markers.prints import Board, Charuco, Chessboard
 
 IntArray = NDArray[np.int64]
 
-# After this long without a chessboard (ns) it may lie the other way round.
+# After this long without a board (ns) it may lie the other way round.
 _LONGEST_LOSS_NS = 1_000_000_000
+# Other markers of a family larger than this are looked for in the first images, and then in one of
+# so many: they are only told of, and a large family takes several times as long.
+_LARGE, _FIRST_IMAGES, _ONE_IN = 100, 5, 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +57,9 @@ class Detections:
 class MarkerDetector:
     """Finds the markers and boards of a map.
 
+    What is found of the map depends on the image alone (and for a board that looks the same turned
+    on the image before); of large families, :attr:`Detections.unknown` is told now and then only.
+
     Args:
         marker_map: what to look for.
         min_side: markers with a shorter side (px) are left out.
@@ -68,12 +75,13 @@ class MarkerDetector:
         self._min_side = min_side
         self._points = marker_map.points
         self._finders = _finders(marker_map)
+        self._images = 0
         self._places: dict[tuple[str, int], int] = {}  # kind and id of a marker -> row
         row = 0
         for marker in marker_map.markers:
             self._places[marker.family.kind, marker.id] = row
             row += 4
-        self._boards: list[tuple[int, Chessboard | Charuco]] = []
+        self._boards: list[tuple[int, Board]] = []
         self._on_boards: set[tuple[str, int]] = set()
         for board in marker_map.boards:
             self._boards.append((row, board))
@@ -83,21 +91,17 @@ class MarkerDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget how a chessboard lay in the last image."""
-        self._chessboard: Array | None = None
-        self._chessboard_ns = 0
-
-    def warm_up(self) -> None:
-        """Compile the kernels."""
-        refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), np.full(1, 6))
+        """Forget how a board lay in the last image."""
+        self._last_board: Array | None = None
+        self._last_board_ns = 0
 
     def detect(self, image: Gray, stamp_ns: int = 0) -> Detections:
         """All corners of the map that an image shows.
 
         Args:
             image: (h,w) uint8.
-            stamp_ns: for chessboards that look the same turned by half: they keep their order
-                from image to image, unless they were lost for a second or time went back.
+            stamp_ns: for boards that look the same turned by half: they keep their order from
+                image to image, unless they were lost for a second or time went back.
 
         Raises:
             ValueError: for another kind of array.
@@ -106,13 +110,15 @@ class MarkerDetector:
             raise ValueError(f"an image must be (h,w) uint8, got {image.dtype} {image.shape}")
         started = time.perf_counter()
         image = np.ascontiguousarray(image)
-        seen = [self._seen(finder, image) for finder in self._finders]
+        everything = self._images < _FIRST_IMAGES or self._images % _ONE_IN == 0
+        self._images += 1
+        seen = [self._seen(all_ if everything else own, image) for own, all_ in self._finders]
         parts = [self._corners(item) for item in seen]
         boards = []
         for row, board in self._boards:
             looking = time.perf_counter()
             rows, pixels = self._board(image, board, seen, stamp_ns)
-            if isinstance(board, Chessboard):
+            if not isinstance(board, Charuco):
                 self.opencv_seconds += time.perf_counter() - looking
             if len(rows):
                 parts.append((row + rows, pixels, _spacings(pixels)))
@@ -167,7 +173,7 @@ class MarkerDetector:
         return corners, seen.quads[used], scores
 
     def _board(
-        self, image: Gray, board: Chessboard | Charuco, seen: list[Seen], stamp_ns: int
+        self, image: Gray, board: Board, seen: list[Seen], stamp_ns: int
     ) -> tuple[IntArray, Array]:
         """Rows of the board's points, and their pixels."""
         if isinstance(board, Charuco):
@@ -176,25 +182,39 @@ class MarkerDetector:
             own = item.known & (item.ids >= board.first_id) & (item.ids < last)
             own &= item.found.all(axis=1)
             return find_charuco(image, board, item.ids[own], item.quads[own])
-        if not 0 <= stamp_ns - self._chessboard_ns <= _LONGEST_LOSS_NS:
-            self._chessboard = None
-        corners = find_chessboard(image, board, self._chessboard)
+        if not 0 <= stamp_ns - self._last_board_ns <= _LONGEST_LOSS_NS:
+            self._last_board = None
+        if isinstance(board, Chessboard):
+            corners = find_chessboard(image, board, self._last_board)
+        else:
+            corners = find_circles(image, board, self._last_board)
         if corners is None:
             return np.empty(0, np.int64), np.empty((0, 2))
-        self._chessboard, self._chessboard_ns = corners, stamp_ns
+        self._last_board, self._last_board_ns = corners, stamp_ns
         return np.arange(len(corners)), corners
 
 
-def _finders(marker_map: MarkerMap) -> list[MarkerFinder]:
-    """One per kind of family: the largest that the map names."""
+def warm_up() -> None:
+    """Compile the kernels of detection."""
+    refine(np.zeros((8, 8), np.uint8), np.zeros((1, 4, 2)), np.full(1, 6))
+
+
+def _finders(marker_map: MarkerMap) -> list[tuple[MarkerFinder, MarkerFinder]]:
+    """For each kind of family, one that knows the map's ids, if that is faster, and one of all."""
     families: dict[str, Family] = {}
+    ids: dict[str, set[int]] = {}
     for marker, _ in marker_map.all_markers():
         kind = marker.family.kind
         largest = families.setdefault(kind, marker.family)
+        ids.setdefault(kind, set()).add(marker.id)
         if marker.family.count > largest.count:
             families[kind] = marker.family
     try:
-        return [MarkerFinder(family) for family in families.values()]
+        return [
+            (MarkerFinder(family, ids[kind]) if family.count > _LARGE else everything, everything)
+            for kind, family in families.items()
+            for everything in [MarkerFinder(family)]
+        ]
     except DictionaryError as error:
         raise MarkerMapError(str(error)) from error
 

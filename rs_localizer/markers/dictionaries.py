@@ -8,6 +8,7 @@ pattern of id 0 is known, and by it every dictionary is turned.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import lru_cache
 from typing import Any
 
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.families import Family
 
 Gray = NDArray[np.uint8]
@@ -42,14 +43,20 @@ def pattern(family: Family, id_: int) -> NDArray[np.bool_]:
 class MarkerFinder:
     """Finds the markers of one family.
 
+    Args:
+        family: of the markers.
+        ids: the only ones to look for; None: all. OpenCV compares every dark quadrilateral with
+            every pattern, so that a few are found several times faster than a thousand.
+
     Raises:
         DictionaryError: when this OpenCV does not know the family.
     """
 
-    def __init__(self, family: Family) -> None:
+    def __init__(self, family: Family, ids: Collection[int] | None = None) -> None:
         self.family = family
         self._turns = _turns(family)
-        dictionary = _dictionary(family)
+        self._ids = np.arange(family.count) if ids is None else np.array(sorted(ids), np.int64)
+        dictionary = _dictionary(family) if ids is None else _part(family, self._ids)
         if hasattr(_aruco, "ArucoDetector"):
             parameters = _configured(_aruco.DetectorParameters())
             self._find = _aruco.ArucoDetector(dictionary, parameters).detectMarkers
@@ -68,7 +75,8 @@ class MarkerFinder:
         if ids is None or len(ids) == 0:
             return np.empty(0, np.int64), np.empty((0, 4, 2))
         quads = np.concatenate(corners).reshape(-1, 4, 2).astype(np.float64)
-        return np.asarray(ids, np.int64).ravel(), np.roll(quads, -self._turns, axis=1)
+        found = self._ids[np.asarray(ids, np.int64).ravel()]
+        return found, np.roll(quads, -self._turns, axis=1)
 
 
 def _configured(parameters: Any) -> Any:
@@ -91,6 +99,16 @@ def _dictionary(family: Family) -> Any:
     if number is None:
         raise DictionaryError(f"OpenCV {cv2.__version__} does not know the family {family.name}")
     return _aruco.getPredefinedDictionary(number)
+
+
+def _part(family: Family, ids: NDArray[np.int64]) -> Any:
+    """A dictionary of some ids: those that differ by as many bits as the family's are kept apart,
+    and as many wrong bits are corrected.
+    """
+    whole = _dictionary(family)
+    part = _aruco.getPredefinedDictionary(getattr(_aruco, family.constant))  # a copy
+    part.bytesList = np.ascontiguousarray(whole.bytesList[ids])
+    return part
 
 
 def _bits(family: Family, id_: int) -> NDArray[np.uint8]:

@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
-from rs_localizer.core.so3 import Array
 
 # Most points along a side, of each round: the first only has to get near.
 _POINTS = (12, 32)

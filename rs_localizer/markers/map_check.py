@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.detection import Detections, IntArray
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker
@@ -42,7 +42,7 @@ class MapCheck:
 
     def fault(self, seen: Detections) -> str | None:
         """What is wrong with the map according to this image; None if nothing can be said."""
-        whole = _whole(seen, 4 * len(self._names))
+        whole = whole_markers(seen, 4 * len(self._names))
         for plane in sorted({self._planes[m] for m in whole}):
             flat = {m: rows for m, rows in whole.items() if self._planes[m] == plane}
             for some in _neighbourhoods(seen, flat):
@@ -122,7 +122,7 @@ def _planes(markers: tuple[Marker, ...]) -> list[int]:
     return numbers
 
 
-def _whole(seen: Detections, end: int) -> dict[int, IntArray]:
+def whole_markers(seen: Detections, end: int) -> dict[int, IntArray]:
     """Rows of the detections for each single marker of which all four corners were found."""
     place = {int(id_): row for row, id_ in enumerate(seen.ids) if id_ < end}
     markers = sorted({id_ // 4 for id_ in place})

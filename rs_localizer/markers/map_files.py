@@ -17,6 +17,14 @@
         square: 0.03
         position: [0.0, 0.0, 0.0]
         quaternion: [0.0, 0.0, 0.0, 1.0]
+        inverted: false            # optional: white on black paper
+      - type: circles              # or asymmetric_circles, OpenCV's pattern
+        columns: 4                 # circles
+        rows: 11
+        spacing: 0.02              # from row to row
+        position: [2.0, 0.0, 0.0]
+        quaternion: [0.0, 0.0, 0.0, 1.0]
+        inverted: false            # optional: white circles on black
       - type: charuco
         columns: 5                 # squares
         rows: 7
@@ -44,18 +52,26 @@ import numpy as np
 import yaml
 
 from rs_localizer.core import so3
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.poses import rotation_of_quaternion as _rotation
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
 # A pose stands for corners that it gives to within this share of a side.
 _SAME = 1e-9
 # Of a size that is given beside the corners.
 _SIZE_TOLERANCE = 0.05
+
+
+_CHESSBOARD, _CIRCLES, _ASYMMETRIC, _CHARUCO = _BOARDS = (
+    "chessboard",
+    "circles",
+    "asymmetric_circles",
+    "charuco",
+)
 
 
 def read_marker_map(path: Path | str) -> MarkerMap:
@@ -156,14 +172,19 @@ def _marker(entry: _Entry) -> Marker:
 def _board(entry: _Entry) -> Board:
     kind = entry.take("type", str)
     entry.where += f" ({kind})"
+    if kind not in _BOARDS:
+        raise _EntryError(f"{entry.where}: type must be one of {', '.join(_BOARDS)}")
     columns, rows = entry.take("columns", int), entry.take("rows", int)
-    square, pose = entry.number("square"), _pose(entry)
-    if kind == "chessboard":
+    spacing = entry.number("spacing") if "circles" in kind else 0.0
+    square = 0.0 if "circles" in kind else entry.number("square")
+    pose = _pose(entry)
+    if kind != _CHARUCO:
+        inverted = entry.take("inverted", bool, False)
         entry.finish()
         with entry.named():
-            return Chessboard(columns, rows, square, pose)
-    if kind != "charuco":
-        raise _EntryError(f"{entry.where}: type must be chessboard or charuco")
+            if kind == _CHESSBOARD:
+                return Chessboard(columns, rows, square, pose, inverted)
+            return CircleGrid(columns, rows, spacing, kind == _ASYMMETRIC, inverted, pose)
     marker, name = entry.number("marker"), entry.take("family", str)
     first_id, legacy = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
     entry.finish()
@@ -181,6 +202,21 @@ def _pose(entry: _Entry) -> Pose:
         return Pose(position, entry.take("rotation", list))
 
 
+_EXPLANATION = """\
+# Where prints are, in the frame map_frame; all lengths in metres.
+#   size: side of the black square of a marker, without the white rim around it
+#   square, spacing: of a board: side of its squares; from row to row of its circles
+#   position: of the middle of the print, x y z in map_frame
+#   quaternion: x y z w (not w x y z), of length 1; turns the print's axes into those of the map.
+#     Axes of a print: x to the right, y up, z out of the paper toward who looks at it.
+#     [0, 0, 0, 1]: the same axes as the map. [0.7071, 0, 0, 0.7071]: upright in a map whose z is up
+#     and whose y points into the wall.
+#   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
+# Measure what was put up, write it here, and check it: rs_localizer markers check FILE;
+# rs_localizer detect names a marker that is not where this file has it.
+"""
+
+
 def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
     """Write a map file that :func:`read_marker_map` reads."""
     tree: dict[str, Any] = {"map_frame": marker_map.map_frame}
@@ -189,7 +225,7 @@ def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
     if marker_map.boards:
         tree["boards"] = [_board_entry(board) for board in marker_map.boards]
     text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=100)
-    Path(path).write_text(text, encoding="utf-8")
+    Path(path).write_text(f"{_EXPLANATION}{text}", encoding="utf-8")
 
 
 def _marker_entry(marker: Marker) -> dict[str, Any]:
@@ -201,13 +237,20 @@ def _marker_entry(marker: Marker) -> dict[str, Any]:
 
 
 def _board_entry(board: Board) -> dict[str, Any]:
-    sizes = {"columns": board.columns, "rows": board.rows, "square": float(board.square)}
-    if isinstance(board, Chessboard):
-        return {"type": "chessboard"} | sizes | _pose_entry(board.pose)
+    sizes: dict[str, Any] = {"columns": board.columns, "rows": board.rows}
+    if not isinstance(board, Charuco):
+        inverted = {"inverted": True} if board.inverted else {}
+        if isinstance(board, Chessboard):
+            kind, sizes["square"] = _CHESSBOARD, float(board.square)
+        else:
+            kind = _ASYMMETRIC if board.asymmetric else _CIRCLES
+            sizes["spacing"] = float(board.spacing)
+        return {"type": kind} | sizes | _pose_entry(board.pose) | inverted
     return (
-        {"type": "charuco"}
+        {"type": _CHARUCO}
         | sizes
         | {
+            "square": float(board.square),
             "marker": float(board.marker),
             "family": board.family.name,
             "first_id": board.first_id,

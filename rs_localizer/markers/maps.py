@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
+from rs_localizer.markers.prints import Board, Charuco, Marker
 
 
 class MarkerMapError(ValueError):
@@ -46,10 +46,11 @@ class MarkerMap:
                     f"{marker.name} is there twice: as {owners[key]} and as {owner}"
                 )
             owners[key] = owner
-        chessboards = [(b.columns, b.rows) for b in self.boards if isinstance(b, Chessboard)]
-        if len(chessboards) > 1:
+        alike = [board.name for board in self.boards if not isinstance(board, Charuco)]
+        if len(alike) > 1:
             raise MarkerMapError(
-                f"there are {len(chessboards)} chessboards, which cannot be told apart; use ChArUco"
+                f"there are {len(alike)} boards without markers ({', '.join(alike)}), which cannot "
+                "be told apart; use ChArUco"
             )
 
     def all_markers(self) -> Iterator[tuple[Marker, str]]:

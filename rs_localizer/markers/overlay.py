@@ -14,20 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.dictionaries import Gray
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Chessboard
 
 Picture = NDArray[np.uint8]
 
-# Blue, green, red.
-_KNOWN, _FOREIGN, _CORNER, _CUBE = (0, 200, 0), (0, 0, 230), (0, 220, 255), (255, 160, 0)
-_AXES = ((0, 0, 255), (0, 255, 0), (255, 0, 0))
+# Blue, green, red. What is used is blue and whole, what is not is orange and crossed out: they
+# differ by lightness and shape, too, for those who do not tell red from green.
+_KNOWN, _FOREIGN, _CORNER, _CUBE = (230, 120, 0), (0, 150, 255), (0, 230, 255), (255, 0, 230)
+_AXES = (("x", (60, 60, 255)), ("y", (60, 220, 60)), ("z", (255, 90, 60)))
 _FIRST_RADIUS, _RADIUS = 4, 2
 # Digits after the point of drawn coordinates, in bits.
 _SHIFT = 4
@@ -63,14 +63,18 @@ class CameraPath:
 
 
 def draw_detections(image: Gray, seen: Detections) -> Picture:
-    """The image with outlines: green what is used, red what is not in the map or seen twice."""
+    """The image with outlines: blue what is used, orange and crossed what is not in the map or
+    seen twice.
+    """
     picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
     for item in seen.markers:
         for quad, id_, known in zip(item.quads, item.ids.tolist(), item.known, strict=True):
             color = _KNOWN if known else _FOREIGN
-            _line(picture, np.vstack([quad, quad[:1]]), color)
-            x, y = np.rint(quad.mean(axis=0)).astype(int).tolist()
-            cv2.putText(picture, str(id_), (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, 1)
+            _line(picture, np.vstack([quad, quad[:1]]), color, 2 if known else 1)
+            if not known:
+                _line(picture, quad[[0, 2]], color)
+                _line(picture, quad[[1, 3]], color)
+            _text(picture, str(id_), quad.mean(axis=0), color)
     for pixel, id_ in zip(seen.pixels, seen.ids.tolist(), strict=True):
         _dot(picture, pixel, _FIRST_RADIUS if id_ % 4 == 0 else _RADIUS)
     return picture
@@ -108,8 +112,9 @@ def draw_world(
     length = max(sizes, default=0.0)
     lines += [
         (_edge(np.zeros(3), length * axis), color)
-        for axis, color in zip(np.eye(3), _AXES, strict=True)
+        for axis, (_, color) in zip(np.eye(3), _AXES, strict=True)
     ]
+    names = dict(zip(range(len(lines) - len(_AXES), len(lines)), _AXES, strict=True))
     points = np.concatenate([line for line, _ in lines])
     pixels, _ = project_rolling(camera, poses_at, points)
     width, height = camera.size
@@ -117,10 +122,12 @@ def draw_world(
     with np.errstate(invalid="ignore"):
         near = np.abs(pixels - middle).max(axis=1) < reach
     start = 0
-    for line, color in lines:
+    for index, (line, color) in enumerate(lines):
         end = start + len(line)
         if near[start:end].all():
             _line(picture, pixels[start:end], color)
+            if index in names:
+                _text(picture, names[index][0], pixels[end - 1], color)
         start = end
 
 
@@ -138,8 +145,7 @@ def _standing(seen: Detections, marker_map: MarkerMap) -> Iterator[tuple[Pose, f
     names = {name for name, _ in seen.boards}
     for board in marker_map.boards:
         if board.name in names:
-            more = 1 if isinstance(board, Chessboard) else 0
-            yield board.pose, board.square * (min(board.columns, board.rows) + more)
+            yield board.pose, min(board.extent)
 
 
 def _cube(pose: Pose, size: float) -> list[Array]:
@@ -155,9 +161,18 @@ def _edge(a: Array, b: Array) -> Array:
     return np.asarray(a + share * (b - a))
 
 
-def _line(picture: Picture, pixels: Array, color: tuple[int, int, int]) -> None:
+def _text(picture: Picture, text: str, pixel: Array, color: tuple[int, int, int]) -> None:
+    """A word that can be read on black and on white."""
+    place = tuple(np.rint(pixel).astype(int).tolist())
+    for shade, width in (((0, 0, 0), 3), (color, 1)):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width, cv2.LINE_AA)
+
+
+def _line(
+    picture: Picture, pixels: Array, color: tuple[int, int, int], width: int = 1
+) -> None:
     fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
-    cv2.polylines(picture, [fixed], False, color, 1, cv2.LINE_AA, _SHIFT)
+    cv2.polylines(picture, [fixed], False, color, width, cv2.LINE_AA, _SHIFT)
 
 
 def _dot(picture: Picture, pixel: Array, radius: int) -> None:

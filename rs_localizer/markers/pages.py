@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 MARGIN = 10.0
 """mm: printers leave about 5 white."""
 _BAR = 100.0  # mm, to be measured
 _INCH = 25.4  # mm
 _FONT = 7.0  # pt
+_ARROW, _CLEAR = 5.0, 3.0  # mm, of the axes at the origin, and around them
 _PNG_DPI = 300
 
 
@@ -34,6 +35,17 @@ class Figure:
     label: str
 
 
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """How the frame of the map lies on a page."""
+
+    right: str  # the axis that points to the right, as "+x"
+    up: str
+    out: str  # toward the viewer
+    origin: tuple[float, float] | None  # mm; None: on another page
+    where: str  # the origin in words
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Page:
     """Figures by their lower left corners in mm."""
@@ -42,6 +54,7 @@ class Page:
     height: float
     figures: tuple[tuple[float, float, Figure], ...]
     note: str
+    axes: Axes | None = None  # None: each figure goes to a place of its own
 
 
 def write_pages(pages: Sequence[Page], path: Path) -> list[Path]:
@@ -97,6 +110,8 @@ def _draw(page: Page, number: str) -> Any:
     axes.add_patch(
         PathPatch(Outline(vertices, codes), facecolor="black", edgecolor="none", snap=False)
     )
+    if page.axes is not None:
+        _frame(axes, page, page.axes)
     _foot(axes, page, number)
     return figure
 
@@ -113,6 +128,32 @@ def _add_rim(axes: Any, x: float, y: float, item: Figure) -> None:
     axes.text(x + 1.0, y + 0.8, item.label, va="bottom", **small)
     right, top = x + item.width - 1.0, y + item.height - 0.8
     axes.text(right, top, "top", ha="right", va="top", **small)
+
+
+def _frame(axes: Any, page: Page, frame: Axes) -> None:
+    """Axes of the map in words, and at its origin, where they cover nothing that is black."""
+    told = f"map: {frame.right} to the right, {frame.up} up, {frame.out} out of the paper; "
+    free = frame.origin is not None and not any(
+        _covers(frame.origin, x, y, item) for x, y, item in page.figures
+    )
+    arrows = ", the origin where the arrows start" if free else ""
+    axes.text(MARGIN, MARGIN + 12.0, told + frame.where + arrows, fontsize=0.8 * _FONT)
+    if frame.origin is None or not free:
+        return
+    x, y = frame.origin
+    for along, name in (((_ARROW, 0.0), frame.right), ((0.0, _ARROW), frame.up)):
+        end = (x + along[0], y + along[1])
+        style = {"arrowstyle": "->", "color": "0.4", "lw": 0.6, "shrinkA": 0.0, "shrinkB": 0.0}
+        axes.annotate("", end, (x, y), arrowprops=style)
+        axes.text(*end, name, fontsize=0.6 * _FONT, color="0.4", ha="left", va="bottom")
+
+
+def _covers(origin: tuple[float, float], x: float, y: float, item: Figure) -> bool:
+    """Whether what is black of a figure at x, y comes near to arrows that start at an origin."""
+    from_figure = np.array(origin) - np.array([x, y])
+    low = item.black[:, :2].min(axis=0) - _ARROW - _CLEAR
+    high = (item.black[:, :2] + item.black[:, 2:]).max(axis=0) + _CLEAR
+    return bool(np.all((low <= from_figure) & (from_figure <= high)))
 
 
 def _foot(axes: Any, page: Page, number: str) -> None:

@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 _ROTATION_TOLERANCE = 1e-3
+# Two digits after the point are within this; what is farther from 1 was mistyped, or is no
+# quaternion, and normalizing would make a wrong rotation of it.
+_LENGTH_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,15 +46,15 @@ class Pose:
 
 
 def rotation_of_quaternion(quaternion: ArrayLike) -> Array:
-    """Rotation matrix (3,3) of ``x y z w``, which need not be of unit length.
+    """Rotation matrix (3,3) of ``x y z w`` of unit length, but for the rounding of what is written.
 
     Raises:
-        ValueError: for anything but four finite values that are not all zero.
+        ValueError: for anything but four finite values of that length.
     """
     q = finite(quaternion, (4,), "quaternion (x, y, z, w)")
     length = float(np.linalg.norm(q))
-    if not 0.5 < length < 2.0:
-        raise ValueError(f"the quaternion must have the length 1, found {length:g}")
+    if abs(length - 1.0) > _LENGTH_TOLERANCE:
+        raise ValueError(f"the quaternion (x y z w) must have the length 1, found {length:.4g}")
     x, y, z, w = q / length
     return np.array(
         [

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.pages import MARGIN, Figure, Page, PrintError
-from rs_localizer.markers.prints import Board, Charuco, Chessboard, Marker
+from rs_localizer.markers.pages import MARGIN, Axes, Figure, Page, PrintError
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
 # Upright, in mm.
 PAGES = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-_TEXT_HEIGHT = 12.0  # mm, at the foot of a page
+_TEXT_HEIGHT = 16.0  # mm, at the foot of a page
 _MM = 1000.0  # in a metre
 # Prints lie in one plane and face the same way to within this.
 _FLAT = 1e-6
@@ -67,7 +70,10 @@ def _board_page(board: Board, size: tuple[float, float], page: str) -> Page:
     if way is None:
         raise PrintError(_too_large(board.name, figure.width, figure.height, size, page))
     note = f"{figure.label}; mount it on something flat"
-    return _middle(way, [(0.0, 0.0, figure)], figure.width, figure.height, note)
+    page_ = _middle(way, [(0.0, 0.0, figure)], figure.width, figure.height, note)
+    x, y, _ = page_.figures[0]
+    middle = (x + 0.5 * figure.width, y + 0.5 * figure.height)
+    return replace(page_, axes=_axes(board.pose, middle, way))
 
 
 def _together(markers: tuple[Marker, ...], size: tuple[float, float]) -> Page | None:
@@ -91,12 +97,37 @@ def _together(markers: tuple[Marker, ...], size: tuple[float, float]) -> Page | 
         return None
     moved = [(x - left, y - bottom, figure) for x, y, figure in figures]
     note = "all markers are where the map has them" if len(markers) > 1 else ""
-    return _middle(way, moved, width, height, note)
+    laid = _middle(way, moved, width, height, note)
+    x, y, figure = laid.figures[0]
+    middle = (x + 0.5 * figure.width, y + 0.5 * figure.height)
+    return replace(laid, axes=_axes(first, middle, way))
+
+
+def _axes(pose: Pose, middle: tuple[float, float], size: tuple[float, float]) -> Axes:
+    """How the map's frame lies on a page that has a print of this pose at ``middle``."""
+    right, up, out = (_direction(pose.rotation[:, k]) for k in range(3))
+    x, y, z = -pose.position @ pose.rotation * _MM
+    origin = (middle[0] + x, middle[1] + y)
+    told = ", ".join(f"{value:g}" for value in np.round(pose.position, 4) + 0.0)
+    where = f"the middle of the first print is at ({told}) m"
+    if abs(z) > _FLAT * _MM or not (0 <= origin[0] <= size[0] and 0 <= origin[1] <= size[1]):
+        return Axes(right, up, out, None, f"{where}; the origin is not on this page")
+    if np.hypot(x, y) < _FLAT * _MM:
+        return Axes(right, up, out, origin, "the origin is in the middle of the print")
+    return Axes(right, up, out, origin, where)
+
+
+def _direction(vector: Array) -> str:
+    """An axis of the map, or a direction between them."""
+    axis = int(np.argmax(np.abs(vector)))
+    if abs(vector[axis]) < 1.0 - _FLAT:
+        return "(" + " ".join(f"{value:.2g}" for value in vector) + ")"
+    return f"{'+' if vector[axis] > 0 else '-'}{'xyz'[axis]}"
 
 
 def _apart(markers: tuple[Marker, ...], size: tuple[float, float], page: str) -> list[Page]:
     """As many markers to a page as fit, to be cut out and put where the map has them."""
-    figures = [_marker_figure(marker) for marker in markers]
+    figures = [_marker_figure(marker, placed=True) for marker in markers]
     width = max(figure.width for figure in figures)
     height = max(figure.height for figure in figures)
     way = _turned(size, width, height)
@@ -133,15 +164,20 @@ def _middle(
 # -- figures ------------------------------------------------------------------------------------
 
 
-def _marker_figure(marker: Marker) -> Figure:
+def _marker_figure(marker: Marker, placed: bool = False) -> Figure:
     cell = marker.size * _MM / marker.family.cells
     black = _rectangles(pattern(marker.family, marker.id), cell) + np.array([cell, cell, 0.0, 0.0])
     side = cell * (marker.family.cells + 2)
     label = f"{marker.family.name}  id {marker.id}  {marker.size * _MM:g} mm"
+    if placed:
+        place = ", ".join(f"{value:g}" for value in np.round(marker.pose.position, 4) + 0.0)
+        label += f"  middle at ({place}) m"
     return Figure(black, side, side, cell, label)
 
 
 def _board_figure(board: Board) -> Figure:
+    if isinstance(board, CircleGrid):
+        raise PrintError(f"a {board.name} can be detected, but not printed from here")
     square = board.square * _MM
     if isinstance(board, Chessboard):
         columns, rows = board.columns + 1, board.rows + 1
@@ -164,10 +200,11 @@ def _board_figure(board: Board) -> Figure:
     return Figure(np.concatenate(black), columns * square, rows * square, 0.0, label)
 
 
-def _white_cells(board: Board, columns: int, rows: int) -> list[tuple[int, int]]:
+def _white_cells(board: Chessboard | Charuco, columns: int, rows: int) -> list[tuple[int, int]]:
     if isinstance(board, Charuco):
         return board.cells
-    return [(c, r) for r in range(rows) for c in range(columns) if (c + r) % 2 == 1]
+    first = 0 if board.inverted else 1
+    return [(c, r) for r in range(rows) for c in range(columns) if (c + r) % 2 == first]
 
 
 def _rectangles(white: NDArray[np.bool_], cell: float) -> Array:

@@ -1,4 +1,4 @@
-"""What can be printed and seen: single markers, chessboards and ChArUco boards, in the map frame.
+"""What can be printed and seen: single markers, and boards of squares or circles, in the map frame.
 
 The frame of a print has its origin in the middle (of the black square of a marker, of the whole
 pattern of squares of a board), x to the right, y up, and z out of the paper toward the viewer.
@@ -13,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.markers.families import Family, family
 from rs_localizer.markers.poses import Pose, finite
 
@@ -83,6 +83,7 @@ class Chessboard:
     rows: int
     square: float  # m
     pose: Pose = field(default_factory=Pose)
+    inverted: bool = False  # white squares on black, with black paper around them
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:  # OpenCV's own limit
@@ -96,8 +97,62 @@ class Chessboard:
         return self.pose(_grid(self.columns, self.rows, self.square))
 
     @property
+    def spacing(self) -> float:
+        """From a corner to the next, m."""
+        return self.square
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the squares, m."""
+        return (self.columns + 1) * self.square, (self.rows + 1) * self.square
+
+    @property
     def name(self) -> str:
-        return f"chessboard {self.columns}x{self.rows}"
+        return f"{'inverted ' if self.inverted else ''}chessboard {self.columns}x{self.rows}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleGrid:
+    """A grid of circles by their centres.
+
+    In an asymmetric one, every second row is shifted by half the distance of neighbours in a row,
+    which is twice the spacing (OpenCV's pattern): so it is known how it lies. A symmetric one looks
+    the same turned by half.
+    """
+
+    columns: int  # circles along a row
+    rows: int
+    spacing: float  # m: from row to row
+    asymmetric: bool = False
+    inverted: bool = False  # white circles on black
+    pose: Pose = field(default_factory=Pose)
+
+    def __post_init__(self) -> None:
+        if self.columns < 2 or self.rows < 3:
+            raise ValueError(f"a grid needs 2x3 circles, got {self.columns}x{self.rows}")
+        _not_too_many(self.columns, self.rows)
+        _positive(self.spacing, "spacing")
+
+    @property
+    def points(self) -> Array:
+        """Centres (n,3), row by row."""
+        if not self.asymmetric:
+            return self.pose(_grid(self.columns, self.rows, self.spacing))
+        row, column = np.mgrid[: self.rows, : self.columns].astype(np.float64)
+        x = 2.0 * column + row % 2.0 - 0.5 * (2 * self.columns - 1)
+        flat = np.stack([x, 0.5 * (self.rows - 1) - row, np.zeros_like(x)], axis=-1)
+        return self.pose(flat.reshape(-1, 3) * self.spacing)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height with a rim of half a spacing, m."""
+        columns = 2 * self.columns if self.asymmetric else self.columns
+        return columns * self.spacing, self.rows * self.spacing
+
+    @property
+    def name(self) -> str:
+        kind = f"{'inverted ' if self.inverted else ''}{'asymmetric ' if self.asymmetric else ''}"
+        return f"{kind}circle grid {self.columns}x{self.rows}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,11 +215,23 @@ class Charuco:
         return made
 
     @property
+    def spacing(self) -> float:
+        """From a corner to the next, m."""
+        return self.square
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the squares, m."""
+        return self.columns * self.square, self.rows * self.square
+
+    @property
     def name(self) -> str:
         return f"charuco {self.columns}x{self.rows} of {self.family.name}"
 
 
-Board = Chessboard | Charuco
+Board = Chessboard | CircleGrid | Charuco
+Whole = Chessboard | CircleGrid
+"""Boards without marks of their own: seen whole or not at all."""
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:

@@ -13,16 +13,18 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.config import MatchBy, Matching
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.prior import Prior
-from rs_localizer.core.sampling import IntArray
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps import Descriptors, Ids, Map
 from rs_localizer.matching.descriptors import Index, Nearest, make_index
-from rs_localizer.matching.prediction import predict_landmarks
+from rs_localizer.matching.prediction import find_view, predict, search_cost
+
+# A prediction tells look-alikes apart: worth so much more than a search of all landmarks, in ns.
+_WORTH = 3e6
 
 
 class MatchError(ValueError):
@@ -155,9 +157,16 @@ class Matcher:
         camera: Camera,
         prior: Prior,
     ) -> tuple[Nearest, IntArray]:
-        """The same among the landmarks that are predicted near each query."""
+        """The same among the landmarks that are predicted near each query.
+
+        Where so many are in view that this would take longer, among all.
+        """
         assert self._index is not None
-        visible = predict_landmarks(camera, prior, self.map.points, settings.gate)
+        view = find_view(camera, prior, self.map.points, settings.gate)
+        cost = search_cost(camera, view, len(queries), self._index.candidate_cost)
+        if cost > _WORTH + len(queries) * len(self.map) * self._index.pair_cost:
+            return self._anywhere(queries, settings)
+        visible = predict(camera, prior, self.map.points, view)
         found, owners = self._index.nearest_within(queries, pixels, visible)
         if not settings.mutual:
             return found, np.arange(len(queries))

@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.prior import Prior, state_in
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.matching.descriptors import Visible
-from rs_localizer.matching.kernels import in_view
+from rs_localizer.matching.kernels import in_view, move
 
 # Standard deviations of the prediction within which the camera is looked for.
 _DEVIATIONS = 3.0
+# What one core of an AMD EPYC took, in ns: for a landmark, without and with a lens that bends, and
+# for a landmark in the rows of a keypoint.
+_PROJECTION_COST, _LENS_COST, _ROW_COST = 400.0, 1400.0, 1.8
 # Pixels along each border of the image that bound its bearings.
 _BORDER_PIXELS = 33
 
 
-def predict_landmarks(camera: Camera, prior: Prior, points: Array, least_gate: float) -> Visible:
-    """The landmarks that the image may show, and where: each at the time of its own row.
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What the image may show."""
+
+    landmarks: IntArray  # (v,)
+    gate: float  # px around the prediction
+
+
+def find_view(camera: Camera, prior: Prior, points: Array, least_gate: float) -> View:
+    """The landmarks that some row may see, and how far from the prediction.
 
     Args:
         camera: of the image.
@@ -32,16 +44,40 @@ def predict_landmarks(camera: Camera, prior: Prior, points: Array, least_gate: f
     assert prior.covariance is not None
     low, high = _bearings(camera)
     widest = 0.5 * math.hypot(*camera.size)
-    K, binning = camera.K, camera.binning
-    focal = math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1])
+    focal = camera.focal_length
     slack = min(2.0 * least_gate, widest) / focal
     depths = np.empty(len(points))
     in_view(points, state_in(prior.motion, np.zeros(3)), low - slack, high + slack, depths)
     near = np.flatnonzero(depths)
     if len(near) == 0:
-        return Visible(near, np.zeros((0, 2)), float(least_gate))
+        return View(near, float(least_gate))
     deviation = focal * _bearing_deviation(prior.covariance, float(np.median(depths[near])))
-    gate = float(min(max(least_gate, _DEVIATIONS * deviation), widest))
+    return View(near, float(min(max(least_gate, _DEVIATIONS * deviation), widest)))
+
+
+def search_cost(camera: Camera, view: View, queries: int, candidate_cost: float) -> float:
+    """What it takes to project the view and to search near the predictions, in ns.
+
+    Args:
+        camera: of the image.
+        view: landmarks and gate.
+        queries: number of keypoints.
+        candidate_cost: ns for each landmark within the gate of a keypoint.
+    """
+    width, height = camera.size
+    projection = _PROJECTION_COST if len(camera.D) == 0 else _LENS_COST
+    rows = min(2.0 * view.gate / height, 1.0)
+    area = min(math.pi * view.gate**2 / (width * height), 1.0)
+    search = queries * (rows * _ROW_COST + area * candidate_cost)
+    return len(view.landmarks) * (projection + search)
+
+
+def predict(camera: Camera, prior: Prior, points: Array, view: View) -> Visible:
+    """Where the image should show the landmarks of a view: each at the time of its own row."""
+    assert prior.motion is not None
+    near, gate = view.landmarks, view.gate
+    if len(near) == 0:
+        return Visible(near, np.zeros((0, 2)), gate)
     pixels = _project(camera, prior.motion, points[near])
     limit = np.array(camera.size) - 0.5 + gate
     inside = np.flatnonzero(np.all((pixels > -0.5 - gate) & (pixels < limit), axis=1))
@@ -56,9 +92,11 @@ def _project(camera: Camera, motion: Motion, points: Array) -> Array:
     to a small part of a pixel, in a fifth of the time.
     """
 
+    state, moved = state_in(motion, np.zeros(3)), np.empty(points.shape)
+
     def view(tau: Array) -> Array:
-        rotations, translations = motion.at_rows(tau)
-        return camera.project(np.einsum("nij,nj->ni", rotations, points) + translations)
+        move(points, state, tau, moved)
+        return camera.project(moved)
 
     rows = camera.row_time(view(np.zeros(len(points))))
     error = camera.row_time(view(rows)) - rows

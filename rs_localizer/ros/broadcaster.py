@@ -14,10 +14,11 @@ from rclpy.node import Node
 from rs_localizer.broadcasts import Broadcast, broadcast
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.outputs import Frame
-from rs_localizer.io.transforms import TransformError, make_transform
+from rs_localizer.io.transforms import NotYetError, TransformError, make_transform
 from rs_localizer.ros.conversion import make_message
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.transforms import AtOnce, NotYetError, Tf, import_tf2_ros
+from rs_localizer.ros.statistics import WINDOW
+from rs_localizer.ros.transforms import Tf, import_tf2_ros
 
 # Frames that wait for odometry, which mostly comes later than they do.
 _MOST_PENDING = 100
@@ -52,6 +53,8 @@ class Broadcaster:
         self._sending = threading.Lock()
         self._own: set[tuple[str, str]] = set()  # parents and children that we have sent
         self._parents: dict[str, str] = {}  # that others have sent, by child
+        self._sent = 0.0  # when, time.monotonic()
+        self._failed: tuple[float, str] | None = None
 
     def configure(self, config: NodeConfig) -> None:
         """Have what these settings need.
@@ -67,6 +70,15 @@ class Broadcaster:
         """Send nothing of the frames so far."""
         with self._sending:
             self._pending.clear()
+            self._failed = None
+
+    def fault(self) -> dict[str, str]:
+        """For the diagnostics: why nothing has been sent lately, if something should have been."""
+        failed = self._failed
+        since = time.monotonic() - WINDOW
+        if failed is None or failed[0] < since or self._sent >= since:
+            return {}
+        return {"not_broadcast": failed[1]}
 
     def close(self) -> None:
         self.forget()
@@ -101,7 +113,7 @@ class Broadcaster:
             self._pending.clear()
             for item in waiting:
                 try:
-                    self._send(broadcast(item.frame, item.config, AtOnce(self.tf)))
+                    self._send(broadcast(item.frame, item.config, self.tf))
                 except NotYetError as error:
                     if time.monotonic() < item.deadline:
                         self._pending.append(item)
@@ -111,7 +123,9 @@ class Broadcaster:
                     self._say(item, error)
 
     def _say(self, item: _Pending, error: TransformError) -> None:
-        self._refusals.notice("not_broadcast", f"publish_tf {item.config.publish_tf}: {error}")
+        text = f"publish_tf {item.config.publish_tf}: {error}"
+        self._failed = time.monotonic(), text
+        self._refusals.notice("not_broadcast", text)
 
     def _send(self, item: Broadcast | None) -> None:
         if item is None or self._broadcaster is None:
@@ -128,3 +142,4 @@ class Broadcaster:
                 make_message, item.stamp_ns, item.parent, item.child, item.parent_from_child
             )
         )
+        self._sent = time.monotonic()

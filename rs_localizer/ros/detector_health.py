@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from rs_localizer.ros.health import Health, Level
+from rs_localizer.ros.health import Health, Level, lost_on_the_way, told
 from rs_localizer.ros.inputs import Silence
 from rs_localizer.ros.statistics import WINDOW, Summary
 
@@ -30,6 +30,7 @@ class Condition:
     life_cycle: str  # label of the state
     wanted: bool  # whether somebody listens
     silence: Mapping[str, Silence]  # of the image topics
+    oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
 
 
 def diagnose(condition: Condition, summary: Summary) -> Health:
@@ -61,8 +62,10 @@ def diagnose(condition: Condition, summary: Summary) -> Health:
 
 
 def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
+    if condition.life_cycle == "configuring":
+        return Level.WARN, "compiling", "the node is being configured: kernels are compiled"
     if condition.life_cycle != "active":
-        return Level.STALE, "inactive", f"the node is {condition.life_cycle}: activate it"
+        return Level.OK, "inactive", f"the node is {condition.life_cycle}: activate it"
     if not condition.wanted:
         return Level.OK, "idle", "nobody listens to the correspondences or the debug image"
     causes = [f"{item.topic}: {item.cause}" for item in condition.silence.values() if item.cause]
@@ -80,6 +83,10 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
             f"{WINDOW:.0f} s"
         )
         return Level.WARN, "detecting", message
+    if summary.recently_missing > _SOME * summary.recently_received:
+        return Level.WARN, "detecting", lost_on_the_way(summary)
+    if condition.oddities:
+        return Level.WARN, "detecting", told(condition.oddities)
     last = summary.last
     if last is None:
         return Level.OK, "detecting", "no image has been looked at yet"

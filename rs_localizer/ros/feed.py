@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
@@ -20,19 +19,13 @@ from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.maps import Map
 from rs_localizer.io.messages import MessageError
-from rs_localizer.ros.inputs import Topic
+from rs_localizer.ros.inputs import LATCHED, Topic
 from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.worker import Localize, Worker
 
 FRAME_TOPICS = ("correspondences", "keypoints")
 """Inputs that are localized; the others say with what."""
 
-# Latched: also of a map that was published before the node started.
-_MAP_QOS = {
-    "depth": 1,
-    "reliability": ReliabilityPolicy.RELIABLE,
-    "durability": DurabilityPolicy.TRANSIENT_LOCAL,
-}
 # In a serialized message, which begins with four bytes of CDR and the stamp of its header.
 _AFTER_STAMP = 12
 # A change of settings that takes longer (s) has compiled kernels, and says so.
@@ -68,8 +61,8 @@ class Feed:
     def topics(self) -> dict[str, Topic]:
         """The inputs; what changes the state comes before the frames."""
         return {
-            "camera_info": Topic(CameraInfo, self._take_camera_info, raw=True),
-            "map_points": Topic(PointCloud2, self._take_map, _MAP_QOS, lasting=True),
+            "camera_info": Topic(CameraInfo, self._take_camera_info, LATCHED, raw=True),
+            "map_points": Topic(PointCloud2, self._take_map, LATCHED, lasting=True),
             "correspondences": self._localized_by(
                 "correspondences", lambda frames, message: frames.localize(message)
             ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 from rs_localizer.ros.inputs import Silence
@@ -39,6 +39,7 @@ class Condition:
     missing: Sequence[str]  # what no frame can be localized without: camera_info, a map
     frame_topics: Sequence[str]  # of the inputs, those with frames
     silence: Mapping[str, Silence]  # by input topic
+    oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,8 @@ def diagnose(condition: Condition, summary: Summary) -> Health:
     """Judge the node.
 
     The states are ``inactive``, ``compiling``, ``waiting for`` what is missing or for frames,
-    ``busy``, ``lost``, ``localized`` (by a search) and ``tracking``.
+    ``busy``, ``lost``, ``localized`` (by a search) and ``tracking``. What is odd is a warning where
+    nothing worse is to be said.
     """
     level, state, message = _judge(condition, summary)
     return Health(level, state, message, {"State": state} | _values(condition, summary))
@@ -85,7 +87,8 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
         return Level.WARN, "compiling", "the node is being configured: kernels are compiled"
     if condition.life_cycle != "active":
         steps = _STEPS.get(condition.life_cycle, "activate it")
-        return Level.STALE, "inactive", f"the node is {condition.life_cycle}: {steps}"
+        # Somebody wants it so: no fault, which an aggregator would make of STALE.
+        return Level.OK, "inactive", f"the node is {condition.life_cycle}: {steps}"
     if condition.changing:
         return Level.WARN, "compiling", "the kernels for the new settings are being compiled"
     if summary.busy is not None and summary.busy > _LONG_WORK:
@@ -103,7 +106,7 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
         return level, f"waiting for {what}", "; ".join([f"waiting for {what}", *causes])
     if silent is not None:
         return silent
-    return _judge_frames(summary)
+    return _judge_frames(summary, condition.oddities)
 
 
 def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
@@ -121,7 +124,7 @@ def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
     return level, "waiting for frames", "; ".join([f"no frame has come{since}", *causes])
 
 
-def _judge_frames(summary: Summary) -> tuple[Level, str, str]:
+def _judge_frames(summary: Summary, oddities: Mapping[str, str]) -> tuple[Level, str, str]:
     last = summary.last
     if last is None or summary.refused_since_answer >= _LOST:
         if summary.refused_since_answer == 0:
@@ -129,7 +132,7 @@ def _judge_frames(summary: Summary) -> tuple[Level, str, str]:
         message = f"the last {summary.refused_since_answer} frames gave no pose"
         if reasons := summary.recently_refused:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
-        return Level.ERROR, "lost", message
+        return Level.ERROR, "lost", "; ".join(filter(None, [message, told(oddities)]))
     state = "tracking" if last.tracked else "localized"
     refused, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
     if refused > _SOME * summary.recently_received:
@@ -137,7 +140,25 @@ def _judge_frames(summary: Summary) -> tuple[Level, str, str]:
     if replaced > _SOME * summary.recently_received:
         message = f"{replaced} frames came while another was localized in the last {WINDOW:.0f} s"
         return Level.WARN, state, message
+    if summary.recently_missing > _SOME * summary.recently_received:
+        return Level.WARN, state, lost_on_the_way(summary)
+    if oddities:
+        return Level.WARN, state, told(oddities)
     return Level.OK, state, f"{state} with {last.inliers} of {last.points} points"
+
+
+def told(oddities: Mapping[str, str]) -> str:
+    """What is odd, in one line."""
+    return "; ".join(f"{name}: {text}" for name, text in oddities.items())
+
+
+def lost_on_the_way(summary: Summary) -> str:
+    """What to say where stamps have gaps."""
+    sent = summary.recently_received + summary.recently_missing
+    return (
+        f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not come "
+        f"in the last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
+    )
 
 
 def _values(condition: Condition, summary: Summary) -> dict[str, str]:
@@ -161,11 +182,13 @@ def _values(condition: Condition, summary: Summary) -> dict[str, str]:
         "Frames replaced": str(summary.replaced),
         "Frames refused": str(summary.refused),
     }
+    if summary.recently_missing:
+        values["Frames missing by their stamps, recently"] = str(summary.recently_missing)
     if summary.dropped:
         values["Frames dropped"] = str(summary.dropped)
     values |= {f"Refused: {reason}": str(n) for reason, n in sorted(summary.refusals.items())}
     values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
-    return values
+    return values | {f"Odd: {name}": text for name, text in condition.oddities.items()}
 
 
 def _milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:
@@ -179,5 +202,6 @@ def _milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:
 
 def _heard(item: Silence) -> str:
     if not item.cause:
-        return "messages come" if item.heard else "no message yet"
+        quality = "reliable" if item.reliable else "best effort"
+        return f"messages come, {quality}" if item.heard else "no message yet"
     return f"silent for {item.seconds:.0f} s: {item.cause}"

@@ -7,10 +7,10 @@ localizes and publishes.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import traceback
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.service import Service
@@ -29,31 +29,28 @@ from rs_localizer.ros.inputs import Inputs
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.outputs import Outputs
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.statistics import Statistics
+from rs_localizer.ros.statistics import WINDOW, Statistics
 from rs_localizer.ros.worker import Worker
 from rs_localizer.settings import NODE_NAME
+
+# Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
+_ODD = ("map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed")
 
 
 class LocalizerNode(RobustLifecycleNode):
     """A managed node; only while active it takes and publishes messages.
 
-    Args:
-        compiling: entered while configuring compiles kernels.
-
     Raises:
         ValueError: when it is started with parameters that are refused, saying what was found.
     """
 
-    def __init__(
-        self, compiling: Callable[[], AbstractContextManager[None]] = nullcontext, **kwargs
-    ) -> None:
+    def __init__(self, **kwargs) -> None:
         super().__init__(NODE_NAME, **kwargs)
-        self._compiling = compiling
         config = parameters.declare(self)
         _check(config)
         for text in parameters.unknown_names(self):
             self._warn(f"a parameter is ignored: {text}")
-        parameters.on_change(self, check=_check, apply=self._take_config)
+        parameters.on_change(self, check=_check, apply=self._take_config, state=lambda: self.state)
         self.autostart = config.autostart
         self.refusals = Refusals(self._warn)
         self._statistics = Statistics(self.refusals, lambda: self.get_clock().now().nanoseconds)
@@ -70,18 +67,26 @@ class LocalizerNode(RobustLifecycleNode):
 
     # -- life cycle -------------------------------------------------------------------------
 
+    def kernels(self) -> Callable[[], None]:
+        frames = FrameLocalizer(parameters.read(self))
+        log = self.get_logger()
+        log.info("compiling kernels (once on this machine, up to a minute)")
+
+        def compiles() -> None:
+            with contextlib.suppress(MapError):  # of which on_configure tells, at once
+                frames.load_map()
+                log.info(f"kernels are ready after {warm_up(frames):.1f} s")
+
+        return compiles
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             config = parameters.read(self)
             frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
-            self.get_logger().info("compiling kernels (once on this machine, up to a minute)")
-            self._diagnostics.publish()
-            with self._compiling():
-                frames.load_map()
-                if frames.map is not None:
-                    self.get_logger().info(described(frames.map))
-                seconds = warm_up(frames)
-            self.get_logger().info(f"kernels are ready after {seconds:.1f} s")
+            frames.load_map()
+            if frames.map is not None:
+                self.get_logger().info(described(frames.map))
+            frames.warm_up()  # what has been set since they were compiled
             self._broadcaster.configure(config)
             self._outputs = Outputs(
                 self, afterwards=lambda frame: self._broadcaster.publish(frame, frames.config)
@@ -179,11 +184,12 @@ class LocalizerNode(RobustLifecycleNode):
         missing = () if frames is None else frames.missing
         silence = {} if self._inputs is None else self._inputs.silence()
         condition = Condition(
-            life_cycle=self._state_machine.current_state[1],
+            life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,
             missing=missing,
             frame_topics=FRAME_TOPICS,
             silence=of_interest(silence, FRAME_TOPICS, missing),
+            oddities=self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault(),
         )
         health = diagnose(condition, self._statistics.summary())
         return health, "" if frames is None else frames.camera_frame

@@ -53,10 +53,13 @@ class Mailbox(Generic[State, Item]):
             self._changed.notify()
             return replaced
 
-    def take(self) -> Work[State, Item] | None:
-        """Wait for all updates, and the oldest frame if there is any; None once it is closed."""
+    def take(self, timeout: float | None = None) -> Work[State, Item] | None:
+        """Wait for all updates, and the oldest frame if there is any; None once it is closed.
+
+        After ``timeout`` (s) it is nothing that is to be done.
+        """
         with self._changed:
-            self._changed.wait_for(lambda: self._updates or self._frames or self._closed)
+            self._changed.wait_for(lambda: self._updates or self._frames or self._closed, timeout)
             if self._closed:
                 return None
             updates, self._updates = self._updates, {}

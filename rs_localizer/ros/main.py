@@ -5,6 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from rs_localizer import threads
+from rs_localizer.missing import explain
+from rs_localizer.ros.usage import answer
 from rs_localizer.stopping import StopRequest
 
 Run = Callable[[StopRequest, list[str] | None], int]
@@ -35,14 +38,16 @@ def marker_detector(args: list[str] | None = None) -> int:
 
 
 def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:
+    threads.limit()
     with StopRequest() as stop:
         try:
             with stop.at_once():
+                text = answer(name, sys.argv[1:] if args is None else args)
+                if text is not None:
+                    sys.stdout.write(text)
+                    return 0
                 run = load()
         except ImportError as error:
-            sys.stderr.write(
-                f"{name}: {' '.join(str(error).split())}: it needs ROS 2 and the Python "
-                "packages of README.md; source a ROS 2 workspace, or install them with pip\n"
-            )
+            sys.stderr.write(f"{name}: {explain(error)}\n")
             return 1
         return run(stop, args)

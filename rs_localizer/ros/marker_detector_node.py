@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import traceback
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -30,10 +29,10 @@ from rs_localizer.ros.detector_health import Condition, Sight, diagnose
 from rs_localizer.ros.detector_outputs import DetectorOutputs
 from rs_localizer.ros.diagnostics import Diagnostics
 from rs_localizer.ros.health import Health
-from rs_localizer.ros.inputs import Inputs, Topic
+from rs_localizer.ros.inputs import LATCHED, Inputs, Topic
 from rs_localizer.ros.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.refusals import Refusals
-from rs_localizer.ros.statistics import Statistics
+from rs_localizer.ros.statistics import WINDOW, Statistics
 from rs_localizer.ros.worker import Worker
 from rs_localizer.settings import DETECTOR_NAME, NODE_NAME
 
@@ -69,18 +68,12 @@ class _Work:
 class MarkerDetectorNode(RobustLifecycleNode):
     """A managed node; only while active it takes images and publishes.
 
-    Args:
-        compiling: entered while configuring compiles kernels.
-
     Raises:
         ValueError: when it is started with parameters that are refused, saying what was found.
     """
 
-    def __init__(
-        self, compiling: Callable[[], AbstractContextManager[None]] = nullcontext, **kwargs
-    ) -> None:
+    def __init__(self, **kwargs) -> None:
         super().__init__(DETECTOR_NAME, **kwargs)
-        self._compiling = compiling
         config = parameters.declare(self, DetectorConfig)
         for text in parameters.unknown_names(self, DetectorConfig):
             self._warn(f"a parameter is ignored: {text}")
@@ -104,12 +97,16 @@ class MarkerDetectorNode(RobustLifecycleNode):
 
     # -- life cycle -------------------------------------------------------------------------
 
+    def kernels(self) -> Callable[[], None]:
+        try:
+            return FrameDetector(parameters.read(self, kind=DetectorConfig)).warm_up
+        except ValueError:  # of which on_configure tells, at once
+            return lambda: None
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             config = parameters.read(self, kind=DetectorConfig)
             detector = FrameDetector(config, self.refusals.notice)
-            with self._compiling():
-                detector.warm_up()
             self._outputs = DetectorOutputs(self)
         except ValueError as error:
             self.get_logger().error(f"not configured: {error}")
@@ -223,7 +220,7 @@ class MarkerDetectorNode(RobustLifecycleNode):
     def _topics(self) -> dict[str, Topic]:
         images = {name: Topic(kind, self._images(name)) for name, kind in _IMAGES.items()}
         return images | {
-            "camera_info": Topic(CameraInfo, self._take_camera_info),
+            "camera_info": Topic(CameraInfo, self._take_camera_info, LATCHED),
             f"{NODE_NAME}/pose": Topic(PoseStamped, self._take_pose),
             f"{NODE_NAME}/odometry": Topic(Odometry, self._take_odometry),
         }
@@ -254,9 +251,10 @@ class MarkerDetectorNode(RobustLifecycleNode):
         """For the diagnostics: how the node is."""
         silence = {} if self._inputs is None else self._inputs.silence()
         condition = Condition(
-            life_cycle=self._state_machine.current_state[1],
+            life_cycle=self.state,
             wanted=bool(self._listening),
             silence={name: silence[name] for name in silence if name in _IMAGES},
+            oddities=self.refusals.recent(("wrong_map", "repeated_markers"), WINDOW),
         )
         return diagnose(condition, self._statistics.summary()), ""
 

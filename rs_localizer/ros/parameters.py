@@ -18,6 +18,8 @@ from rclpy.parameter import Parameter
 from rs_localizer.config import NodeConfig
 from rs_localizer.settings import Kind, Setting, build, settings, unknown
 
+_UNCONFIGURED = "unconfigured"
+
 
 def declare(node: Node, kind: Kind = NodeConfig) -> Any:
     """Declare every setting as a parameter and return those that the node was started with.
@@ -72,6 +74,7 @@ def on_change(
     check: Callable[[Any], None],
     apply: Callable[[Any], None],
     kind: Kind = NodeConfig,
+    state: Callable[[], str] = lambda: _UNCONFIGURED,
 ) -> None:
     """Check, then apply, changes of parameters; several set at once are one change.
 
@@ -80,10 +83,12 @@ def on_change(
         check: raises ``ValueError`` for settings that are refused: then all stay as they were.
         apply: takes settings that were accepted.
         kind: the class of the node's settings.
+        state: label of the node's, for settings that are fixed once it is configured.
     """
 
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         try:
+            _check_fixed(node, parameters, kind, state())
             check(read(node, parameters, kind))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -97,13 +102,22 @@ def on_change(
     node.add_post_set_parameters_callback(after_set)
 
 
+def _check_fixed(node: Node, parameters: list[Parameter], kind: Kind, state: str) -> None:
+    if state == _UNCONFIGURED:
+        return
+    fixed = {name for name, setting in settings(kind).items() if setting.fixed}
+    for item in parameters:
+        if item.name in fixed and item.value != node.get_parameter(item.name).value:
+            raise ValueError(
+                f"{item.name} cannot be changed while the node is {state}: clean it up first"
+            )
+
+
 def _descriptor(setting: Setting) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=setting.description,
         read_only=setting.read_only,
-        additional_constraints=(
-            f"one of {', '.join(setting.choices)}" if setting.choices else ""
-        ),
+        additional_constraints="; ".join(_constraints(setting)),
     )
     if setting.minimum is None or setting.maximum is None:
         return descriptor
@@ -116,3 +130,9 @@ def _descriptor(setting: Setting) -> ParameterDescriptor:
             FloatingPointRange(from_value=float(setting.minimum), to_value=float(setting.maximum))
         ]
     return descriptor
+
+
+def _constraints(setting: Setting) -> list[str]:
+    """What ranges cannot say."""
+    found = [f"one of {', '.join(setting.choices)}"] if setting.choices else []
+    return found + (["can be changed while the node is unconfigured"] if setting.fixed else [])

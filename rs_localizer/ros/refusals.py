@@ -6,7 +6,7 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 _PERIOD = 5.0  # s between two log lines that say the same
@@ -43,6 +43,7 @@ class Refusals:
         self._clock = clock
         self._lock = threading.Lock()
         self._logged: dict[str, dict[str, _Logged]] = {}  # by reason and kind
+        self._latest: dict[str, tuple[float, str]] = {}  # when, and the detail, by reason
 
     def add(self, reason: str, detail: str) -> None:
         """Count one more; ``detail`` is one sentence."""
@@ -53,9 +54,17 @@ class Refusals:
     def notice(self, reason: str, detail: str) -> None:
         """Log likewise what is no refusal."""
         with self._lock:
+            self._latest[reason] = self._clock(), detail
             line = self._line(reason, detail)
         if line is not None:
             self._log(line)
+
+    def recent(self, reasons: Collection[str], seconds: float) -> dict[str, str]:
+        """Of these, what has been noticed in the last seconds, and its latest detail."""
+        with self._lock:
+            since = self._clock() - seconds
+            found = {reason: self._latest.get(reason) for reason in reasons}
+            return {k: item[1] for k, item in found.items() if item and item[0] >= since}
 
     def _line(self, reason: str, detail: str) -> str | None:
         """What to log of it; None if it has been said."""

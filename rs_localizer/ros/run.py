@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -38,19 +39,21 @@ def run(
     Args:
         stop: asks for the end.
         args: of the command line.
-        make: the node's class, called with what to enter while kernels are compiled.
+        make: the node's class.
         name: of the node.
     """
     try:
         # rclpy's own handlers end the context from a thread while the node still uses it.
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = make(compiling=stop.at_once)
+        node = make()
     except (ValueError, RuntimeError) as error:
         rclpy.logging.get_logger(name).fatal(" ".join(str(error).split()))
         rclpy.try_shutdown()
         return 1
+    log = node.get_logger()
+    warnings.showwarning = lambda message, *_: log.warning(" ".join(str(message).split()))
     try:
-        code = _start(node) or spin(node, lambda: stop.requested)
+        code = _start(node, stop) or spin(node, lambda: stop.requested)
     except ExternalShutdownException:
         code = 0
     finally:
@@ -64,15 +67,23 @@ def run(
     return code
 
 
-def _start(node: Any) -> int:
+def _start(node: Any, stop: StopRequest) -> int:
     """Configure and activate the node if it is to do so itself; the exit code if that failed."""
-    if node.autostart and node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
-        return 1
+    if stop.requested:
+        return 0
+    if node.autostart:
+        prepared = node.prepare()
+        spin(node, lambda: stop.requested or prepared.done())
+        if stop.requested:
+            return 0
+        if not node.configure(prepared.result()):
+            return 1
     # What has been compiled stays; to look through it for garbage takes some tenths of a second,
     # and must not come between frames.
     gc.collect()
     gc.freeze()
-    if node.autostart and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+    waits = node.autostart and node.state == "inactive"  # a client may have been faster
+    if waits and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
         return 1
     # Other threads than the worker have little to do and give the GIL back soon.
     sys.setswitchinterval(_SWITCH_INTERVAL)

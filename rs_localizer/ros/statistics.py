@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.frames import Refusal
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Frame
+from rs_localizer.ros.gaps import missing
 from rs_localizer.ros.refusals import Refusals
 
 WINDOW = 5.0
@@ -53,6 +55,7 @@ class Summary:
     recently_received: int  # in the window
     recently_replaced: int
     recently_refused: dict[str, int]  # frames, by reason
+    recently_missing: int  # sent and not received, by the gaps between the stamps
     refused_since_answer: int  # frames in a row
     busy: float | None  # s for which the worker has had the same frame
     latency: Percentiles | None  # from receiving to publishing
@@ -85,14 +88,19 @@ class Statistics:
         self._started: float | None = None
         # Times of what happened, and what is told of each answer.
         self._in: deque[float] = deque(maxlen=_MOST_FRAMES)
+        self._stamps: dict[str, deque[tuple[float, int]]] = {}
         self._refused_at: deque[tuple[float, str]] = deque(maxlen=_MOST_FRAMES)
         self._replaced_at: deque[float] = deque(maxlen=_MOST_FRAMES)
         self._out: deque[tuple[float, float, float]] = deque(maxlen=_MOST_FRAMES)
 
-    def received(self, topic: str) -> None:
+    def received(self, topic: str, message: Any) -> None:
+        """A frame has come: a message with a header."""
         with self._lock:
+            now = self._clock()
             self._received[topic] += 1
-            self._in.append(self._clock())
+            self._in.append(now)
+            stamps = self._stamps.setdefault(topic, deque(maxlen=_MOST_FRAMES))
+            stamps.append((now, stamp_ns(message)))
 
     def replaced(self) -> None:
         """A frame gave way to a newer one before it was looked at."""
@@ -161,6 +169,10 @@ class Statistics:
                 recently_received=sum(when >= since for when in self._in),
                 recently_replaced=sum(when >= since for when in self._replaced_at),
                 recently_refused=Counter(r for when, r in self._refused_at if when >= since),
+                recently_missing=sum(
+                    missing([stamp for when, stamp in stamps if when >= since])
+                    for stamps in self._stamps.values()
+                ),
                 refused_since_answer=self._in_a_row,
                 busy=None if started is None else self._clock() - started,
                 latency=_percentiles([latency for _, latency, _ in out]),

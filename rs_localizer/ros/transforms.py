@@ -1,18 +1,15 @@
 """TF in the node: where the camera is on the robot, and where odometry believes the robot.
 
 tf2_ros is imported when a setting needs it: it is not on PyPI, and all else works without it.
-Transforms are taken in a thread of their own, and the worker waits for those that are not known
-yet; the executor never does.
+Transforms are taken in a thread of their own. Nobody waits in here for those that are not known
+yet: frames are kept until they are, while others are localized.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import threading
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -24,15 +21,11 @@ from rclpy.time import Time
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.messages import stamp_ns as stamp_of
-from rs_localizer.io.transforms import Transform, TransformError, read_transform
+from rs_localizer.io.transforms import NotYetError, Transform, TransformError, read_transform
 from rs_localizer.ros.intake import Intake, NotByExecutor
 
 # For how long tf2's buffer remembers, in ns: its default.
 _MEMORY = 10_000_000_000
-
-
-class NotYetError(TransformError):
-    """The transform is known for earlier times only."""
 
 
 def check(config: NodeConfig) -> None:
@@ -61,7 +54,7 @@ def import_tf2_ros(config: NodeConfig) -> ModuleType:
 class Tf:
     """Transforms from TF (see :class:`rs_localizer.io.transforms.Transforms`).
 
-    :meth:`lookup`, which may wait, and :meth:`moves` belong to the worker's thread, all else to the
+    :meth:`lookup` and :meth:`moves` may be called from any thread, all else belongs to the
     executor's.
 
     Args:
@@ -77,14 +70,11 @@ class Tf:
         self._node = node
         self._heard = heard
         self._failed = failed
-        self._tolerance = 0.0
         self._buffer: Any = None
         self._listener: Any = None
         self._intake: Intake | None = None
         self._jumps: Any = None
         self._errors: ModuleType | None = None  # tf2_ros
-        self._arrivals = 0
-        self._arrived = threading.Condition()
 
     def configure(self, config: NodeConfig) -> None:
         """Listen if these settings need it.
@@ -92,7 +82,6 @@ class Tf:
         Raises:
             ValueError: without tf2_ros.
         """
-        self._tolerance = config.transform_tolerance
         if not needed(config) or self._buffer is not None:
             return
         tf2_ros = import_tf2_ros(config)
@@ -106,52 +95,21 @@ class Tf:
         )
         self._errors, self._buffer = tf2_ros, buffer
         node = _WithoutExecutor(self._node)
-        self._listener = _listen(tf2_ros, buffer, node, self._hear)
+        self._listener = _listen(tf2_ros, buffer, node, self._heard)
         self._intake = Intake(self._node.context, node.subscriptions, self._failed)
 
     def close(self) -> None:
-        """Stop listening; whoever waits for a transform gets none."""
+        """Stop listening; whoever asks for a transform gets none."""
         if self._buffer is None:
             return
         self._buffer = None
-        self._wake()
         self._intake.close()
         self._listener.unregister()
         self._jumps.unregister()
         self._intake = self._listener = self._jumps = None
 
-    def _hear(self, transforms: list[Any]) -> None:
-        self._wake()
-        self._heard(transforms)
-
-    def _wake(self) -> None:
-        with self._arrived:
-            self._arrivals += 1
-            self._arrived.notify_all()
-
-    def _wait_for_more(self, seen: int, seconds: float) -> bool:
-        with self._arrived:
-            return self._arrived.wait_for(lambda: self._arrivals != seen, seconds)
-
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
         """``target_from_source`` at a time; None: the latest.
-
-        What is not known yet is waited for, ``transform_tolerance`` at most.
-
-        Raises:
-            TransformError: when it does not come.
-        """
-        deadline = time.monotonic() + self._tolerance
-        while True:
-            seen = self._arrivals
-            try:
-                return self.lookup_now(target, source, stamp_ns)
-            except NotYetError:
-                if not self._wait_for_more(seen, deadline - time.monotonic()):
-                    raise
-
-    def lookup_now(self, target: str, source: str, stamp_ns: int | None) -> Transform:
-        """The same, without waiting.
 
         Raises:
             NotYetError: when it is known for earlier times.
@@ -193,19 +151,6 @@ class Tf:
         with contextlib.suppress(self._errors.TransformException):
             return stamp_of(buffer.lookup_transform(target, source, Time()))
         return None
-
-
-@dataclass(frozen=True, slots=True)
-class AtOnce:
-    """The transforms of a :class:`Tf` as they are known now."""
-
-    tf: Tf
-
-    def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
-        return self.tf.lookup_now(target, source, stamp_ns)
-
-    def moves(self, target: str, source: str) -> bool:
-        return self.tf.moves(target, source)
 
 
 class _WithoutExecutor:

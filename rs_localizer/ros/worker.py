@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rs_localizer.frames import FrameLocalizer, Refusal
+from rs_localizer.frames import FrameLocalizer, Refusal, Waiting
 from rs_localizer.io.outputs import Frame
 from rs_localizer.ros.errors import describe
 from rs_localizer.ros.mailbox import Mailbox, Update, Work
@@ -20,6 +21,9 @@ from rs_localizer.ros.statistics import Statistics
 
 Localize = Callable[[FrameLocalizer, Any], Frame | Refusal]
 _NAME = "rs_localizer worker"
+# How often frames are looked at that wait for their mounting, in s, and how many may.
+_LATE_PERIOD = 0.005
+_MOST_LATE = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,16 @@ class Arrival:
     message: Any
     localize: Localize
     received: float  # s, time.monotonic()
+
+
+@dataclass(frozen=True, slots=True)
+class _Late:
+    """A frame that is localized and waits for its mounting."""
+
+    work: Work[FrameLocalizer, Arrival]
+    arrival: Arrival
+    result: Waiting
+    deadline: float  # s, time.monotonic()
 
 
 class Worker:
@@ -55,10 +69,10 @@ class Worker:
         self._statistics = statistics
         self._failed = failed
         self._mailbox: Mailbox[FrameLocalizer, Arrival] = Mailbox()
+        self._late: deque[_Late] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
-        # A daemon: a frame that takes minutes must not keep the process alive.
-        threading.Thread(target=self._run, name=_NAME, daemon=True).start()
+        in_thread(self._run)
 
     def update(self, kind: str, update: Update[FrameLocalizer]) -> None:
         """Have this done before the next frame (see :meth:`Mailbox.update`)."""
@@ -66,7 +80,7 @@ class Worker:
 
     def localize(self, topic: str, message: Any, localize: Localize) -> None:
         """Have this frame localized and published, unless a newer one comes first."""
-        self._statistics.received(topic)
+        self._statistics.received(topic, message)
         arrival = Arrival(topic, message, localize, time.monotonic())
         if self._mailbox.put(topic, arrival):
             self._statistics.replaced()
@@ -84,9 +98,10 @@ class Worker:
     # -- in the thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        while (work := self._mailbox.take()) is not None:
+        while (work := self._mailbox.take(_LATE_PERIOD if self._late else None)) is not None:
             for update in work.updates:
                 self._guarded(update, self._frames)
+            self._finish_late()
             if work.frame is not None:
                 self._localize(work, work.frame)
 
@@ -97,37 +112,59 @@ class Worker:
             self._failed(describe(error))
 
     def _localize(self, work: Work[FrameLocalizer, Arrival], arrival: Arrival) -> None:
+        self._statistics.started()
+        result = self._attempt(lambda: arrival.localize(self._frames, arrival.message))
+        self._statistics.ended()
+        if isinstance(result, Waiting) and len(self._late) < _MOST_LATE:
+            deadline = time.monotonic() + result.patience
+            self._late.append(_Late(work, arrival, result, deadline))
+        else:
+            self._finish(work, arrival, result)
+
+    def _finish_late(self) -> None:
+        """Publish what has become known, in the order in which it came; give up what is overdue."""
+        while self._late:
+            item = self._late[0]
+            result = self._attempt(item.result.again)
+            patient = time.monotonic() < item.deadline and self._mailbox.is_current(item.work)
+            if isinstance(result, Waiting) and patient:
+                return
+            self._late.popleft()
+            self._finish(item.work, item.arrival, result)
+
+    def _attempt(self, function: Callable[[], Any]) -> Any:
+        """What it returns; if it fails, a refusal."""
         try:
-            result = self._answer(work, arrival)
+            return function()
         except Exception as error:  # of one message: the others go on
-            result = Refusal("internal_error", describe(error))
+            return Refusal("internal_error", describe(error))
+
+    def _finish(
+        self, work: Work[FrameLocalizer, Arrival], arrival: Arrival, result: Frame | Refusal
+    ) -> None:
+        """Publish it, unless nobody wants it any more, and count it."""
         if isinstance(result, Refusal):
             self._statistics.refused(result)
-        elif result is None:
+            return
+        with self._publishing:
+            wanted = self._mailbox.is_current(work)
+            if wanted:
+                failure = self._attempt(lambda: self._publish(result))
+        if not wanted:
             self._statistics.dropped(1)
+        elif failure is not None:
+            self._statistics.refused(failure)
         else:
             self._statistics.answered(result, arrival.received)
 
-    def _answer(
-        self, work: Work[FrameLocalizer, Arrival], arrival: Arrival
-    ) -> Frame | Refusal | None:
-        """What was published, or why nothing was; None: nobody wants it any more."""
-        self._statistics.started()
-        try:
-            result = arrival.localize(self._frames, arrival.message)
-        finally:
-            self._statistics.ended()
-        if not result:
-            return result
-        with self._publishing:
-            if not self._mailbox.is_current(work):
-                return None
-            self._publish(result)
-        return result
+
+def in_thread(function: Callable[[], None]) -> None:
+    """Run what may take minutes, which must not keep the process alive."""
+    threading.Thread(target=function, name=_NAME, daemon=True).start()
 
 
 def wait_for_workers(seconds: float) -> bool:
-    """Wait for the end of all closed workers of this process; whether it came in time."""
+    """Wait for the end of all threads of :func:`in_thread`; whether it came in time."""
     deadline = time.monotonic() + seconds
     threads = [thread for thread in threading.enumerate() if thread.name == _NAME]
     for thread in threads:

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES, Vector, multiply
-from rs_localizer.core.so3 import Array
 
 MODEL_SIZE = 18
 

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.eigenvalues import real_eigenvalues, reduce_to_hessenberg
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import (
@@ -38,7 +39,6 @@ from rs_localizer.core.simd import (
     traced,
     triangularize,
 )
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.vectors import lane_array
 from rs_localizer.solvers import linear, rank_drop
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter

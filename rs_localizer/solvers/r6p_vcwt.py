@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import (
     LANES,
@@ -27,7 +28,6 @@ from rs_localizer.core.simd import (
     nearest_rotation,
     traced,
 )
-from rs_localizer.core.so3 import Array
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import Sample, gather, inputs, scatter
 

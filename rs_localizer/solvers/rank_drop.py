@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES, Lanes, Vector, least_squares, traced
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.vectors import load, root, store, uniform, where_less
 
 SOLUTIONS = 20

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.solvers import joint, p3p, r6p, r6p_two_step, r6p_vcwt, r9p
 from rs_localizer.solvers.batch import MODEL_SIZE, unpack
 

@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 

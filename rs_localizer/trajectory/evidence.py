@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.calibration import Calibration, within
 from rs_localizer.trajectory.fit import cost_at, fit, image_speeds
 

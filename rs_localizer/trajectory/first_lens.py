@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.observe import Observed
 
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4

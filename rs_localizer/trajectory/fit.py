@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
 from rs_localizer.trajectory.banded import Factored
 from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, Observations, State

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.lens import lens_values, project
 
 # Directions that the image does not see: least eigenvalue of the information, diagonal scaled to 1.

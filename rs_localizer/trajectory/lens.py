@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.core.so3 import Array
 
 # Columns of OpenCV's Jacobians: focal lengths and centre, distortion, place of the point.
 _PINHOLE = (slice(6, 10), 10, slice(3, 5))

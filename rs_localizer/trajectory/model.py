@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
 from rs_localizer.trajectory.lens import lens_values
 from rs_localizer.trajectory.spline import Spline
 

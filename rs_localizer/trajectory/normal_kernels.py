@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.jit import kernel
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.spline_kernels import (
     CONTROL,
     LOCAL,

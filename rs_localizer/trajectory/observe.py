@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
 from rs_localizer.trajectory.model import Observations

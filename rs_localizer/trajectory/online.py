@@ -26,8 +26,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.trajectory.image_alone import image_alone
 
@@ -123,7 +124,14 @@ class ReadoutMonitor:
         if self._views and time_ns <= self._views[-1].time_ns:
             self.reset()
         chosen = estimate.inliers
-        alone = image_alone(camera, estimate, points[chosen], pixels[chosen])
+        # Without accelerations and shaking: what a prior has wrong about the velocities, they mend.
+        steady = Motion(
+            estimate.rotation,
+            estimate.translation,
+            estimate.angular_velocity,
+            estimate.linear_velocity,
+        )
+        alone = image_alone(camera, steady, points[chosen], pixels[chosen])
         if alone is None:
             self._views.clear()
             return

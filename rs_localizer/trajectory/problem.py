@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.trajectory.banded import Factored, Undetermined
 from rs_localizer.trajectory.lens import lens_values, project
 from rs_localizer.trajectory.model import Freedom, Observations, State

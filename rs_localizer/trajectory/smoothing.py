@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray, Estimate
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
+from rs_localizer.core.types import Estimate
 from rs_localizer.trajectory.fit import Fit, fit
 from rs_localizer.trajectory.model import Freedom, State, start_state
 from rs_localizer.trajectory.observe import Observed, collect
@@ -80,6 +80,9 @@ class Smoothed:
         states = self.fit.state.spline.states(times)
         scale = np.repeat([1.0, self.readout_time], 6)
         empty = np.zeros(0)
+        # At a moment of its own nothing asks for accelerations.
+        joint = np.zeros((len(times), PARAMETERS, PARAMETERS))
+        joint[:, :MOTION_PARAMETERS, :MOTION_PARAMETERS] = scale[:, None] * covariances * scale
         return [
             Estimate(
                 rotation=rotation.T,
@@ -88,12 +91,12 @@ class Smoothed:
                 linear_velocity=self.readout_time * (rotation.T @ linear),
                 inliers=empty.astype(np.bool_),
                 residuals=empty,
-                covariance=scale[:, None] * covariance * scale,
+                joint_covariance=covariance,
                 global_shutter_inliers=0,
                 iterations=0,
             )
             for rotation, position, angular, linear, covariance in zip(
-                states.rotations, states.positions, states.angular, states.linear, covariances,
+                states.rotations, states.positions, states.angular, states.linear, joint,
                 strict=True,
             )
         ]  # fmt: skip

@@ -8,9 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.trajectory.spline_kernels import LOCAL, ORDER, jacobians, states, steps
 
 

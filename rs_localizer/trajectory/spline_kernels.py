@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.jit import kernel
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array, coefficients, log
+from rs_localizer.core.so3 import coefficients, log
 
 ORDER = 4
 """Controls that act at one instant."""

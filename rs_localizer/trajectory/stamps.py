@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 
 # A camera's own clock keeps its stamps within this (s) of even intervals.
 _MOST_JITTER = 5e-4

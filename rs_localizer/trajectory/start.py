@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from rs_localizer.core.sampling import IntArray
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.trajectory.spline import Layout, Spline
 
 # Without a frame for longer than this (s), or than so many usual intervals, a motion ends.

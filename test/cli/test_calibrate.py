@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -51,9 +52,11 @@ def test_faults(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["calibrate", str(tmp_path / "nothing")]) == 1
     assert main(["calibrate", str(flight), "--out", str(tmp_path / "x.txt")]) == 2
     assert main(["calibrate", str(flight), "--board", "5x4", "--square", "0.1"]) == 2
-    video = tmp_path / "video.mp4"
-    video.touch()
+    video, nothing = tmp_path / "video.mjpeg", tmp_path / "nothing.mp4"
+    video.write_bytes(2 * cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes())
     assert main(["calibrate", str(video), "--board", "5x4", "--square", "0.1"]) == 2
+    nothing.touch()
+    assert main(["calibrate", str(nothing), "--board", "5x4", "--square", "0.1"]) == 1
     assert "Traceback" not in capsys.readouterr().err
 
 

@@ -219,7 +219,7 @@ def test_nothing_is_left_where_nothing_was_seen(
     image_bag(tmp_path / "bag", [markers()])
     assert detect(files, str(tmp_path / "bag"), *files.map) == 1
     error = capsys.readouterr().err
-    assert "none of the 1 images shows anything of the map; they show 5x5_50 0, 5x5_50 1" in error
+    assert "none of the 1 images shows anything of the map (5x5_50); they show 5x5_50 0, " in error
     assert not files.out.exists()
 
 
@@ -247,7 +247,7 @@ def test_faults_end_the_command(
     image_bag(tmp_path / "bag", [markers()], info=False)
     assert detect(files, str(tmp_path / "bag"), *files.map) == 1
     assert "no topic of type sensor_msgs/msg/CameraInfo: none" in capsys.readouterr().err
-    silent = SimpleNamespace(path=tmp_path / "bag", messages=lambda topics: iter(()))
+    silent = SimpleNamespace(path=tmp_path / "bag", topics={}, messages=lambda topics: iter(()))
     with pytest.raises(SourceError, match="bag has no message on /info; give --calibration"):
         next(from_bag(silent, "/image", "/info", None))  # type: ignore[arg-type]
     assert detect(files, str(tmp_path / "bag"), "--map", str(tmp_path / "none.yaml")) == 1
@@ -264,7 +264,9 @@ def test_faults_end_the_command(
         (("--board", "1x1", "--square", "1"), "--board: a board needs 3x3 inner corners"),
         (("--board", "6x4", "--square", "0"), "--square: must be more than 0, got 0"),
         (("--board", "6x4", "--square", "1"), "a video or folder has no camera_info"),
-        (("--board", "6x4", "--square", "1", "--calibration", "x"), "a video has no time stamps"),
+        (("--board", "6x4", "--square", "1", "--calibration", "x"), "has no presentation times"),
+        (("--board", "6x4", "--square", "25"), "--square: chessboard 6x4 with 25 m"),
+        (("--map", "x", "--pattern", "circles"), "--pattern goes with --board"),
         (("--map", "x", "--image", "/i", "--rate", "1"), "cannot be read"),
         (("--rate", "0"), "--rate: must be more than 0, got 0"),
         (("--readout-time", "7"), "--readout-time: must lie between 0 and 0.2, got 7"),

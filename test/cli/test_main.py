@@ -89,7 +89,7 @@ def test_wrong_usage(words: list[str], text: str, capsys: pytest.CaptureFixture[
         (ValueError("it is\n  bent"), 1, "rs_localizer replay: it is bent\n"),
         (OSError(28, "No space left on device"), 1, "No space left on device\n"),
         (UsageError("not so"), 2, "rs_localizer replay: not so\n"),
-        (KeyboardInterrupt(), 1, "rs_localizer replay: interrupted\n"),
+        (KeyboardInterrupt(), 130, "rs_localizer replay: interrupted\n"),
     ],
 )
 def test_faults_are_one_line_and_an_exit_code(
@@ -138,7 +138,7 @@ def test_signals_while_a_command_is_imported(tmp_path: Path, number: int, slow: 
         time.sleep(0.02)
     process.send_signal(number)
     output, errors = process.communicate(timeout=30)
-    assert (process.returncode, output) == (1, "")
+    assert (process.returncode, output) == (128 + number, "")
     assert errors == "rs_localizer replay: interrupted\n"
 
 
@@ -157,4 +157,57 @@ def test_sigterm_ends_a_running_command_in_one_line(tmp_path: Path) -> None:
     time.sleep(0.5)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (1, "rs_localizer simulate: interrupted\n")
+    assert (process.returncode, errors) == (143, "rs_localizer simulate: interrupted\n")
+    assert not (tmp_path / "bag").exists()
+
+
+def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path: Path) -> None:
+    words = ["simulate", "bag", "--duration", "3000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(rs_localizer.__file__).parents[1])},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (tmp_path / "bag").exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (130, "rs_localizer simulate: interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_between_two_imports_has_no_traceback() -> None:
+    code = (
+        "import os, signal, sys, rs_localizer.__main__ as m, rs_localizer.cli.main as c\n"
+        "def parser(): os.kill(os.getpid(), signal.SIGINT)\n"
+        "c._parser = parser\n"
+        "sys.exit(m.run())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "rs_localizer: interrupted\n")
+
+
+def test_who_stops_reading_is_not_told_of_it() -> None:
+    """As with ``| head -1``: more is written than the pipe holds."""
+    code = (
+        "import sys; from types import SimpleNamespace as N; import rs_localizer.cli.main as c\n"
+        "def run(_):\n"
+        "    for _ in range(100_000): print('a line of a long table')\n"
+        "sys.modules['rs_localizer.cli.map'] = N(add_arguments=lambda p: None, run=run)\n"
+        "sys.exit(c.main(['map']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    assert process.stdout.readline() == "a line of a long table\n"
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert process.wait(timeout=60) == 141

@@ -96,7 +96,12 @@ def test_what_comes_out(
         recorded = [stamp for _, stamp, _ in bag.messages(["/rs_localizer/pose"])]
     assert recorded == [s for t, s, _ in messages(recording) if t == "/correspondences"]
     text = (out / "poses.txt").read_text()
-    assert text.startswith("# t x y z qx qy qz qw\n1732204800.")
+    assert text.startswith(
+        "# pose of 'camera_optical_frame' in 'map', map_from_body; t: s, the stamp of the image "
+        "(pose_time: stamp)\n# x y z: m, its origin;"
+    )
+    assert "\n# t x y z qx qy qz qw\n1732204800." in text
+    assert (out / "twists.txt").read_text().startswith("# velocity of 'camera_optical_frame' with")
 
 
 def test_the_same_again_is_the_same(recording: Path, tmp_path: Path) -> None:
@@ -456,4 +461,4 @@ def test_ctrl_c_ends_it_in_one_line(recording: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
     )
-    assert (done.returncode, done.stderr) == (1, "rs_localizer replay: interrupted\n")
+    assert (done.returncode, done.stderr) == (130, "rs_localizer replay: interrupted\n")

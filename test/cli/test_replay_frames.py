@@ -12,8 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.trajectories import read_tum, read_twists
 from rs_localizer.lab.recording import write_simulated

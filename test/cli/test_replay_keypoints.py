@@ -85,7 +85,7 @@ def test_a_map_in_the_recording(
     out = tmp_path / "out"
     assert main(["replay", str(flight / "with_map"), "--out", str(out), *SHUTTER]) == 0
     said = capsys.readouterr().out
-    assert [line.split()[-1] for line in said.splitlines() if "no_map" in line] == ["2"]
+    assert [line.split()[-1] for line in said.splitlines() if ": no_map" in line] == ["2"]
     found = errors(out, flight / "with_map")
     assert len(found) == FRAMES - 2
     assert found.max() < 0.02
@@ -128,7 +128,7 @@ def test_a_recording_of_everything(
     [
         (["keypoints"], 1, "has keypoints and no map on map_points; give one with --map"),
         (["keypoints", "--map", "nowhere.npz"], 1, "map_file: [Errno 2] No such file"),
-        (["keypoints", "--map", "x.npz", "--ros"], 2, "--map and -p are for offline replay"),
+        (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth and -p are for offline replay"),
         (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),
         (["all", "--keypoints", "/nowhere"], 1, "topic /nowhere does not exist"),
         (["all", "--keypoints", "/ids", "--map-points", "/x"], 1, "topic /x does not exist"),

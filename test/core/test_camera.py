@@ -144,7 +144,11 @@ def test_inside_is_the_area_of_the_pixels():
         ({"scan_direction": "sideways"}, "one of top_to_bottom, .*; got 'sideways'"),
         ({"width": 0}, "at least 2x2, got 0x480"),
         ({"readout_time": -0.1}, "readout_time must be 0 or more seconds, got -0.1"),
-        ({"width": 640.5}, "got 640.5x480"),
+        ({"width": 640.5}, "width must be a whole number of pixels, got 640.5"),
+        ({"height": np.nan}, "height must be a whole number of pixels, got nan"),
+        ({"width": True}, "width must be a whole number of pixels, got True"),
+        ({"K": "matrix"}, "K must be numbers, got 'matrix'"),
+        ({"readout_time": 30}, "at most 1 s, got 30: it is in seconds; 30 ms are 0.03"),
         ({"readout_time": "fast"}, "readout_time must be 0 or more seconds, got 'fast'"),
         ({"K": np.diag([1e300, 1e300, 1.0])}, "focal lengths of 1e\\+300, .* are impossible"),
         ({"roi": Roi(0, 0, 700, 480)}, "does not lie on a sensor of 640x480"),
@@ -156,3 +160,14 @@ def test_inside_is_the_area_of_the_pixels():
 def test_an_impossible_camera_is_refused_with_what_was_found(changes, said):
     with pytest.raises(ValueError, match=said):
         camera(**changes)
+
+
+def test_what_people_and_files_give_is_taken():
+    """Lists, no distortion, and sizes as JSON has them."""
+    K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+    camera = Camera(1280.0, np.int64(720), K, None)
+    assert (camera.width, camera.height) == (1280, 720)
+    assert type(camera.width) is int
+    assert camera.D.shape == (0,)
+    np.testing.assert_array_equal(camera.K, np.array(K, float))
+    assert Camera(640, 480, K, [0.1, 0, 0, 0]).D.tolist() == [0.1, 0, 0, 0]

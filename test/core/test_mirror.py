@@ -6,7 +6,8 @@ import pytest
 from rs_localizer.core import so3
 from rs_localizer.core.mirror import mirrored
 
-VELOCITIES = np.array([0.01, 0.02, 0.03, 0.04, 0.05, 0.06])
+MOTION = np.linspace(0.01, 0.12, 12)  # velocities and accelerations
+ALL = np.ones(40, dtype=bool)
 
 
 def plane(relief=0.0):
@@ -16,7 +17,7 @@ def plane(relief=0.0):
 
 
 def state_of(rotation, translation):
-    return np.concatenate([rotation.ravel(), translation, VELOCITIES])
+    return np.concatenate([rotation.ravel(), translation, MOTION])
 
 
 @pytest.mark.parametrize("sight", [[0.0, 0.0, 4.0], [1.0, -0.5, 4.0]])
@@ -30,18 +31,30 @@ def test_the_mirrored_plane_leans_the_other_way_at_the_same_place(sight):
                      * np.arccos(towards[2])) if towards[2] < 1 else np.eye(3)  # fmt: skip
     rotation = so3.exp(0.4 * axis) @ facing
     centre = points.mean(axis=0)
-    other = mirrored(points, state_of(rotation, sight - rotation @ centre))
+    other = mirrored(points, ALL, state_of(rotation, sight - rotation @ centre))
     turned = other[:9].reshape(3, 3)
     np.testing.assert_allclose(turned, so3.exp(-0.4 * axis) @ facing, atol=1e-9)
     np.testing.assert_allclose(turned @ centre + other[9:12], sight, atol=1e-9)
-    np.testing.assert_array_equal(other[12:], VELOCITIES)
+    np.testing.assert_array_equal(other[12:], MOTION)
 
 
 def test_there_is_none_of_a_plane_that_faces_the_camera_and_of_what_is_no_plane():
     rotation = so3.exp(np.array([0.4, 0.0, 0.0]))
     for points, turn in ((plane(), np.eye(3)), (plane(relief=0.3), rotation)):
         centre = points.mean(axis=0)
-        assert mirrored(points, state_of(turn, [0, 0, 4.0] - turn @ centre)) is None
+        assert mirrored(points, ALL, state_of(turn, [0, 0, 4.0] - turn @ centre)) is None
     points = plane(relief=0.01)
     nearly = state_of(rotation, [0, 0, 4.0] - rotation @ points.mean(axis=0))
-    assert mirrored(points, nearly) is not None
+    assert mirrored(points, ALL, nearly) is not None
+
+
+def test_only_the_points_that_count_are_the_plane():
+    points, rotation = plane(), so3.exp(np.array([0.4, 0.0, 0.0]))
+    state = state_of(rotation, [0, 0, 4.0] - rotation @ points.mean(axis=0))
+    strewn = np.vstack([points, points[:10] + np.array([0.0, 0.0, 3.0])])
+    assert mirrored(strewn, np.ones(50, dtype=bool), state) is None
+    counting = np.arange(50) < 40
+    np.testing.assert_allclose(
+        mirrored(strewn, counting, state), mirrored(points, ALL, state), atol=1e-12
+    )
+    assert mirrored(strewn, np.zeros(50, dtype=bool), state) is None

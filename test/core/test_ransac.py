@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from rs_localizer.core.prior import velocity_terms
-from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, Observations, search
+from rs_localizer.core.observations import Observations
+from rs_localizer.core.prior import motion_terms
+from rs_localizer.core.ransac import NOTHING, Candidate, Hypotheses, search
 from rs_localizer.core.sampling import Pool, generator
 
 IDENTITY = np.eye(3)
@@ -50,7 +51,7 @@ def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotation
         start=NOTHING, seed=1):  # fmt: skip
     hypotheses = Hypotheses(
         solve=solver, sample_size=6, solutions=1, block=50, score_scale=8.0, final_scale=2.0,
-        prior=velocity_terms(0.0, 0.0), noise=1.0,
+        prior=motion_terms((0.0, 0.0), (0.0, 0.0)), noise=1.0,
     )  # fmt: skip
     return search(
         observations, hypotheses, rotations, pools, start, confidence, max_samples, generator(seed)
@@ -87,7 +88,7 @@ def test_without_outliers_one_block_is_enough(problem):
 
 def test_a_better_start_is_kept(problem, scene):
     observations, model, outliers = problem(0.3)
-    start = Candidate(np.arange(18.0), 1e-6)
+    start = Candidate(np.arange(24.0), 1e-6)
     found = run(observations, Solver(model, outliers), [everything(observations)], start=start)
     assert found.state is start.state
 

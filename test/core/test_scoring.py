@@ -1,11 +1,11 @@
 import numpy as np
 
-from rs_localizer.core.prior import velocity_terms
+from rs_localizer.core.prior import motion_terms
 from rs_localizer.core.residuals import truncated_cost
 from rs_localizer.core.scoring import best_models, optimize, state_of_model
 from rs_localizer.core.shutter import from_model_a
 
-FREE = velocity_terms(0.0, 0.0)
+FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
 
 
 def test_models_become_states_by_the_motion_model(scene):
@@ -67,7 +67,7 @@ def test_optimisation_reaches_all_inliers_from_a_poor_state(scene):
     measured[outliers] = rng.uniform([0, 0], [639, 479], (32, 2))
     data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
     start = scene.state_of(motion)
-    start[9:] += 0.02 * rng.normal(size=9)
+    start[9:18] += 0.02 * rng.normal(size=9)
     before = truncated_cost(data, start, gradient, 2.0, np.inf)
     state, cost = optimize(start[None], np.zeros(1), data, gradient, 32.0, 2.0, FREE, 1.0)
     truth = truncated_cost(data, scene.state_of(motion), gradient, 2.0, np.inf)

@@ -10,13 +10,15 @@ K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 
 
-def some_motion(seed=0, speed=0.3):
+def some_motion(seed=0, speed=0.3, acceleration=0.0):
     rng = np.random.default_rng(seed)
     return Motion(
         Rotation.random(random_state=seed).as_matrix(),
         np.array([0.1, -0.2, 3.0]),
         speed * rng.normal(size=3),
         speed * rng.normal(size=3),
+        angular_acceleration=acceleration * rng.normal(size=3),
+        linear_acceleration=acceleration * rng.normal(size=3),
     )
 
 
@@ -25,8 +27,9 @@ def centre(motion, tau):
     return -rotation.T @ translation
 
 
-def test_velocities_are_the_derivatives_of_the_camera_s_path_in_its_own_axes():
-    motion, h = some_motion(), 1e-6
+@pytest.mark.parametrize("acceleration", [0.0, 0.5])
+def test_velocities_are_the_derivatives_of_the_camera_s_path_in_its_own_axes(acceleration):
+    motion, h = some_motion(acceleration=acceleration), 1e-6
     for tau in (-0.5, 0.0, 0.4):
         map_from_camera = motion.at(tau)[0].T
         velocity = (centre(motion, tau + h) - centre(motion, tau - h)) / (2 * h)
@@ -35,7 +38,17 @@ def test_velocities_are_the_derivatives_of_the_camera_s_path_in_its_own_axes():
         )
         turn = motion.at(tau - h)[0] @ motion.at(tau + h)[0].T  # before_from_after
         rate = Rotation.from_matrix(turn).as_rotvec() / (2 * h)
-        np.testing.assert_allclose(rate, motion.angular_velocity, atol=1e-7)
+        np.testing.assert_allclose(rate, motion.angular_velocity_at(tau), atol=1e-7)
+        if acceleration == 0.0:
+            np.testing.assert_allclose(rate, motion.angular_velocity, atol=1e-7)
+
+
+def test_accelerations_are_the_second_derivatives_at_the_middle_row():
+    motion, h = some_motion(acceleration=0.5), 1e-4
+    bent = (centre(motion, h) - 2 * centre(motion, 0.0) + centre(motion, -h)) / h**2
+    np.testing.assert_allclose(motion.rotation @ bent, motion.linear_acceleration, atol=1e-6)
+    turns = [Rotation.from_matrix(motion.rotation @ motion.at(t)[0].T).as_rotvec() for t in (h, -h)]
+    np.testing.assert_allclose(sum(turns) / h**2, motion.angular_acceleration, atol=1e-6)
 
 
 def test_the_centre_moves_on_a_straight_line():
@@ -53,7 +66,7 @@ def test_no_velocity_is_a_global_shutter():
 
 
 def test_many_rows_are_single_rows():
-    motion, tau = some_motion(), np.array([-0.5, 0.0, 0.37])
+    motion, tau = some_motion(acceleration=0.2), np.array([-0.5, 0.0, 0.37])
     rotations, translations = motion.at_rows(tau)
     for k, row in enumerate(tau):
         np.testing.assert_allclose(rotations[k], motion.at(row)[0], atol=1e-15)

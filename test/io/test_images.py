@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import struct
+import zlib
 from types import SimpleNamespace
 from typing import Any
 
@@ -177,3 +178,49 @@ def test_sizes_that_an_image_claims() -> None:
     tall = JPEG[: start + 5] + (65000).to_bytes(2) * 2 + JPEG[start + 9 :]
     with pytest.raises(MessageError, match="JPEG image says that it is 65000 x 65000, of which"):
         read_compressed_image(compressed(tall))
+
+
+def png_of(width: int, height: int) -> bytes:
+    """A gray PNG, all black, a row at a time: 20000 x 20000 take 400 kB."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return len(body).to_bytes(4) + kind + body + zlib.crc32(kind + body).to_bytes(4)
+
+    packer = zlib.compressobj(9)
+    rows = b"".join(packer.compress(bytes(width + 1)) for _ in range(height)) + packer.flush()
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return PNG[:8] + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_a_small_file_of_many_pixels_is_refused_by_its_header(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    np.testing.assert_array_equal(
+        read_compressed_image(compressed(png_of(300, 200))).pixels, np.zeros((200, 300))
+    )
+    bomb = png_of(20000, 20000)
+    assert len(bomb) < 450_000
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(MessageError, match=r"PNG image says that it is 20000 x 20000, .* megap"):
+        read_compressed_image(compressed(bomb))
+    tall = jpeg_of(20000, 20000) + bytes(3_000_000) + b"\xff\xd9"
+    with pytest.raises(MessageError, match="JPEG image says that it is 20000 x 20000"):
+        read_compressed_image(compressed(tall))
+
+
+def jpeg_of(width: int, height: int, before: bytes = b"") -> bytes:
+    start = next(k for k in range(len(JPEG)) if JPEG[k : k + 2] == b"\xff\xc0")
+    size = height.to_bytes(2) + width.to_bytes(2)
+    return JPEG[:2] + before + JPEG[2 : start + 5] + size + JPEG[start + 9 : -2]
+
+
+@pytest.mark.parametrize("before", [b"\xff\xff\xff", b"\xff\x01", b"\xff\xd0\xff"])
+def test_the_size_of_a_jpeg_is_found_behind_what_may_stand_before_it(before: bytes) -> None:
+    with pytest.raises(MessageError, match="JPEG image says that it is 65000 x 64000"):
+        read_compressed_image(compressed(jpeg_of(65000, 64000, before) + b"\xff\xd9"))
+
+
+def test_a_jpeg_that_hides_its_size_is_not_decoded() -> None:
+    hidden = JPEG[:2] + b"junk" + JPEG[2:]
+    with pytest.raises(MessageError, match="cannot be decoded: no header tells its size"):
+        read_compressed_image(compressed(hidden))

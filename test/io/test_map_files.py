@@ -134,6 +134,20 @@ def test_a_model_without_a_database(tmp_path: Path) -> None:
     assert given.descriptors.shape == (14, 128)
 
 
+def test_a_database_of_any_name(tmp_path: Path) -> None:
+    model = tmp_path / "sparse" / "0"
+    shutil.copytree(COLMAP / "binary", model)
+    shutil.copy(COLMAP / "database.db", tmp_path / "office.db")
+    sqlite3.connect(tmp_path / "thumbs.db").close()  # another program's
+    (tmp_path / "notes.db").write_text("no database")
+    found = read_map_file(model, "map")
+    assert found.equals(read_map_file(COLMAP / "binary", "map", COLMAP / "database.db"))
+    assert found.descriptors is not None
+    shutil.copy(COLMAP / "database.db", tmp_path / "attic.db")
+    with pytest.raises(MapError, match=r"several databases of COLMAP, attic.db, office.db: name"):
+        read_map_file(model, "map")
+
+
 def database(path: Path, *changes: str) -> Path:
     shutil.copy(COLMAP / "database.db", path / "database.db")
     with sqlite3.connect(path / "database.db") as tables:

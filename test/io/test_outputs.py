@@ -26,7 +26,7 @@ def frame() -> Frame:
         linear_velocity=np.zeros(3),
         inliers=np.ones(3, dtype=bool),
         residuals=np.zeros(3),
-        covariance=np.eye(12),
+        joint_covariance=np.eye(18),
         global_shutter_inliers=3,
         iterations=1,
     )

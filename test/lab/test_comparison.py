@@ -10,8 +10,8 @@ from matplotlib.quiver import Quiver
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.lab import plots
 from rs_localizer.lab.comparison import (
     Answer,

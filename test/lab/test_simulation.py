@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.scene import room
 from rs_localizer.lab.simulation import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.true_motion import (
     BODY_FROM_CAMERA,

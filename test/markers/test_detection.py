@@ -291,3 +291,19 @@ def test_charuco_corners_are_those_of_opencvs_board(
 def test_tiny_and_narrow_images_show_no_chessboard(shape: tuple[int, int]) -> None:
     detector = MarkerDetector(MarkerMap(boards=(Chessboard(6, 4, 0.03),)))
     assert len(detector.detect(np.zeros(shape, np.uint8)).ids) == 0
+
+
+def test_of_large_families_foreign_markers_are_told_now_and_then(render: Any, look: Any) -> None:
+    """What is in the map is found in every image, and in the same place."""
+    known, foreign = (Marker.at("5x5_1000", i, 0.08, Pose(np.array([x, 0.0, 0.0])))
+                      for i, x in ((3, -0.06), (700, 0.06)))  # fmt: skip
+    prints = [(pattern(one.family, one.id), one.corners) for one in (known, foreign)]
+    image = render(prints, look(4.0, 5.0))
+    detector = MarkerDetector(MarkerMap((known,)))
+    found = [detector.detect(image) for _ in range(31)]
+    told = [k for k, seen in enumerate(found) if seen.unknown]
+    assert told == [0, 1, 2, 3, 4, 30]
+    assert found[0].unknown == ("5x5_1000 700",)
+    for seen in found:
+        assert seen.ids.tolist() == [0, 1, 2, 3]
+        np.testing.assert_array_equal(seen.pixels, found[0].pixels)

@@ -14,7 +14,7 @@ from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError, wall
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Charuco, Chessboard, Marker
+from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid, Marker
 
 TURN = Rotation.from_euler("xyz", [20.0, -35.0, 110.0], degrees=True)
 IDENTITY = {"position": [0, 0, 0], "quaternion": [0, 0, 0, 1]}
@@ -121,7 +121,7 @@ CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
         (MARKER | {"size": "big"}, "size cannot be 'big'"),
         (MARKER | {"position": [0, 0]}, "position must have 3 values"),
         (MARKER | {"position": [0, 0, float("nan")]}, "position must be finite"),
-        (MARKER | {"quaternion": [0, 0, 0, 0]}, "quaternion must have the length 1, found 0"),
+        (MARKER | {"quaternion": [0, 0, 0, 0]}, "quaternion .* must have the length 1, found 0"),
         (MARKER | {"rotation": np.eye(3).tolist()}, "both a rotation and a quaternion"),
         (MARKER | {"colour": "red"}, "unknown colour"),
         ({"family": "4x4_50"}, "marker 1 has no id; it has nothing else"),
@@ -148,7 +148,8 @@ def test_faults_of_markers(tmp_path: Path, entry: Any, text: str) -> None:
 @pytest.mark.parametrize(
     ("entry", "text"),
     [
-        (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\): type must be chessboard or"),
+        (CHESSBOARD | {"type": "rings"}, r"board 1 \(rings\): type must be one of chess"),
+        (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\) has no spacing"),
         (CHESSBOARD | {"columns": 2}, "needs 3x3 inner corners, got 2x4"),
         (CHESSBOARD | {"columns": 10**9}, "may be 200 squares wide and high, got 1000000000x4"),
         (CHARUCO | {"rows": 10**9}, "may be 200 squares wide and high, got 3x1000000000"),
@@ -186,7 +187,7 @@ def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
         ),
         (
             {"map_frame": "map", "boards": [CHESSBOARD, CHESSBOARD]},
-            "2 chessboards, which cannot be told apart",
+            "2 boards without markers .*, which cannot be told apart",
         ),
         ([1, 2], "the map must be a mapping"),
     ],
@@ -202,3 +203,37 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text("a: [1")
     with pytest.raises(MarkerMapError, match="is no YAML file"):
         read_marker_map(tmp_path / "map.yaml")
+
+
+def test_a_written_map_explains_itself(tmp_path: Path) -> None:
+    write_marker_map(tmp_path / "wall.yaml", MarkerMap(wall("4x4_50", 2, 1, 0.1, 0.05)))
+    text = (tmp_path / "wall.yaml").read_text()
+    for words in ("metres", "quaternion: x y z w", "x to the right, y up, z out of the paper"):
+        assert words in text
+    assert len(read_marker_map(tmp_path / "wall.yaml").markers) == 2
+
+
+@pytest.mark.parametrize(
+    ("factor", "fine"), [(1.0, True), (0.995, True), (0.9, False), (2.0, False)]
+)
+def test_quaternions_have_unit_length(tmp_path: Path, factor: float, fine: bool) -> None:
+    quaternion = [factor * value for value in (0.5, 0.5, 0.5, 0.5)]
+    tree = {"map_frame": "map", "markers": [MARKER | {"quaternion": quaternion}]}
+    if fine:
+        read(tmp_path, tree)
+        return
+    with pytest.raises(MarkerMapError, match=r"\(x y z w\) must have the length 1, found"):
+        read(tmp_path, tree)
+
+
+@pytest.mark.parametrize("kind", ["circles", "asymmetric_circles", "chessboard"])
+@pytest.mark.parametrize("inverted", [False, True])
+def test_boards_without_marks_come_back(tmp_path: Path, kind: str, inverted: bool) -> None:
+    if kind == "chessboard":
+        board: Any = Chessboard(6, 4, 0.03, inverted=inverted)
+    else:
+        board = CircleGrid(4, 5, 0.03, kind == "asymmetric_circles", inverted)
+    write_marker_map(tmp_path / "map.yaml", MarkerMap(boards=(board,)))
+    (found,) = read_marker_map(tmp_path / "map.yaml").boards
+    assert found.name == board.name
+    np.testing.assert_allclose(found.points, board.points)

@@ -48,7 +48,7 @@ def drawn(path: CameraPath, first_row_ns: int) -> Any:
     """Where the picture has the color of the cubes."""
     picture = np.full((480, 640, 3), 128, np.uint8)
     draw_world(picture, detections(), MAP, CAMERA, path, first_row_ns)
-    return (picture[..., 0] > 180) & (picture[..., 2] < 80)
+    return (picture[..., 0] > 160) & (picture[..., 1] < 80)
 
 
 def near(mask: Any, pixel: Any) -> bool:
@@ -104,5 +104,9 @@ def test_outlines_tell_what_is_used() -> None:
         patch = picture[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3)
         return patch[np.argmax(np.ptp(patch, axis=1))]
 
-    assert np.argmax(color(left)) == 1  # green
-    assert np.argmax(color(right)) == 2  # red
+    assert np.argmax(color(left)) == 0  # blue
+    assert np.argmin(color(right)) == 0  # orange
+    # What is not used is crossed out, besides.
+    inside = [quad.mean(axis=0) * 0.6 + quad[1] * 0.4 for quad in item.quads]
+    assert np.ptp(color(inside[0].round().astype(int))) == 0
+    assert np.ptp(color(inside[1].round().astype(int))) > 50

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.pages import PrintError, write_pages
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.printing import PAGES, plan
-from rs_localizer.markers.prints import Charuco, Chessboard
+from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid
 
 PIXEL = 0.0254 / 300  # m, of the PNG files
 
@@ -92,3 +93,36 @@ def test_what_is_too_large_is_refused(tmp_path: Path) -> None:
         plan(MarkerMap(boards=(Chessboard(9, 6, 0.05),)))
     with pytest.raises(PrintError, match=r"must end in .pdf or .png"):
         write_pages(plan(MarkerMap(wall("4x4_50", 1, 1, 0.1, 0.1))), tmp_path / "wall.svg")
+
+
+def standing() -> Any:
+    return Pose(np.zeros(3), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]))
+
+
+def test_a_page_tells_how_the_map_lies_on_it() -> None:
+    (page,) = plan(MarkerMap(wall("4x4_50", 2, 3, 0.06, 0.02, pose=standing())))
+    assert page.axes is not None
+    assert (page.axes.right, page.axes.up, page.axes.out) == ("+x", "+z", "-y")
+    # In the middle of the grid, which is that of all figures.
+    boxes = np.array([(x, y, x + f.width, y + f.height) for x, y, f in page.figures])
+    middle = 0.5 * (boxes[:, :2].min(axis=0) + boxes[:, 2:].max(axis=0))
+    np.testing.assert_allclose(page.axes.origin, middle, atol=1e-6)
+    assert "the first print is at (-0.04, 0, 0.08) m" in page.axes.where
+    (page,) = plan(MarkerMap(boards=(Chessboard(6, 4, 0.02),)))
+    assert page.axes is not None
+    assert (page.axes.right, page.axes.up, page.axes.out) == ("+x", "+y", "+z")
+    assert page.axes.where == "the origin is in the middle of the print"
+
+
+def test_what_is_cut_out_tells_where_it_goes() -> None:
+    pages = plan(MarkerMap(wall("4x4_50", 2, 1, 0.1, 0.5)))
+    labels = [figure.label for page in pages for _, _, figure in page.figures]
+    assert [label.split("  ")[-1] for label in labels] == [
+        "middle at (-0.3, 0, 0) m", "middle at (0.3, 0, 0) m",
+    ]  # fmt: skip
+    assert {page.axes for page in pages} == {None}
+
+
+def test_circles_are_not_printed() -> None:
+    with pytest.raises(PrintError, match="a circle grid 4x5 can be detected, but not printed"):
+        plan(MarkerMap(boards=(CircleGrid(4, 5, 0.02),)))

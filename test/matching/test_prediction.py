@@ -16,7 +16,8 @@ from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps import Map
 from rs_localizer.lab.scene import room
 from rs_localizer.matching import Matcher
-from rs_localizer.matching.prediction import predict_landmarks
+from rs_localizer.matching.descriptors import Visible
+from rs_localizer.matching.prediction import find_view, predict
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERAS: dict[str, dict[str, Any]] = {
@@ -40,6 +41,10 @@ def points() -> Any:
     return room(np.zeros((1, 3)), np.random.default_rng(0), count=20_000)
 
 
+def predicted(view: Camera, prior: Prior, points: Any, least_gate: float) -> Visible:
+    return predict(view, prior, points, find_view(view, prior, points, least_gate))
+
+
 def camera(name: str) -> Camera:
     return Camera(640, 480, K, readout_time=0.03, **CAMERAS[name])
 
@@ -50,7 +55,7 @@ def test_all_that_the_image_shows_is_predicted_where_it_is(name: str, points: An
     pixels, _ = project_rolling(view, MOTION.at_rows, points)
     shown = np.flatnonzero(view.inside(pixels))
     assert len(shown) > 300
-    found = predict_landmarks(view, SURE, points, 20.0)
+    found = predicted(view, SURE, points, 20.0)
     assert found.gate == 20.0
     assert np.all(np.diff(found.pixels[:, 1]) >= 0.0)
     place = {row: k for k, row in enumerate(found.landmarks.tolist())}
@@ -77,15 +82,15 @@ def is_seen(view: Camera, point: Any, pixel: Any) -> bool:
 def test_the_gate_is_as_wide_as_the_prediction_is_uncertain(points: Any) -> None:
     view = camera("ideal")
     covariance = np.diag(np.repeat([0.03**2, 1e-8, 1e-8, 1e-8], 3))
-    wide = predict_landmarks(view, Prior(motion=MOTION, covariance=covariance), points, 20.0)
+    wide = predicted(view, Prior(motion=MOTION, covariance=covariance), points, 20.0)
     assert wide.gate == pytest.approx(3.0 * 0.03 * np.sqrt(400.0 * 410.0), rel=1e-3)
-    lost = predict_landmarks(view, Prior(motion=MOTION, covariance=np.eye(12)), points, 20.0)
+    lost = predicted(view, Prior(motion=MOTION, covariance=np.eye(12)), points, 20.0)
     assert lost.gate == pytest.approx(400.0)  # half the diagonal: everything
 
 
 def test_nothing_in_view() -> None:
     behind = MOTION.rotation.T @ (np.array([[0.0, 0.0, -5.0]]) - MOTION.translation).T
-    found = predict_landmarks(camera("ideal"), SURE, np.ascontiguousarray(behind.T), 20.0)
+    found = predicted(camera("ideal"), SURE, np.ascontiguousarray(behind.T), 20.0)
     assert len(found.landmarks) == 0
     matcher = Matcher(Map(behind.T.copy(), None, np.zeros((1, 32), np.uint8), "map"))
     given = Keypoints(0, np.zeros((1, 2)), None, np.zeros((1, 32), np.uint8), None, 0)
@@ -109,3 +114,25 @@ def test_a_prediction_tells_apart_what_looks_the_same(points: Any, mutual: bool)
     assert len(found) > 150
     assert np.mean(found.landmarks == shown[found.keypoints]) > 0.95
     assert len(set(found.landmarks.tolist())) == len(found)
+
+
+@pytest.mark.parametrize(("in_view", "everywhere"), [(3_000, False), (40_000, True)])
+def test_where_too_much_is_in_view_all_landmarks_are_compared(
+    in_view: int, everywhere: bool
+) -> None:
+    """To predict and to look near 40,000 landmarks takes longer than to compare 500 with all."""
+    rng = np.random.default_rng(2)
+    view = camera("ideal")
+    still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    prior = Prior(motion=still, covariance=1e-10 * np.eye(12))
+    pixels = rng.uniform([0, 0], [639, 479], (in_view, 2))
+    count = 40_000
+    depths = np.where(np.arange(count) < in_view, 3.0, -3.0)  # the others are behind
+    rays = np.resize(view.rays(pixels), (count, 2))
+    points = depths[:, None] * np.column_stack([rays, np.ones(count)])
+    descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
+    shown = rng.permutation(in_view)[:500]
+    misplaced = 0.5 * pixels[shown]  # not where they are predicted
+    given = Keypoints(0, misplaced, None, descriptors[shown], None, 0)
+    found = Matcher(Map(points, None, descriptors, "map")).match(given, Matching(), view, prior)
+    assert (len(found) == 500) == everywhere

@@ -499,7 +499,7 @@ def deactivated(world: World) -> str:
     go_on = slow(world)
     assert world.change_state(Transition.TRANSITION_DEACTIVATE)
     go_on()
-    assert world.diagnosis("STALE: the node is inactive: activate it")
+    assert world.diagnosis("OK: the node is inactive: activate it")
     assert len(world.peer.poses) == before
     assert world.change_state(Transition.TRANSITION_ACTIVATE)
     world.wait(world.peer.connected)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -42,16 +43,22 @@ class World:
         self.refusals = Refusals(lambda text: None)
         self.statistics = Statistics(self.refusals, lambda: round(self.now * 1e9), lambda: self.now)
 
+    def receive(self) -> None:
+        seconds, nanoseconds = divmod(round(self.now * 1e9), 1_000_000_000)
+        stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+        message = SimpleNamespace(header=SimpleNamespace(stamp=stamp))
+        self.statistics.received("correspondences", message)
+
     def pass_frames(self, count: int, rate: float, latency: float = 0.0) -> None:
         for _ in range(count):
-            self.statistics.received("correspondences")
+            self.receive()
             self.now += latency
             self.statistics.answered(frame(self.now - latency), self.now - latency)
             self.now += 1.0 / rate - latency
 
     def refuse(self, count: int, reason: str = "too_few_inliers") -> None:
         for _ in range(count):
-            self.statistics.received("correspondences")
+            self.receive()
             self.statistics.refused(Refusal(reason, "7 of 100"))
             self.now += 0.01
 
@@ -86,8 +93,8 @@ def test_numbers_of_a_working_node(world: World) -> None:
         "Poses published": "100",
         "Frames replaced": "0",
         "Frames refused": "0",
-        "Topic /camera_info": "messages come",
-        "Topic /correspondences": "messages come",
+        "Topic /camera_info": "messages come, best effort",
+        "Topic /correspondences": "messages come, best effort",
     }
     assert health.values == expected
     world.now += 6.0  # the window is over: nothing of it is said to be so now
@@ -136,6 +143,44 @@ def test_a_few_refused_frames_are_normal(world: World) -> None:
     assert world.diagnose().values["Frames replaced"] == "20"
 
 
+def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
+    for index in range(150):
+        if index % 10 < 6:
+            world.pass_frames(1, rate=30.0)
+        else:
+            world.now += 1.0 / 30.0
+    health = world.diagnose()
+    assert health.level == Level.WARN
+    assert re.match(
+        r"messages are lost: by their stamps, 5\d of 14\d have not come", health.message
+    )
+    assert int(health.values["Frames missing by their stamps, recently"]) in range(50, 61)
+
+
+def test_what_is_odd_is_a_warning(world: World) -> None:
+    odd = replace(GOOD, oddities={"pixels_outside": "7 of 100 pixels"})
+    world.pass_frames(10, rate=50.0)
+    health = world.diagnose(odd)
+    assert (health.level, health.state) == (Level.WARN, "localized")
+    assert health.message == "pixels_outside: 7 of 100 pixels"
+    assert health.values["Odd: pixels_outside"] == "7 of 100 pixels"
+    world.refuse(5)
+    health = world.diagnose(odd)
+    assert health.level == Level.ERROR
+    assert health.message.endswith("for too_few_inliers; pixels_outside: 7 of 100 pixels")
+
+
+def test_what_was_odd_is_forgotten() -> None:
+    now = [0.0]
+    refusals = Refusals(lambda text: None, lambda: now[0])
+    refusals.notice("map_is_camera", "first")
+    refusals.notice("map_is_camera", "second")
+    refusals.notice("another", "text")
+    assert refusals.recent(("map_is_camera", "nothing"), 5.0) == {"map_is_camera": "second"}
+    now[0] = 5.1
+    assert refusals.recent(("map_is_camera",), 5.0) == {}
+
+
 def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) -> Silence:
     return Silence(topic, 7.0, heard, cause, mismatch)
 
@@ -143,11 +188,11 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
 @pytest.mark.parametrize(
     ("change", "level", "state", "message"),
     [
-        ({"life_cycle": "inactive"}, Level.STALE, "inactive", "the node is inactive: activate it"),
+        ({"life_cycle": "inactive"}, Level.OK, "inactive", "the node is inactive: activate it"),
         ({"life_cycle": "configuring"}, Level.WARN, "compiling", "the node is being configured"),
         (
             {"life_cycle": "unconfigured"},
-            Level.STALE,
+            Level.OK,
             "inactive",
             "the node is unconfigured: configure and activate it",
         ),

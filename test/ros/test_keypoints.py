@@ -176,8 +176,7 @@ def test_a_map_that_is_not_latched(
     start_node: Callable[..., Any], peer: Any, flight: tuple[Any, list[SimulatedFrame]]
 ) -> None:
     info, frames = flight
-    override = "qos_overrides./map_points.subscription.durability:=volatile"
-    start_node("-p", f"readout_time:={READOUT_TIME}", "-p", override)
+    start_node("-p", f"readout_time:={READOUT_TIME}")
     talk = Talk(peer, info)
     volatile = peer.node.create_publisher(PointCloud2, "map_points", 1)
     talk.connect()

@@ -196,12 +196,12 @@ def test_compressed_images_and_the_debug_picture(
     answer.pose.pose.orientation.x, answer.pose.pose.orientation.w = 1.0, 0.0
     debug = talk.heard["/marker_detector/debug_image"]
 
-    def blue(message: Any) -> Any:
+    def magenta(message: Any) -> Any:
         pixels = np.frombuffer(message.data, np.uint8).reshape(240, 320, 3).astype(int)
-        return (pixels[..., 0] > 200) & (pixels[..., 2] < 60)
+        return (pixels[..., 0] > 180) & (pixels[..., 1] < 60) & (pixels[..., 2] > 150)
 
     def cubes() -> bool:
-        return any(message.header.stamp.sec >= 10 and blue(message).any() for message in debug)
+        return any(message.header.stamp.sec >= 10 and magenta(message).any() for message in debug)
 
     for second in range(10, 40):
         info.publish(
@@ -212,10 +212,10 @@ def test_compressed_images_and_the_debug_picture(
         odometry.publish(answer)
         if peer.spin_until(cubes, 0.3):
             break
-    shown = next(m for m in reversed(debug) if blue(m).any())
+    shown = next(m for m in reversed(debug) if magenta(m).any())
     assert (shown.encoding, shown.width, shown.height) == ("bgr8", 320, 240)
     # The base of the left cube is the marker's outline, and its top is larger (nearer).
-    rows, columns = np.nonzero(blue(shown)[:, :160])
+    rows, columns = np.nonzero(magenta(shown)[:, :160])
     assert rows.min() < 75
     assert columns.min() < 55
     assert rows.max() > 165

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
-from rs_localizer.lab.recording import write_frame
+from rs_localizer.lab.recording import make_camera_info, write_frame, write_image
 
 FRAMES = 8
 PERIOD_NS = 100_000_000
@@ -115,19 +115,39 @@ def test_poses_of_a_node_are_counted(tmp_path: Path, start_node: Callable[..., A
     assert counts.get("/cam/rs_localizer/pose", 0) == 0
 
 
+def test_images_are_played_for_a_detector(tmp_path: Path, peer: Any) -> None:
+    """A recording of a camera alone: there is nothing for the localizer yet."""
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(FRAMES):
+            stamp_ns = START_NS + k * PERIOD_NS
+            bag.write("/cam/camera_info", make_camera_info(Camera(640, 480, K), stamp_ns), stamp_ns)
+            write_image(bag, "/cam/image/compressed", stamp_ns, "png", bytes([k]) * 100)
+    images: list[CompressedImage] = []
+    infos: list[CameraInfo] = []
+    subscribe = peer.node.create_subscription
+    subscribe(CompressedImage, "/cam/image/compressed", images.append, qos_profile_sensor_data)
+    subscribe(CameraInfo, "/cam/camera_info", infos.append, qos_profile_sensor_data)
+    player = play(tmp_path / "bag", "--rate", "2")
+    assert peer.spin_until(lambda: player.poll() is not None)
+    output, errors = player.communicate()
+    assert (player.returncode, errors) == (0, "")
+    assert output.startswith(f"{FRAMES} images published in 0.")
+    peer.spin_until(lambda: len(images) == FRAMES, 1.0)
+    assert [bytes(image.data) for image in images] == [bytes([k]) * 100 for k in range(FRAMES)]
+    assert len(infos) == FRAMES
+
+
 def test_ctrl_c_ends_it_in_one_line(recording: Path, peer: Any) -> None:
     heard: list[PointCloud2] = []
     for kind, topic in ((PointCloud2, "/correspondences"), (CameraInfo, "/camera_info")):
         peer.node.create_subscription(kind, topic, heard.append, qos_profile_sensor_data)
     player = play(recording, "--rate", "0.01")
-    # Both kinds of messages: rosbags compiles its readers at first use, and Python remembers an
-    # interrupt inside exec() until it exits.
     assert peer.spin_until(lambda: len(heard) > 1)
     time.sleep(0.2)
     player.send_signal(signal.SIGINT)
     player.send_signal(signal.SIGINT)
     output, errors = player.communicate(timeout=30)
-    assert (player.returncode, output, errors) == (1, "", "rs_localizer replay: interrupted\n")
+    assert (player.returncode, output, errors) == (130, "", "rs_localizer replay: interrupted\n")
 
 
 def test_without_ros_it_says_what_is_missing(recording: Path, tmp_path: Path) -> None:

@@ -6,16 +6,21 @@ import json
 import re
 import runpy
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
+import rclpy
 import yaml
+from rclpy.context import Context
 
+from rs_localizer.config import DetectorConfig
 from rs_localizer.io.outputs import TYPES
+from rs_localizer.lab.recording import PARAMETERS, write_parameters
 from rs_localizer.ros.feed import Feed
-from rs_localizer.settings import NODE_NAME
+from rs_localizer.settings import NODE_NAME, build, load_params_file, settings
 
 ROOT = Path(__file__).parents[2]
 # Displays of RViz and what they can show.
@@ -31,6 +36,10 @@ class Piece:
 
     def __init__(self, kind: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
         self.kind, self.arguments, self.options = kind, arguments, options
+
+    @property
+    def name(self) -> str:
+        return str(self.arguments[0])
 
 
 class Fake(ModuleType):
@@ -52,34 +61,90 @@ def pieces(item: Any) -> list[Piece]:
     return [piece for part in item for piece in pieces(part)]
 
 
+def text_of(default: Any) -> str:
+    """Of an argument that is not given; files are those of the sources."""
+    return str(ROOT.joinpath(*default.name_of_file)) if isinstance(default, Shared) else default
+
+
+class Shared(Piece):
+    """A file that the package installs."""
+
+    @property
+    def name_of_file(self) -> list[str]:
+        return self.arguments[0][1:]
+
+
+class FakeSubstitutions(Fake):
+    PathJoinSubstitution = staticmethod(lambda path: Shared("PathJoinSubstitution", (path,), {}))
+
+
+Describe = Callable[..., list[Piece]]
+
+
 @pytest.fixture
-def describe(monkeypatch: pytest.MonkeyPatch) -> Any:
+def describe(monkeypatch: pytest.MonkeyPatch) -> Describe:
+    """All of a launch file when these arguments are given."""
     for name in (
-        *("launch", "launch.actions", "launch.conditions", "launch.launch_description_sources"),
-        *("launch.substitutions", "launch_ros", "launch_ros.actions", "launch_ros.substitutions"),
+        *("launch", "launch.actions", "launch.launch_description_sources"),
+        *("launch_ros", "launch_ros.actions", "launch_ros.substitutions"),
         "launch_ros.parameter_descriptions",
     ):
         monkeypatch.setitem(sys.modules, name, Fake(name))
-    return lambda file: pieces(
-        runpy.run_path(str(ROOT / "launch" / file))["generate_launch_description"]()
-    )
+    name = "launch.substitutions"
+    monkeypatch.setitem(sys.modules, name, FakeSubstitutions(name))
+    monkeypatch.delitem(sys.modules, "rs_localizer.ros.launching", raising=False)
+
+    def describe(file: str, **given: str) -> list[Piece]:
+        code = runpy.run_path(str(ROOT / "launch" / file))
+        found = pieces(code["generate_launch_description"]())
+        defaults = {
+            piece.name: text_of(piece.options["default_value"])
+            for piece in found
+            if piece.kind == "DeclareLaunchArgument"
+        }
+        assert given.keys() <= defaults.keys()
+        context = SimpleNamespace(launch_configurations=defaults | given)
+        for piece in list(found):
+            if piece.kind == "OpaqueFunction":
+                found += pieces(piece.options["function"](context))
+        return found
+
+    yield describe
+    sys.modules.pop("rs_localizer.ros.launching", None)
 
 
 def declared(description: list[Piece]) -> set[str]:
-    return {piece.arguments[0] for piece in description if piece.kind == "DeclareLaunchArgument"}
+    return {piece.name for piece in description if piece.kind == "DeclareLaunchArgument"}
 
 
 def used(description: list[Piece]) -> set[str]:
-    return {piece.arguments[0] for piece in description if piece.kind == "LaunchConfiguration"}
+    return {piece.name for piece in description if piece.kind == "LaunchConfiguration"}
+
+
+def node(description: list[Piece], executable: str) -> Piece:
+    (found,) = [
+        piece
+        for piece in description
+        if piece.kind == "Node" and piece.options["executable"] == executable
+    ]
+    return found
+
+
+def parameters(description: list[Piece], executable: str) -> dict[str, Any]:
+    """What a node gets besides its params file."""
+    file, given = node(description, executable).options["parameters"]
+    assert file.kind == "LaunchConfiguration"
+    return {k: v.arguments[0] if isinstance(v, Piece) else v for k, v in given.items()}
+
+
+MAP = {"markers.launch.py": {"marker_map": "wall.yaml"}}
 
 
 @pytest.mark.parametrize("file", [path.name for path in (ROOT / "launch").glob("*.launch.py")])
-def test_arguments_and_files_exist(describe: Any, file: str) -> None:
-    description = describe(file)
-    assert used(description) == declared(description)
-    shared = [
-        piece.arguments[0][1:] for piece in description if piece.kind == "PathJoinSubstitution"
-    ]
+def test_arguments_and_files_exist(describe: Describe, file: str) -> None:
+    description = describe(file, **MAP.get(file, {}))
+    assert used(description) <= declared(description)
+    shared = [piece.name_of_file for piece in description if isinstance(piece, Shared)]
     assert shared
     for path in shared:
         assert ROOT.joinpath(*path).is_file()
@@ -90,19 +155,97 @@ def test_arguments_and_files_exist(describe: Any, file: str) -> None:
             )
 
 
-def test_every_input_can_be_remapped(describe: Any) -> None:
+def test_every_input_can_be_remapped(describe: Describe) -> None:
     unused: Any = None
     inputs = set(Feed(unused, unused, unused, unused).topics())
-    (launched,) = [
-        piece
-        for piece in describe("localizer.launch.py")
-        if piece.kind == "Node" and piece.options["executable"] == "localizer"
-    ]
+    launched = node(describe("localizer.launch.py"), "localizer")
     assert {name for name, _ in launched.options["remappings"]} == inputs
     assert launched.options["name"] == NODE_NAME
 
 
-def test_two_cameras_pass_on_what_one_camera_takes(describe: Any) -> None:
+@pytest.mark.parametrize("file", ["localizer.launch.py", "markers.launch.py"])
+def test_arguments_that_are_not_given_change_nothing(describe: Describe, file: str) -> None:
+    assert parameters(describe(file, **MAP.get(file, {})), "localizer") == {}
+
+
+@pytest.mark.parametrize("file", ["localizer.launch.py", "markers.launch.py"])
+def test_every_setting_can_be_given(describe: Describe, file: str) -> None:
+    names = {name for name in settings() if "." not in name}
+    if file == "markers.launch.py":
+        names |= set(settings(DetectorConfig))
+    assert names | {"use_sim_time"} <= declared(describe(file, **MAP.get(file, {})))
+    given = {
+        "readout_time": "2e-2", "seed": "3", "tracking": "False", "map_frame": "1",
+        "use_sim_time": "true", "scan_direction": "bottom_to_top",
+    }  # fmt: skip
+    found = parameters(describe(file, **MAP.get(file, {}), **given), "localizer")
+    assert found == {
+        "readout_time": 0.02, "seed": 3, "tracking": False, "map_frame": "1",
+        "use_sim_time": True, "scan_direction": "bottom_to_top",
+    }  # fmt: skip
+
+
+def test_a_value_that_cannot_be_read_goes_to_the_node(describe: Describe) -> None:
+    description = describe("localizer.launch.py", readout_time="20ms", tracking="maybe")
+    assert parameters(description, "localizer") == {"readout_time": "20ms", "tracking": "maybe"}
+
+
+def test_the_detector_knows_the_localizers_shutter(describe: Describe, tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text(
+        "/**:\n  ros__parameters: {readout_time: 0.021, stamp_offset: 0.004, min_inliers: 20}\n"
+    )
+    chosen = {"marker_map": "wall.yaml", "params_file": str(file), "stamp_offset": "0.005"}
+    description = describe("markers.launch.py", **chosen, min_side="12", use_sim_time="true")
+    assert parameters(description, "marker_detector") == {
+        "marker_map": "wall.yaml", "readout_time": 0.021, "stamp_offset": 0.005,
+        "min_side": 12.0, "use_sim_time": True,
+    }  # fmt: skip
+    assert parameters(description, "localizer") == {"stamp_offset": 0.005, "use_sim_time": True}
+
+
+def test_markers_need_a_map(describe: Describe, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="marker_map must name a file"):
+        describe("markers.launch.py")
+    file = tmp_path / "detector.yaml"
+    file.write_text("/**:\n  ros__parameters: {marker_map: wall.yaml}\n")
+    description = describe("markers.launch.py", detector_params_file=str(file))
+    assert "marker_map" not in parameters(description, "marker_detector")
+
+
+@pytest.mark.parametrize(
+    ("file", "given", "text"),
+    [
+        ("markers.launch.py", {"camera": "v4l"}, "one of none, v4l2_camera, usb_cam; got 'v4l'"),
+        ("markers.launch.py", {"camera": "usb_cam"}, "sudo apt install ros-jazzy-usb-cam"),
+        ("markers.launch.py", {"rviz": "true"}, "rviz:=true needs the package rviz2"),
+        ("localizer.launch.py", {"rviz": "True"}, "rviz:=true needs the package rviz2"),
+    ],
+)
+def test_what_cannot_be_started_is_said_before_anything_is(
+    describe: Describe,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    given: dict[str, str],
+    text: str,
+) -> None:
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(ROOT))
+    with pytest.raises(RuntimeError, match=text):
+        describe(file, **MAP.get(file, {}), **given)
+
+
+def test_a_driver_that_is_installed_is_started(
+    describe: Describe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index = tmp_path / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    (index / "usb_cam").touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    description = describe("markers.launch.py", marker_map="wall.yaml", camera="usb_cam")
+    assert node(description, "usb_cam_node_exe").options["package"] == "usb_cam"
+
+
+def test_two_cameras_pass_on_what_one_camera_takes(describe: Describe) -> None:
     known = declared(describe("localizer.launch.py"))
     included = [
         piece
@@ -112,6 +255,23 @@ def test_two_cameras_pass_on_what_one_camera_takes(describe: Any) -> None:
     assert len({id(piece.arguments[0]) for piece in included}) == 2
     for piece in included:
         assert {name for name, _ in piece.options["launch_arguments"]} <= known
+
+
+@pytest.mark.parametrize("namespace", ["/", "/front", "/robot/front"])
+def test_the_parameters_of_a_recording_hold_in_every_namespace(
+    tmp_path: Path, namespace: str
+) -> None:
+    write_parameters(tmp_path, 0.021, "bottom_to_top")
+    context = Context()
+    rclpy.init(args=["--ros-args", "--params-file", str(tmp_path / PARAMETERS)], context=context)
+    made = rclpy.create_node(NODE_NAME, namespace=namespace, context=context)
+    try:
+        assert made.declare_parameter("readout_time", 0.0).value == 0.021
+        assert made.declare_parameter("scan_direction", "").value == "bottom_to_top"
+    finally:
+        made.destroy_node()
+        rclpy.shutdown(context=context)
+    assert load_params_file(tmp_path / PARAMETERS)["readout_time"] == 0.021
 
 
 def test_rviz_shows_what_the_node_publishes() -> None:
@@ -134,3 +294,24 @@ def test_foxglove_shows_what_the_node_publishes() -> None:
     assert {"pose_with_covariance", "inliers", "twist"} <= topics <= set(TYPES)
     panels = re.findall(r'"(?:first|second)": "([^"]+)"', text)
     assert sorted(panels) == sorted(layout["configById"])
+
+
+def test_nav2_manages_the_node() -> None:
+    file = ROOT / "config" / "nav2.yaml"
+    config = build(load_params_file(file))
+    assert (config.autostart, config.publish_tf) == (False, "map_to_odom")
+    manager = yaml.safe_load(file.read_text())["/**/lifecycle_manager_localization"]
+    assert NODE_NAME in manager["ros__parameters"]["node_names"]
+    assert manager["ros__parameters"]["bond_timeout"] == 0.0  # a Python node has none
+
+
+def test_robot_localization_listens_to_what_the_node_publishes() -> None:
+    file = ROOT / "config" / "robot_localization.yaml"
+    found = yaml.safe_load(file.read_text())["/**/ekf_map"]["ros__parameters"]
+    kinds = {"pose0": "geometry_msgs/msg/PoseWithCovarianceStamped",
+             "twist0": "geometry_msgs/msg/TwistWithCovarianceStamped"}  # fmt: skip
+    for name, kind in kinds.items():
+        assert TYPES[found[name].removeprefix(f"/{NODE_NAME}/")] == kind
+    for name in ("odom0", *kinds):
+        assert [type(item) for item in found[f"{name}_config"]] == [bool] * 15
+    assert found["world_frame"] == found["map_frame"]

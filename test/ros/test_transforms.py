@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 import importlib.util
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,9 +17,9 @@ from geometry_msgs.msg import TransformStamped
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Frame, Pose
-from rs_localizer.io.transforms import TransformError
+from rs_localizer.io.transforms import NotYetError, TransformError
 from rs_localizer.ros.broadcaster import Broadcaster
-from rs_localizer.ros.transforms import NotYetError, check
+from rs_localizer.ros.transforms import check
 
 STAND_IN = Path(__file__).parent / "stand_in"
 Notes = list[tuple[str, str]]
@@ -96,35 +94,16 @@ def frame(stamp_ns: int, x: float = 0.0) -> Frame:
     )  # fmt: skip
 
 
-def answer(function: Callable[[], Any], peer: Any, meanwhile: Callable[[], None]) -> Any:
-    """What a function gives in a thread of its own while the executor spins."""
-    results: list[Any] = []
-
-    def run() -> None:
-        try:
-            results.append(function())
-        except TransformError as error:
-            results.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    peer.spin_until(lambda: False, 0.05)
-    meanwhile()
-    assert peer.spin_until(lambda: results), "no answer"
-    thread.join()
-    return results[0]
-
-
 def known(made: Any, peer: Any, target: str, source: str, stamp_ns: int | None) -> Any:
     def there() -> bool:
         try:
-            made.tf.lookup_now(target, source, stamp_ns)
+            made.tf.lookup(target, source, stamp_ns)
         except TransformError:
             return False
         return True
 
     assert peer.spin_until(there), f"no transform from {source} to {target}"
-    return made.tf.lookup_now(target, source, stamp_ns)
+    return made.tf.lookup(target, source, stamp_ns)
 
 
 def test_static_transforms_hold_for_all_times(made: Any, robot: Any, peer: Any) -> None:
@@ -144,38 +123,25 @@ def test_static_transforms_hold_for_all_times(made: Any, robot: Any, peer: Any) 
         node.tf.lookup("base_link", "camera", -10_000_000)
 
 
-def test_what_is_not_known_yet_is_waited_for(made: Any, robot: Any, peer: Any) -> None:
+def test_what_is_not_known_yet_is_said_at_once(made: Any, robot: Any, peer: Any) -> None:
     node = made(base_frame="base_link", transform_tolerance=10.0)
     second = 10**9
     robot.send("base_link", "camera", 1.0, 5 * second)
     robot.send("base_link", "camera", 2.0, 6 * second)
     assert known(node, peer, "base_link", "camera", 5_500_000_000).translation[0] == 1.5
     assert node.tf.moves("camera", "base_link")
-    ask = functools.partial(node.tf.lookup, "base_link", "camera", 7 * second)
+    started = time.monotonic()
     with pytest.raises(NotYetError, match="extrapolation into the future"):
-        node.tf.lookup_now("base_link", "camera", 7 * second)
-    found = answer(ask, peer, lambda: robot.send("base_link", "camera", 6.0, 8 * second))
-    assert found.translation[0] == 4.0
-    # Whoever waits while the node ends gets an answer at once.
-    started = time.monotonic()
-    ask = functools.partial(node.tf.lookup, "base_link", "camera", 9 * second)
-    refused = answer(ask, peer, node.broadcaster.close)
-    assert str(refused) == "TF is not listened to"
-    assert time.monotonic() - started < 5.0
-
-
-def test_waiting_ends(made: Any, robot: Any, peer: Any) -> None:
-    node = made(base_frame="base_link", transform_tolerance=0.1)
-    for stamp in (5, 6):
-        robot.send("base_link", "camera", 1.0, stamp * 10**9)
-    known(node, peer, "base_link", "camera", 6 * 10**9)
-    started = time.monotonic()
-    with pytest.raises(NotYetError):
-        node.tf.lookup("base_link", "camera", 7 * 10**9)
-    assert 0.1 <= time.monotonic() - started < 5.0
+        node.tf.lookup("base_link", "camera", 7 * second)
+    assert time.monotonic() - started < 1.0
+    robot.send("base_link", "camera", 6.0, 8 * second)
+    assert known(node, peer, "base_link", "camera", 7 * second).translation[0] == 4.0
     with pytest.raises(TransformError, match="extrapolation into the past") as caught:
-        node.tf.lookup("base_link", "camera", 4 * 10**9)
+        node.tf.lookup("base_link", "camera", 4 * second)
     assert not isinstance(caught.value, NotYetError)
+    node.broadcaster.close()
+    with pytest.raises(TransformError, match="TF is not listened to"):
+        node.tf.lookup("base_link", "camera", 7 * second)
 
 
 def test_a_recording_that_starts_over(made: Any, robot: Any, peer: Any) -> None:
@@ -276,6 +242,7 @@ def test_map_to_camera(made: Any, robot: Any, peer: Any) -> None:
     ((reason, text),) = node.notes
     assert reason == "not_broadcast"
     assert text.startswith("publish_tf map_to_camera: header.stamp of the input is zero")
+    assert node.broadcaster.fault() == {}  # one has been sent just now
     node.publish(frame(6 * 10**9), NodeConfig())  # switched off meanwhile
     assert len(node.notes) == 1
 
@@ -288,6 +255,7 @@ def test_a_frame_has_one_parent(made: Any, robot: Any, peer: Any) -> None:
     reason, text = node.notes[0]
     assert reason == "not_broadcast"
     assert text.startswith("publish_tf map_to_camera: frame 'base_link' hangs on 'odom' already")
+    assert node.broadcaster.fault() == {"not_broadcast": text}  # for the diagnostics
     peer.spin_until(lambda: False, 0.1)
     assert not robot_knows(robot, "map")
 

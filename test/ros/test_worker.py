@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from sensor_msgs.msg import Image
 
-from rs_localizer.frames import Refusal
+from rs_localizer.frames import Refusal, Waiting
 from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.statistics import Statistics
 from rs_localizer.ros.worker import Worker, wait_for_workers
@@ -18,7 +19,10 @@ PATIENCE = 10.0  # s, of a machine that is busy
 
 
 class Count(Statistics):
-    """Frames are plain text here, of which there are no details."""
+    """Frames are plain text here, of which there are no details and no stamps."""
+
+    def received(self, topic: str, message: Any) -> None:
+        super().received(topic, Image())
 
     def answered(self, frame: Any, received: float) -> None:
         assert received <= time.monotonic()
@@ -34,6 +38,8 @@ class Fake:
         self.published: list[str] = []
         self.done = threading.Semaphore(0)
         self.errors: list[str] = []
+        self.mounted: set[str] = set()
+        self.patience = 10.0
         self.refusals = Refusals(lambda text: None)
         self.statistics = Count(self.refusals)
         frames: Any = self
@@ -53,10 +59,18 @@ class Fake:
         if frame == "bug":
             self.done.release()
             raise TypeError("a bug")
+        if frame.startswith("late"):
+            return self._waiting(frame)
         if frame == "dark":
             self.done.release()
             return Refusal("dark", "there is no light")
         return f"{frame} {self.settings}"
+
+    def _waiting(self, frame: str) -> Any:
+        def again() -> Any:
+            return frame if frame in self.mounted else self._waiting(frame)
+
+        return Waiting("no_transform", "not yet", again, self.patience)
 
     def _publish(self, frame: Any) -> None:
         self.published.append(frame)
@@ -157,6 +171,48 @@ def test_nothing_is_published_after_a_pause(fake: Fake) -> None:
     fake.wait(fake.done)
     assert fake.published == ["three old"]
     assert fake.statistics.summary().dropped == 2  # none is lost unseen
+
+
+def test_a_late_mounting_keeps_no_other_frame_waiting(fake: Fake) -> None:
+    fake.go_on.release(4)
+    for frame in ("late 1", "late 2", "next"):
+        fake.send(frame)
+        fake.wait(fake.started)
+    fake.wait(fake.done)
+    assert fake.published == ["next old"]
+    fake.mounted = {"late 2"}  # later ones wait for the first
+    time.sleep(0.05)
+    assert fake.published == ["next old"]
+    fake.mounted = {"late 1", "late 2"}
+    fake.wait(fake.done)
+    fake.wait(fake.done)
+    assert fake.published == ["next old", "late 1", "late 2"]
+    assert fake.statistics.summary().refused == 0
+
+
+def test_a_mounting_that_does_not_come_is_a_refusal(fake: Fake) -> None:
+    fake.patience = 0.05
+    fake.go_on.release(1)
+    fake.send("late")
+    deadline = time.monotonic() + PATIENCE
+    while not fake.refusals.counts:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert fake.refusals.counts == {"no_transform": 1}
+    assert fake.published == []
+
+
+def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake: Fake) -> None:
+    fake.go_on.release(1)
+    fake.send("late")
+    fake.wait(fake.started)
+    deadline = time.monotonic() + PATIENCE
+    fake.worker.pause()
+    fake.mounted = {"late"}
+    while not fake.statistics.summary().dropped:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert fake.published == []
 
 
 def test_the_end_waits_for_the_last_frame_but_not_for_ever(fake: Fake) -> None:

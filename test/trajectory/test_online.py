@@ -8,7 +8,6 @@ import numpy as np
 import projector
 import pytest
 
-from rs_localizer.config import Acceleration
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
@@ -35,7 +34,7 @@ def watch(
 ) -> tuple[ReadoutMonitor, list[MeasuredReadout | None]]:
     """What the monitor says after every fifth frame; tracked where a readout time is given."""
     localizer = Localizer(replace(camera, readout_time=believed))
-    tracker = Tracker(localizer, Acceleration()) if believed > 0.0 else None
+    tracker = Tracker(localizer) if believed > 0.0 else None
     monitor = ReadoutMonitor(keep)
     said = []
     for k, frame in enumerate(frames):

@@ -6,7 +6,6 @@ import numpy as np
 import projector
 import pytest
 
-from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
@@ -22,7 +21,7 @@ Frames = list[tuple[float, Observed, Estimate]]
 
 
 def track(frames: list[projector.Frame]) -> Frames:
-    tracker = Tracker(Localizer(CAMERA), Acceleration())
+    tracker = Tracker(Localizer(CAMERA))
     found = []
     for frame in frames:
         stamp_ns = round(frame.stamp * 1e9)
@@ -71,10 +70,11 @@ def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn: f
     assert not np.any(sampled.bridged)
     tracked, _ = errors(motion, times, [e for _, _, e in frames])
     found, covariances = errors(motion, times, sampled.estimates)
-    for at in (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)):
+    parts = (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12))
+    for at, most in zip(parts, (0.95, 0.85, 0.5, 0.5), strict=True):
         ratio = np.median(np.linalg.norm(found[:, at], axis=1)) / np.median(
             np.linalg.norm(tracked[:, at], axis=1))  # fmt: skip
-        assert ratio < 0.7
+        assert ratio < most
     for at in (slice(0, 6), slice(6, 12)):
         squared = np.einsum("ni,nij,nj->n", found[:, at], np.linalg.inv(covariances[:, at, at]),
                             found[:, at])  # fmt: skip

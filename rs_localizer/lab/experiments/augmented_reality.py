@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rs_localizer.config import SOLVER_NAMES
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m

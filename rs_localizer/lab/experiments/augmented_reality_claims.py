@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.results import Claim, judge
 

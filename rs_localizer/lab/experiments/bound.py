@@ -9,12 +9,21 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import (
+    Claim,
+    Context,
+    Result,
+    Table,
+    judge,
+    judge_intervals,
+)
 from rs_localizer.lab.experiments.trials import Setting, camera
+from rs_localizer.lab.experiments.uncertainty import Interval, quantile, share
 from rs_localizer.lab.experiments.views import GROSS, Outcome, outcome, synthetic_views
+from rs_localizer.lab.palette import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 _REGION = 0.95
@@ -42,14 +51,14 @@ class Case:
 
 _CASES = (
     Case("fast", "50 points at 20 deg and 0.2 m", Setting(20.0, 0.2, 1.0),
-         Look("#0b3c8c", "", "-", 2.0), 1.05),
+         Look(BLUE, "", "-", 2.0), 1.05),
     Case("outliers", "200 points, 50 % outliers, at 10 deg and 0.1 m",
          Setting(10.0, 0.1, 1.0, points=200), Look("#2f6fc0", "", "--", 1.6), 1.05, outliers=0.5),
     Case("faster", "100 points at 30 deg and 0.3 m", Setting(30.0, 0.3, 1.0, points=100),
          Look("#5aa0e0", "", ":", 2.0), 1.08),
     Case("slow", "50 points at 1 deg and 0.01 m", Setting(1.0, 0.01, 1.0),
          Look("#2a6b34", "", "-.", 1.6), 1.05),
-    Case("rest", "50 points at rest", Setting(noise=1.0), Look("#f08a24", "", "-", 1.4)),
+    Case("rest", "50 points at rest", Setting(noise=1.0), Look(ORANGE, "", "-", 1.4)),
 )  # fmt: skip
 
 
@@ -59,9 +68,6 @@ class Found:
 
     case: Case
     outcomes: Sequence[Outcome]
-
-    def share(self, condition: Sequence[bool]) -> float:
-        return float(np.mean(condition))
 
     @property
     def errors(self) -> Array:
@@ -73,12 +79,13 @@ class Found:
         return 6 if self.case.at_rest else 12
 
     @property
-    def ratio(self) -> float:
+    def ratio(self) -> Interval:
         """Median error in units of that of an estimate at the bound, as standard deviations."""
-        return float(np.sqrt(np.median(self.errors) / chi2.ppf(0.5, self.freedom)))
+        found = np.sqrt(np.maximum(self.errors, 0.0) / chi2.ppf(0.5, self.freedom))
+        return quantile(found)
 
     @property
-    def coverage(self) -> float:
+    def coverage(self) -> Interval:
         """Share of the truths in the 95 % region of the covariance reported with a pose."""
         reported = np.array(
             [
@@ -87,7 +94,7 @@ class Found:
                 if x.localized
             ]
         )
-        return float(np.mean(reported < chi2.ppf(_REGION, self.freedom)))
+        return share(reported < chi2.ppf(_REGION, self.freedom))
 
     @property
     def velocities_covered(self) -> float:
@@ -96,11 +103,16 @@ class Found:
 
     @property
     def gross(self) -> float:
-        return self.share([x.gross for x in self.outcomes])
+        return float(np.mean([x.gross for x in self.outcomes]))
 
     @property
     def refused(self) -> float:
-        return self.share([not x.localized for x in self.outcomes])
+        return float(np.mean([not x.localized for x in self.outcomes]))
+
+    @property
+    def lost(self) -> Interval:
+        """Share without a pose that is right."""
+        return share(np.array([x.gross or not x.localized for x in self.outcomes]))
 
     @property
     def overconfident(self) -> int:
@@ -152,33 +164,36 @@ def claims(found: Found) -> list[Claim]:
     low, high = _COVERED
     block = ", pose alone" if case.at_rest else ""
     listed = [
-        judge(
+        judge_intervals(
             f"bound.{case.name}_calibrated",
             "this project",
             f"the covariance is honest: {case.label}{block}",
             f"the {_REGION:.0%} region covers {low:.0%} to {high:.0%} of the truths",
-            f"{found.coverage:.1%}",
-            low <= found.coverage <= high,
+            found.coverage.share(),
+            [found.coverage],
+            _COVERED,
         ),
-        judge(
+        judge_intervals(
             f"bound.{case.name}_gross",
             "this project",
             f"hardly a pose is wrong: {case.label}",
             f"more than {GROSS:g} sigma off, or no pose: at most {_MOST_GROSS:.0%}",
             f"{found.gross:.2%} off, {found.refused:.2%} without a pose",
-            found.gross + found.refused <= _MOST_GROSS,
+            [found.lost],
+            (0.0, _MOST_GROSS),
         ),
     ]
     if np.isfinite(case.at_most):
         listed.insert(
             0,
-            judge(
+            judge_intervals(
                 f"bound.{case.name}",
                 "this project",
                 f"at the Cramér-Rao bound: {case.label}",
                 f"median at most {case.at_most:g} of the bound's, as standard deviations",
-                f"{found.ratio:.3f}",
-                found.ratio <= case.at_most,
+                f"{found.ratio.value:.3f}",
+                [found.ratio],
+                (-np.inf, case.at_most),
             ),
         )
     return listed
@@ -202,8 +217,8 @@ def _row(found: Found) -> tuple[str | float | int, ...]:
     case, setting = found.case, found.case.setting
     return (
         case.name, setting.points, case.outliers, setting.angular, setting.linear, found.freedom,
-        found.ratio, found.coverage, found.velocities_covered, found.gross, found.refused,
-        found.overconfident,
+        found.ratio.value, found.coverage.value, found.velocities_covered, found.gross,
+        found.refused, found.overconfident,
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments.kernels import informations
 from rs_localizer.lab.experiments.methods import states, view_arguments
 from rs_localizer.lab.experiments.trials import Trials

@@ -14,11 +14,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import METRICS
 from rs_localizer.lab.experiments.methods import Method
 from rs_localizer.lab.experiments.sweeps import Curves
+from rs_localizer.lab.palette import BLUE, ORANGE
 
 _DPI = 110
 _LEGEND_MARGIN, _LEGEND_ROW = 0.1, 0.21  # inches
@@ -36,7 +37,7 @@ class Look:
 
 
 _LOOKS: Mapping[str, Look] = {
-    m.P3P.name: Look("#f08a24", "x", "--"),
+    m.P3P.name: Look(ORANGE, "x", "--"),
     m.R6P.name: Look("#000000", "o", "-", 1.0, filled=False),
     m.VC_WT.name: Look("#b8b8b8", "v", "-."),
     m.VCT_W.name: Look("#4fae5b", "^", ":", filled=False),
@@ -47,7 +48,7 @@ _LOOKS: Mapping[str, Look] = {
     m.VCWT_OURS.name: Look("#2f6fc0", "P", "-", filled=False),
     m.R9P_OURS.name: Look("#701848", "D", "-"),
     m.JOINT.name: Look("#8a6d1d", "*", "-.", filled=False),
-    m.REFINED.name: Look("#0b3c8c", ".", "-", 2.2),
+    m.REFINED.name: Look(BLUE, ".", "-", 2.2),
 }
 _MARKER_SIZE = {"x": 5.0, "+": 7.0, ".": 8.0, "*": 6.0, "o": 8.0, "^": 9.0}
 

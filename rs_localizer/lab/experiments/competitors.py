@@ -8,8 +8,8 @@ from types import ModuleType
 import cv2
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.lab.experiments.stopwatch import Subject
 from rs_localizer.lab.experiments.trials import Trials, camera
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from rs_localizer.config import Acceleration
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.animation import gif, side_by_side
 from rs_localizer.lab.cube import Cube, corner_pixels, cube_on, draw_cube
@@ -71,7 +70,7 @@ def cube_clip(trajectory: Trajectory, trials: int, seed: int, track: Track) -> C
     walls = MarkerWalls(trajectory, seed, CLIP_SENSOR)
     stamps = clip_stamps(walls, max(8, round(_FRAMES_PER_TRIAL * trials)))
     p3p = Localizer(CAMERA, solver="p3p", max_iterations=_SAMPLES)
-    ours = Tracker(Localizer(CAMERA, max_iterations=_SAMPLES), Acceleration())
+    ours = Tracker(Localizer(CAMERA, max_iterations=_SAMPLES))
     middles, images, motions = [], [], []
     for frame, image in track(walls.frames(stamps), len(stamps)):
         found = {

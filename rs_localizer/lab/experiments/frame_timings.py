@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.prior import velocity_terms
-from rs_localizer.core.ransac import MODEL_SIZE, Candidate, Hypotheses, Observations, search
-from rs_localizer.core.sampling import IntArray, Pool, generator
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.observations import Observations
+from rs_localizer.core.ransac import NOTHING, Hypotheses, search
+from rs_localizer.core.sampling import Pool, generator
 from rs_localizer.lab.experiments.competitors import robust_subjects
 from rs_localizer.lab.experiments.plain_ransac import observe
 from rs_localizer.lab.experiments.stopwatch import Subject
 from rs_localizer.lab.experiments.trials import Setting, camera, draw_trials
-from rs_localizer.localizer import Localizer
+from rs_localizer.localizer import Localizer, assumptions
 from rs_localizer.solvers import find_solver
 
 FRAME = Setting(angular=17.0, linear=0.3, noise=0.5, points=200)
@@ -70,16 +70,17 @@ def _all_samples(observations: Observations, rotation: Array, config: LocalizerC
     ) -> None:
         solver.solve(points, rays, tau, samples, rotations, config.solver_iterations, models)
 
-    threshold, prior = config.inlier_threshold, config.velocity_prior
+    threshold = config.inlier_threshold
+    terms, _ = assumptions(camera(), config, solver)
     search(
         observations,
         Hypotheses(
             solve, solver.sample_size, solver.solutions, _BLOCK, 4.0 * threshold, threshold,
-            velocity_terms(prior.angular, prior.linear), 0.5 * threshold,
+            terms, 0.5 * threshold,
         ),
         [rotation],
         [Pool(np.arange(len(observations)))],
-        Candidate(np.zeros(MODEL_SIZE), np.inf),
+        NOTHING,
         1.0,  # never sure enough to stop
         _HYPOTHESES,
         generator(config.seed),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.prior import PriorTerms
 from rs_localizer.core.refine import refine
@@ -15,8 +16,7 @@ from rs_localizer.core.residuals import (
     truncated_cost,
 )
 from rs_localizer.core.scoring import optimize, state_of_model
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.view import PARAMETERS, STATE_SIZE
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 
 
 @kernel
@@ -49,7 +49,7 @@ def refine_frames(
     models: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array,
     threshold: float, prior: PriorTerms,
 ) -> Array:
-    """Local optimisation and final refinement of the Localizer on all points: states (h,18)."""
+    """Local optimisation and final refinement of the Localizer on all points: states (h,24)."""
     states = np.full((len(models), STATE_SIZE), np.nan)
     noise = 0.5 * threshold
     for i in range(len(models)):
@@ -74,7 +74,7 @@ def refine_frames(
 def frame_errors(
     states: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array
 ) -> Array:
-    """Reprojection errors (h,n) in pixels under the states (h,18) of the frames."""
+    """Reprojection errors (h,n) in pixels under the states (h,24) of the frames."""
     errors = np.empty(tau.shape)
     for i in range(len(states)):
         data = pack(points[i], rays[i], tau[i], by_ray)
@@ -86,10 +86,11 @@ def frame_errors(
 def informations(
     states: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array
 ) -> Array:
-    """Fisher information (h,12,12) of the states at a noise of one pixel."""
-    found = np.empty((len(states), PARAMETERS, PARAMETERS))
-    slope = np.empty(PARAMETERS)
+    """Fisher information (h,12,12) of the states at a noise of one pixel, without acceleration."""
+    found = np.empty((len(states), MOTION_PARAMETERS, MOTION_PARAMETERS))
+    information, slope = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
     for i in range(len(states)):
         data = pack(points[i], rays[i], tau[i], by_ray)
-        normal_equations(data, states[i], gradient, 1e6, 0.0, 2, found[i], slope)
+        normal_equations(data, states[i], gradient, 1e6, 0.0, 2, information, slope)
+        found[i] = information[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
     return found

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.image_sequence import in_order
 from rs_localizer.lab.rendering import ImageSettings, Renderer

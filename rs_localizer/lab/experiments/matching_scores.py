@@ -8,8 +8,8 @@ from itertools import islice
 import numpy as np
 
 from rs_localizer.config import Matching
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps import Map
 from rs_localizer.lab.experiments.results import Claim, Context, judge

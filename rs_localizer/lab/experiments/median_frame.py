@@ -9,8 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.lab.experiments.competitors import poselib, poselib_camera
 from rs_localizer.lab.experiments.results import Claim, Context, Table, judge, not_tested
 from rs_localizer.lab.experiments.trials import Setting, camera

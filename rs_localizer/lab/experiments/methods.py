@@ -14,11 +14,11 @@ from itertools import combinations
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.prior import velocity_terms
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments.errors import angles
 from rs_localizer.lab.experiments.kernels import best_solutions, refine_frames
 from rs_localizer.lab.experiments.trials import POINTS, Motions, Trials, camera
+from rs_localizer.localizer import assumptions
 from rs_localizer.solvers import SOLVERS, find_solver, solve_minimal
 
 _SIX = 6
@@ -31,7 +31,7 @@ _ALL_POINTS_SCALE = 1e4
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A row of the tables and a line of the figures."""
+    """A row of the tables and a line of the figures; labels begin with the setting ``solver``."""
 
     name: str
     label: str
@@ -41,17 +41,17 @@ class Method:
     refined: bool = False
 
 
-P3P = Method("p3p", "P3P", "p3p")
-R6P = Method("r6p", "R6P", "r6p")
-VC_WT = Method("r6p_vc_wt", "R6P v,C | w,t", "r6p_vc_wt")
-VCT_W = Method("r6p_vct_w", "R6P v,C,t | w", "r6p_vct_w")
-VCT_WT = Method("r6p_vct_wt", "R6P v,C,t | w,t", "r6p_vct_wt")
-VCWT = Method("r6p_vcwt", "R6P v,C,w,t", "r6p_vcwt")
-R9P = Method("r9p", "R9P", "r9p")
-VCWT_ONCE = Method("r6p_vcwt_1", "R6P v,C,w,t, one iteration", "r6p_vcwt", iterations=1)
-VCWT_OURS = Method("r6p_vcwt_relinearized", "R6P v,C,w,t relinearized", "r6p_vcwt",
+P3P = Method("p3p", "p3p", "p3p")
+R6P = Method("r6p", "r6p", "r6p")
+VC_WT = Method("r6p_vc_wt", "r6p_vc_wt", "r6p_vc_wt")
+VCT_W = Method("r6p_vct_w", "r6p_vct_w", "r6p_vct_w")
+VCT_WT = Method("r6p_vct_wt", "r6p_vct_wt", "r6p_vct_wt")
+VCWT = Method("r6p_vcwt", "r6p_vcwt", "r6p_vcwt")
+R9P = Method("r9p", "r9p", "r9p")
+VCWT_ONCE = Method("r6p_vcwt_1", "r6p_vcwt, one iteration", "r6p_vcwt", iterations=1)
+VCWT_OURS = Method("r6p_vcwt_relinearized", "r6p_vcwt, relinearized", "r6p_vcwt",
                    as_published=False)  # fmt: skip
-R9P_OURS = Method("r9p_trace_fixed", "R9P, trace fixed", "r9p", as_published=False)
+R9P_OURS = Method("r9p_trace_fixed", "r9p, trace fixed", "r9p", as_published=False)
 JOINT = Method("joint", "joint", "joint", as_published=False)
 REFINED = Method("refined", f"ours, refined on {POINTS} points", "r6p_vcwt", as_published=False,
                  refined=True)  # fmt: skip
@@ -106,10 +106,11 @@ def plausible_triplet(trials: Trials) -> Motions:
 
 
 def states(motions: Motions) -> Array:
-    """Model B states (h,18) of the reprojection kernels: ``omega = -w``, ``v = w x C - t``."""
+    """Model B states (h,24) of the reprojection kernels: ``omega = -w``, ``v = w x C - t``."""
     velocity = np.cross(motions.w, motions.translation) - motions.t
     rotation = motions.rotation.reshape(-1, 9)
-    return np.hstack([rotation, motions.translation, -motions.w, velocity])
+    still = np.zeros((len(rotation), 6))
+    return np.hstack([rotation, motions.translation, -motions.w, velocity, still])
 
 
 def _models(method: Method, trials: Trials, initial: Array) -> Array:
@@ -156,8 +157,7 @@ def _best(models: Array, trials: Trials, scale: float) -> Array:
 
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
-    deviations = LocalizerConfig().velocity_prior
-    prior = velocity_terms(deviations.angular, deviations.linear)
+    prior, _ = assumptions(camera(), LocalizerConfig(), find_solver("r6p_vcwt"))
     found = refine_frames(
         np.ascontiguousarray(models), *view_arguments(trials), threshold, prior
     )

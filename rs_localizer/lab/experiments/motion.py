@@ -6,14 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import ORIENTATION, POSITION, T, W
 from rs_localizer.lab.experiments.methods import Method
-from rs_localizer.lab.experiments.results import Claim, Context, Result, judge, not_tested
-from rs_localizer.lab.experiments.sweeps import Curves, largest_difference, sweep
+from rs_localizer.lab.experiments.results import (
+    Claim,
+    Context,
+    Result,
+    judge_intervals,
+    not_tested,
+)
+from rs_localizer.lab.experiments.sweeps import Curves, largest_difference, sampled, sweep
 from rs_localizer.lab.experiments.trials import Setting
 
 SPEEDS = tuple(np.linspace(0.0, 30.0, 11).tolist())
@@ -64,9 +69,7 @@ def run(context: Context) -> Result:
         {
             "motion": charts.error_figure(exact, (*m.PAPERS, m.REFINED), X_LABEL),
             "motion_noisy": charts.error_figure(noisy, (*m.PAPERS, m.REFINED), X_LABEL),
-            "choosing_motion": charts.error_figure(
-                noisy, CHOICE, X_LABEL, (ORIENTATION, POSITION)
-            ),
+            "choosing_motion": charts.error_figure(noisy, CHOICE, X_LABEL, (ORIENTATION, POSITION)),
             "motion_ours": charts.error_figure(
                 noisy, (m.R6P, m.VCT_W, m.VCWT, m.R9P, m.R9P_OURS, m.JOINT, m.REFINED), X_LABEL
             ),
@@ -96,29 +99,39 @@ def equal_to_r6p(
     )
     if not sweeps[0].has(m.R6P):
         return not_tested(*said, "r6p is not part of this version")
-    difference = max(
-        largest_difference(
-            curves.medians(method)[curves.x <= up_to],
-            curves.medians(m.R6P)[curves.x <= up_to],
-            _FLOOR,
+
+    def difference(*sweeps: Curves) -> float:
+        return max(
+            largest_difference(
+                curves.medians(method)[curves.x <= up_to],
+                curves.medians(m.R6P)[curves.x <= up_to],
+                _FLOOR,
+            )
+            for curves in sweeps
         )
-        for curves in sweeps
-    )
-    return judge(*said, f"largest difference {difference:.1%}", difference <= _EQUAL, why)
+
+    found = sampled(difference, *sweeps)
+    finding = f"largest difference {found.value:.1%}"
+    return judge_intervals(*said, finding, [found], (-np.inf, _EQUAL), why)
 
 
 def joint_is_best(experiment: str, curves: Curves) -> Claim:
     """Whether choosing by the robust score loses nothing."""
-    better = np.minimum(curves.medians(m.VCT_W), curves.medians(m.VCWT))
-    excess = float(np.max(curves.medians(m.JOINT) / better)) - 1.0
-    return judge(
+
+    def excess(curves: Curves) -> float:
+        better = np.minimum(curves.medians(m.VCT_W), curves.medians(m.VCWT))
+        return float(np.max(curves.medians(m.JOINT) / better)) - 1.0
+
+    found = sampled(excess, curves)
+    return judge_intervals(
         f"{experiment}.joint",
         "this project",
         "joint, by the robust score over the 50 noisy points of the frame, is never worse than "
         "the better of its two solvers",
         f"all medians of the four errors at most {_EQUAL:.0%} above those of the better one",
-        f"at most {excess:+.1%}",
-        excess <= _EQUAL,
+        f"at most {found.value:+.1%}",
+        [found],
+        (-np.inf, _EQUAL),
     )
 
 
@@ -127,39 +140,47 @@ def _moving(curves: Curves, method: Method, metric: int) -> Array:
 
 
 def _two_step_poor(sweeps: Sequence[Curves]) -> Claim:
-    ratio = min(
-        float(np.min(_moving(curves, method, metric) / _moving(curves, m.VCWT, metric)))
-        for curves in sweeps
-        for method in m.TWO_STEP
-        for metric in (ORIENTATION, POSITION, W, T)
-    )
-    return judge(
+    def ratio(*sweeps: Curves) -> float:
+        return min(
+            float(np.min(_moving(curves, method, metric) / _moving(curves, m.VCWT, metric)))
+            for curves in sweeps
+            for method in m.TWO_STEP
+            for metric in (ORIENTATION, POSITION, W, T)
+        )
+
+    found = sampled(ratio, *sweeps)
+    return judge_intervals(
         "motion.two_step_poor",
         _PAPER,
         "the three solvers in two steps are poor",
         f"all their medians at least {_POOR:g} times those of {m.VCWT.label}, wherever it moves",
-        f"at least {ratio:.1f} times",
-        ratio >= _POOR,
+        f"at least {found.value:.1f} times",
+        [found],
+        (_POOR, np.inf),
     )
 
 
 def _r9p_ahead(name: str, when: str, method: Method, sweeps: Sequence[Curves]) -> Claim:
-    ratios = np.array(
-        [
-            _moving(curves, method, metric) / _moving(curves, m.VCWT, metric)
-            for curves in sweeps
-            for metric in (ORIENTATION, POSITION)
-        ]
-    )
+    def all_ratios(*sweeps: Curves) -> Array:
+        return np.array(
+            [
+                _moving(curves, method, metric) / _moving(curves, m.VCWT, metric)
+                for curves in sweeps
+                for metric in (ORIENTATION, POSITION)
+            ]
+        )
+
+    ratios = all_ratios(*sweeps)
     fast = SPEEDS[-1]
-    return judge(
+    return judge_intervals(
         name,
         "this project" if method is m.R9P_OURS else _PAPER,
         f"{method.label} is slightly better than {m.VCWT.label} in pose, {when}",
         f"its medians of orientation and position below those of {m.VCWT.label}, wherever it moves",
         f"{ratios.min():.2f} to {ratios.max():.2f} times ({ratios[:, -1].max():.2f} at {fast:g} "
         "deg per frame)",
-        bool(np.all(ratios < 1.0)),
+        [sampled(lambda *sweeps: float(all_ratios(*sweeps).max()), *sweeps)],
+        (-np.inf, 1.0),
         "scaling all points in proportion to the row (R_RS = I, t = C) leaves the image of a "
         "camera at rest as it is: nothing but the motion itself tells the solver how much of it "
         "there is, and noise fills it with any amount (see motion.r9p_gauge). The paper's curves "
@@ -168,21 +189,26 @@ def _r9p_ahead(name: str, when: str, method: Method, sweeps: Sequence[Curves]) -
 
 
 def _gauge(noisy: Curves) -> Claim:
-    def gain(metric: int, places: BoolArray) -> float:
-        ratio = noisy.median(m.R9P, metric) / noisy.median(m.R9P_OURS, metric)
+    def gain(curves: Curves, metric: int, places: BoolArray) -> float:
+        ratio = curves.median(m.R9P, metric) / curves.median(m.R9P_OURS, metric)
         return float(np.min(ratio[places]))
 
     everywhere, fast = noisy.x >= 0.0, noisy.x >= _FAST
-    drift, pose = gain(T, everywhere), min(gain(ORIENTATION, fast), gain(POSITION, fast))
-    return judge(
+    drift = sampled(lambda curves: gain(curves, T, everywhere), noisy)
+    pose = sampled(
+        lambda curves: min(gain(curves, metric, fast) for metric in (ORIENTATION, POSITION)), noisy
+    )
+    return judge_intervals(
         "motion.r9p_gauge",
         "this project",
         "fixing trace(R_RS) = 0 removes the gauge of R9P: about half the error in pose, a tenth "
         "of that in t",
         f"at 1 px: error of t at most a tenth, at every speed; from {_FAST:g} deg per frame on, "
         "errors of the pose at most two thirds",
-        f"t {drift:.0f} times better or more; pose {pose:.2f} times or more",
-        drift >= 10.0 and pose >= 1.5,
+        f"t {drift.value:.0f} times better or more; pose {pose.value:.2f} times or more",
+        # Each in units of what is asked of it.
+        [drift.over(10.0), pose.over(1.5)],
+        (1.0, np.inf),
     )
 
 
@@ -197,7 +223,10 @@ def _velocity_of_r9p(exact: Curves, noisy: Curves) -> Claim:
             f"{curves.at(m.R9P, W, top):.1f}, {m.VCWT.label} {curves.at(m.VCWT, W, top):.1f})"
         )
 
-    return judge(
+    def least(curves: Curves) -> float:
+        return float(np.min(curves.median(m.R9P_OURS, W)[places] / curves.x[places]))
+
+    return judge_intervals(
         "motion.r9p_no_velocity",
         "paper: R9P",
         "the angular velocity cannot be had from R9P",
@@ -205,7 +234,8 @@ def _velocity_of_r9p(exact: Curves, noisy: Curves) -> Claim:
         f"{_FAST:g} deg per frame on",
         f"misses {relative.min():.0%} to {relative.max():.0%}; at {top:g} deg per frame "
         f"{errors(exact)} without noise, {errors(noisy)} at 1 px",
-        bool(np.all(relative >= 0.5)),
+        [sampled(least, noisy)],
+        (0.5, np.inf),
         "w is the skew part of R_RS (I + [v]x)^-1: the solver determines all nine entries, only "
         "the gauge had to go",
     )

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.bounds import median_bound
@@ -16,9 +16,17 @@ from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.errors import ORIENTATION, motion_errors
 from rs_localizer.lab.experiments.kernels import frame_errors
 from rs_localizer.lab.experiments.methods import Method
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
-from rs_localizer.lab.experiments.sweeps import Curves, sweep
+from rs_localizer.lab.experiments.results import (
+    Claim,
+    Context,
+    Result,
+    Table,
+    judge,
+    judge_intervals,
+)
+from rs_localizer.lab.experiments.sweeps import Curves, sampled, sweep
 from rs_localizer.lab.experiments.trials import POINTS, Setting, Trials, draw_trials
+from rs_localizer.lab.experiments.uncertainty import share
 
 _NOISES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 _SPEED, _TRANSLATION = 20.0, 0.2  # deg and units per frame
@@ -69,16 +77,21 @@ def _slope(curves: Curves, method: Method) -> float:
 
 def _alike(name: str, who: str, methods: Sequence[Method], curves: Curves) -> Claim:
     reference = _slope(curves, m.VCWT)
-    slopes = {x.label: _slope(curves, x) for x in methods if curves.has(x)}
-    listed = ", ".join(f"{label} {slope:.2f}" for label, slope in slopes.items())
-    return judge(
+    slopes = {
+        x: sampled(lambda drawn, x=x: _slope(drawn, x) / _slope(drawn, m.VCWT), curves)
+        for x in methods
+        if curves.has(x)
+    }
+    listed = ", ".join(f"{x.label} {slope.value * reference:.2f}" for x, slope in slopes.items())
+    return judge_intervals(
         name,
         "paper: noise",
         f"{who} degrade alike",
         "from 2 to 4 px, median orientation errors grow per px by half to twice as much as that of "
         f"{m.VCWT.label}",
         f"{m.VCWT.label} {reference:.2f} deg per px; {listed}",
-        all(1.0 / _ALIKE <= slope / reference <= _ALIKE for slope in slopes.values()),
+        list(slopes.values()),
+        (1.0 / _ALIKE, _ALIKE),
         "the solvers in two steps stop near their start, w = t = 0: after five iterations a bias "
         "of degrees hides the noise, so that their curves start high and stay flat (see "
         "convergence.others_slow)",
@@ -86,28 +99,34 @@ def _alike(name: str, who: str, methods: Sequence[Method], curves: Curves) -> Cl
 
 
 def _six_points(curves: Curves, bound: Array) -> Claim:
-    found = {x.label: curves.at(x, ORIENTATION, 1.0) for x in (m.R6P, m.VCWT) if curves.has(x)}
-    listed = ", ".join(f"{label} {error:.2f}" for label, error in found.items())
-    return judge(
+    found = {
+        x.label: sampled(lambda drawn, x=x: drawn.at(x, ORIENTATION, 1.0), curves)
+        for x in (m.R6P, m.VCWT)
+        if curves.has(x)
+    }
+    listed = ", ".join(f"{label} {error.value:.2f}" for label, error in found.items())
+    return judge_intervals(
         "noise.six_point_bound",
         "this project",
         "a six-point pose is limited by the noise, not by the solver",
         "median orientation error at 1 px at most 1.5 times the bound of six points",
         f"{listed} deg; bound {bound[0]:.2f}",
-        all(error <= 1.5 * bound[0] for error in found.values()),
+        list(found.values()),
+        (-np.inf, 1.5 * bound[0]),
     )
 
 
 def _fifty_points(curves: Curves, bound: Array) -> Claim:
-    error = curves.at(m.REFINED, ORIENTATION, 1.0)
-    return judge(
+    error = sampled(lambda drawn: drawn.at(m.REFINED, ORIENTATION, 1.0), curves)
+    return judge_intervals(
         "noise.refined_reaches_bound",
         "this project",
         f"refined on all {POINTS} points, the pose is as good as it can be",
         f"median orientation error at 1 px at most 1.15 times the bound of {POINTS} points",
-        f"{error:.4f} deg; bound {bound[0]:.4f}; six-point start "
+        f"{error.value:.4f} deg; bound {bound[0]:.4f}; six-point start "
         f"{curves.at(m.VCWT_OURS, ORIENTATION, 1.0):.2f}",
-        error <= 1.15 * bound[0],
+        [error],
+        (-np.inf, 1.15 * bound[0]),
     )
 
 
@@ -127,22 +146,23 @@ def _visible(shares: Sequence[float]) -> Claim:
         "at 1 px noise, fewer than "
         + ", ".join(f"{few:.0%} within {radius:g} px" for few, radius in
                     zip(_FEW, _RADII, strict=True)),
-        ", ".join(f"{share:.0%} within {radius:g} px" for share, radius in
+        ", ".join(f"{seen:.0%} within {radius:g} px" for seen, radius in
                   zip(shares, _RADII, strict=True)),
-        all(share < few for share, few in zip(shares, _FEW, strict=True)),
+        all(seen < few for seen, few in zip(shares, _FEW, strict=True)),
     )  # fmt: skip
 
 
 def _one_sample(trials: Trials, bound: Array) -> Claim:
     found = motion_errors(m.estimate(m.REFINED, trials, noise=1.0), trials.truth)
-    share = float(np.mean(found[:, ORIENTATION] < 10.0 * bound[0]))
-    return judge(
+    succeeded = share(found[:, ORIENTATION] < 10.0 * bound[0])
+    return judge_intervals(
         "noise.one_sample_suffices",
         "this project",
         "local optimisation from one sample of inliers alone succeeds in 99 to 100 %",
         "at 1 px, 98 % of the refined orientations within ten times the median bound",
-        f"{share:.1%}",
-        share >= 0.98,
+        succeeded.share(),
+        [succeeded],
+        (0.98, 1.0),
         "six points that happen to determine the motion badly (most of them in the worst tenth by "
         "their own bound) start it where half of the points miss by more than the widest "
         "threshold, 16 px; the robust loop optimises the best two of every block of samples",

@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.ransac import MODEL_SIZE, Observations
+from rs_localizer.core.observations import Observations
+from rs_localizer.core.ransac import MODEL_SIZE
 from rs_localizer.core.sampling import draw, generator
 from rs_localizer.core.scoring import best_models
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.state import STATE_SIZE
 from rs_localizer.lab.experiments.methods import Method
 from rs_localizer.solvers import find_solver
 
@@ -32,7 +34,7 @@ def best_of_samples(
     observations: Observations, method: Method, rotation: Array, samples: int, threshold: float,
     seed: int,
 ) -> tuple[Array, int]:
-    """State (18,) of the best minimal model and its number of inliers.
+    """State (24,) of the best minimal model and its number of inliers.
 
     Args:
         rotation: initial rotation (3,3).
@@ -42,7 +44,7 @@ def best_of_samples(
     solver = find_solver(method.solver)
     count = len(observations)
     if count < solver.sample_size:
-        return np.full(MODEL_SIZE, np.nan), 0
+        return np.full(STATE_SIZE, np.nan), 0
     drawn = np.empty((samples, solver.sample_size), dtype=np.int64)
     draw(
         np.arange(count), np.full(samples, count), observations.tau,
@@ -58,6 +60,6 @@ def best_of_samples(
         models, observations.packed, observations.row_time_gradient, threshold, 1, math.inf
     )
     if not math.isfinite(costs[0]):
-        return np.full(MODEL_SIZE, np.nan), 0
+        return np.full(STATE_SIZE, np.nan), 0
     inliers = observations.squared_errors(states[0]) < threshold**2
     return states[0], int(np.count_nonzero(inliers))

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from matplotlib.figure import Figure
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.methods import Method, available
 from rs_localizer.lab.experiments.results import Claim, judge, not_tested

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import textwrap
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -13,6 +14,7 @@ from rs_localizer.lab.experiments.choosing import choosing_section
 from rs_localizer.lab.experiments.results import Claim, Result, Table, Verdict
 
 SUMMARY, SUMMARY_DATA = "summary.md", "summary.json"
+_LETTERS_PER_INCH = 10.0  # of a title
 
 
 def write_result(folder: Path, result: Result) -> None:
@@ -20,6 +22,8 @@ def write_result(folder: Path, result: Result) -> None:
     for name, table in result.tables.items():
         _write_table(folder / f"{name}.csv", table)
     for name, figure in result.figures.items():
+        letters = int(_LETTERS_PER_INCH * figure.get_figwidth())
+        figure.suptitle(textwrap.fill(result.title, letters))
         figure.savefig(folder / f"{name}.png")
     for name, data in result.files.items():
         (folder / name).write_bytes(data)

@@ -10,6 +10,8 @@ from typing import Protocol, TypeVar
 
 from matplotlib.figure import Figure
 
+from rs_localizer.lab.experiments.uncertainty import Interval
+
 T = TypeVar("T")
 
 
@@ -18,6 +20,7 @@ class Verdict(StrEnum):
 
     HELD = "held"
     NOT_HELD = "did not hold"
+    UNDECIDED = "undecided"  # too few trials to tell
     NOT_TESTED = "not tested"
 
 
@@ -40,6 +43,30 @@ def judge(
     """A claim and its verdict; ``why`` is kept for one that does not hold."""
     verdict = Verdict.HELD if held else Verdict.NOT_HELD
     return Claim(name, source, statement, criterion, finding, verdict, "" if held else why)
+
+
+def judge_intervals(
+    name: str,
+    source: str,
+    statement: str,
+    criterion: str,
+    finding: str,
+    intervals: Sequence[Interval],
+    limits: tuple[float, float],
+    why: str = "",
+) -> Claim:
+    """A claim that figures lie between limits, judged by how well they are known.
+
+    It holds where all intervals lie within, does not where one lies outside, and is undecided
+    between.
+    """
+    if any(interval.outside(*limits) for interval in intervals):
+        return Claim(name, source, statement, criterion, finding, Verdict.NOT_HELD, why)
+    if all(interval.within(*limits) for interval in intervals):
+        return Claim(name, source, statement, criterion, finding, Verdict.HELD)
+    trials = min(interval.trials for interval in intervals)
+    said = f"{finding}; undecided at {trials} trials"
+    return Claim(name, source, statement, criterion, said, Verdict.UNDECIDED)
 
 
 def not_tested(name: str, source: str, statement: str, criterion: str, reason: str) -> Claim:
@@ -91,3 +118,5 @@ class Context:
     webcam: Path  # recording of a chessboard
     webcam_readout_time: float
     hand_motion: Path  # trajectory
+    slow_hand_motion: Path  # trajectory
+    tags: Path  # recording of a global shutter

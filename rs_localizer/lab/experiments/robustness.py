@@ -12,20 +12,27 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import (
+    Claim,
+    Context,
+    Result,
+    Table,
+    judge,
+    judge_intervals,
+)
+from rs_localizer.lab.experiments.uncertainty import CONFIDENCE, Interval, share, together
 from rs_localizer.lab.experiments.views import GROSS, Outcome, View, outcome, uniform_pixels
 from rs_localizer.localizer import Localizer
 
 _SIZE = 1000
 _NOISE = 1.0  # px
 _DEPTH = (1.0, 4.0)  # m
-_FOUND, _MOST_MS = 0.99, 15.0
+_FOUND, _MOST_MS, _MOST_WRONG = 0.99, 15.0, 0.01
 # A second object has turned and moved by so much against the scene (deg, m).
 _OBJECT = (20.0, 0.5)
 _PERIOD = 0.3  # m from one window of a facade to the next
@@ -82,17 +89,16 @@ class Found:
     seconds: Array
 
     @property
-    def correct(self) -> float:
-        return float(np.mean([x.correct for x in self.outcomes]))
+    def correct(self) -> Interval:
+        return share(np.array([x.correct for x in self.outcomes]))
 
     @property
     def no_pose(self) -> float:
         return float(np.mean([not x.localized for x in self.outcomes]))
 
-    @property
-    def wrong(self) -> float:
+    def wrong(self, confidence: float = CONFIDENCE) -> Interval:
         """Share of frames that were published and are wrong."""
-        return float(np.mean([x.gross for x in self.outcomes]))
+        return share(np.array([x.gross for x in self.outcomes]), confidence=confidence)
 
     @property
     def median(self) -> float:
@@ -180,9 +186,9 @@ def _view(case: Case, view: Camera, rng: np.random.Generator) -> View:
     points = _seen_at(motion, view, pixels, rng.uniform(*_DEPTH, n))
     group = np.zeros(n, dtype=np.int64)  # 0: the scene
     order, first = rng.permutation(n), 0
-    for kind, share in enumerate((case.uniform, case.second, case.shifted), 1):
-        group[order[first : first + round(share * n)]] = kind
-        first += round(share * n)
+    for kind, part in enumerate((case.uniform, case.second, case.shifted), 1):
+        group[order[first : first + round(part * n)]] = kind
+        first += round(part * n)
     measured = pixels + _NOISE * rng.normal(size=(n, 2))
     measured[group == 1] = uniform_pixels(view, int(np.count_nonzero(group == 1)), rng)
     # The camera as the object sees it: elsewhere, and moving in another way.
@@ -228,13 +234,14 @@ def _scores(case: Case, inliers: BoolArray, rng: np.random.Generator) -> Array |
 
 
 def _hard(found: Found) -> Claim:
-    return judge(
+    return judge_intervals(
         "robustness.uniform_70",
         "this project",
         "70 % uniform outliers are borne",
         f"at least {_FOUND:.0%} of the frames localized correctly",
-        f"{found.correct:.1%}, median error {found.median:.2f} of the bound",
-        found.correct >= _FOUND,
+        f"{found.correct.share()}, median error {found.median:.2f} of the bound",
+        [found.correct],
+        (_FOUND, 1.0),
     )
 
 
@@ -252,33 +259,36 @@ def _hard_time(found: Found) -> Claim:
 
 def _localized(found: Found) -> Claim:
     case = found.case
-    return judge(
+    return judge_intervals(
         f"robustness.{case.name}",
         "this project",
         f"localized correctly: {case.label}",
         f"at least {case.at_least:.0%} of the frames",
-        f"{found.correct:.1%}, median error {found.median:.2f} of the bound",
-        found.correct >= case.at_least,
+        f"{found.correct.share()}, median error {found.median:.2f} of the bound",
+        [found.correct],
+        (case.at_least, 1.0),
     )
 
 
 def _none_wrong(found: Sequence[Found]) -> Claim:
-    wrong = {one.case.name: one.wrong for one in found if one.wrong > 0.0}
-    worst = max(wrong.values(), default=0.0)
-    listed = ", ".join(f"{name} {share:.1%}" for name, share in wrong.items())
-    return judge(
+    wrong = {one.case.name: one.wrong(together(len(found))) for one in found}
+    some = {name: interval for name, interval in wrong.items() if interval.value > 0.0}
+    listed = ", ".join(f"{name} {interval.value:.1%}" for name, interval in some.items())
+    return judge_intervals(
         "robustness.none_wrong",
         "this project",
         "where there is no good pose, none is published",
-        "at most 1 % of the frames of each kind have a wrong one",
+        f"at most {_MOST_WRONG:.0%} of the frames of each kind have a wrong one",
         listed or "none at all",
-        worst <= 0.01,
+        list(wrong.values()),
+        (0.0, _MOST_WRONG),
     )
 
 
 def _row(found: Found) -> tuple[str | float | int, ...]:
     return (
-        found.case.name, found.case.points, len(found.outcomes), found.correct, found.wrong,
+        found.case.name, found.case.points, len(found.outcomes), found.correct.value,
+        found.wrong().value,
         found.no_pose, found.median, found.milliseconds,
     )  # fmt: skip
 
@@ -292,7 +302,7 @@ def _figure(found: Sequence[Found]) -> Figure:
     axes, errors = drawn.subplots(1, 2, sharey=True)
     y = np.arange(len(found), dtype=np.float64)
     for panel, values, label in (
-        (axes, [100.0 * one.correct for one in found], "localized correctly (%)"),
+        (axes, [100.0 * one.correct.value for one in found], "localized correctly (%)"),
         (errors, [one.median for one in found], "median error / that at the bound"),
     ):
         charts.line(panel, np.array(values), y, Look("#0b3c8c", "o", ""), "")

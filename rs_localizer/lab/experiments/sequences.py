@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
-from rs_localizer.core.so3 import Array
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
+from scipy.stats import norm
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments.errors import METRICS, motion_errors
 from rs_localizer.lab.experiments.methods import Method, available, estimate
 from rs_localizer.lab.experiments.results import Context, Table
 from rs_localizer.lab.experiments.trials import Setting, Trials, draw_trials
+from rs_localizer.lab.experiments.uncertainty import CONFIDENCE, Interval
 
 _QUANTILES = (25.0, 50.0, 75.0)
 _MEDIAN = 1
+_RESAMPLED = 30
 
 Initial = Callable[[Trials, float], Array]
 
@@ -26,6 +31,7 @@ class Curves:
     x_name: str
     x: Array  # (m,)
     quartiles: Mapping[str, Array]  # method -> (m,3,4): 25, 50, 75 %; metrics
+    errors: Mapping[str, Array] = field(default_factory=dict)  # method -> (m,trials,4)
 
     def median(self, method: Method, metric: int) -> Array:
         """Medians (m,)."""
@@ -43,6 +49,11 @@ class Curves:
     def at(self, method: Method, metric: int, x: float) -> float:
         """Median at one of the places."""
         return float(self.median(method, metric)[np.argmin(np.abs(self.x - x))])
+
+    @property
+    def trials(self) -> int:
+        """Of each method at each place; 0: not known."""
+        return min((values.shape[1] for values in self.errors.values()), default=0)
 
     def table(self) -> Table:
         columns = (self.x_name, "method", "metric", "p25", "median", "p75")
@@ -77,8 +88,46 @@ def sweep(
         start = None if initial is None else initial(trials, value)
         for method in usable:
             motions = estimate(method, trials, start, here.noise)
-            found[method.name].append(quartiles(motion_errors(motions, trials.truth)))
-    return Curves(x_name, np.array(x, float), {n: np.array(v) for n, v in found.items()})
+            found[method.name].append(motion_errors(motions, trials.truth))
+    errors = {name: np.array(values) for name, values in found.items()}
+    return Curves(x_name, np.array(x, float), _all_quartiles(errors), errors)
+
+
+def sampled(statistic: Callable[..., float], *sweeps: Curves) -> Interval:
+    """A figure of some curves, and where it lies for as many trials as one likes.
+
+    All methods get the same resampled frames. The largest of many differences grows with their
+    noise, which resampling raises by the root of two: of what it adds on the average, the trials
+    themselves have added nothing where one place stands out, and 1/(root(2) - 1) times as much
+    where all are alike. The interval allows for both. Without errors the figure counts as exact.
+    """
+    value = statistic(*sweeps)
+    trials = min(curves.trials for curves in sweeps)
+    if trials == 0:
+        return Interval(value, value, value, 0)
+    drawn = np.array([statistic(*each) for each in zip(*map(_resampled, sweeps), strict=True)])
+    added = (float(np.mean(drawn)) - value) / (math.sqrt(2.0) - 1.0)
+    half = float(norm.ppf(0.5 + 0.5 * CONFIDENCE) * np.std(drawn))
+    low, high = value - max(0.0, added) - half, value - min(0.0, added) + half
+    return Interval(value, low, high, trials)
+
+
+@lru_cache(maxsize=8)
+def _resampled(curves: Curves) -> list[Curves]:
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, curves.trials, (_RESAMPLED, curves.trials))
+    return [
+        Curves(
+            curves.x_name,
+            curves.x,
+            _all_quartiles({name: errors[:, rows] for name, errors in curves.errors.items()}),
+        )
+        for rows in chosen
+    ]
+
+
+def _all_quartiles(errors: Mapping[str, Array]) -> dict[str, Array]:
+    return {name: np.array([quartiles(each) for each in values]) for name, values in errors.items()}
 
 
 def quartiles(errors: Array) -> Array:

@@ -21,6 +21,7 @@ from rs_localizer.lab.experiments import (
     tracking,
     translation,
 )
+from rs_localizer.lab.experiments.honesty import experiment as honesty
 from rs_localizer.lab.experiments.results import Context, Result
 
 EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
@@ -32,6 +33,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "p3p-initialisation": p3p_initialisation.run,
     "bound": bound.run,
     "planes": planes.run,
+    "honesty": honesty.run,
     "tracking": tracking.run,
     "robustness": robustness.run,
     "timings": timings.run,

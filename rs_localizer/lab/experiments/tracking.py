@@ -9,14 +9,22 @@ from itertools import islice
 import numpy as np
 from matplotlib.figure import Figure
 
-from rs_localizer.config import Acceleration
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.so3 import Array
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import (
+    Claim,
+    Context,
+    Result,
+    Table,
+    judge,
+    judge_intervals,
+)
+from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
+from rs_localizer.lab.palette import BLUE, ORANGE
 from rs_localizer.lab.scene import room
 from rs_localizer.lab.simulation import (
     FrameSettings,
@@ -57,7 +65,7 @@ _CASES = (
          wall=True),
     Case("rich", "150 points, 30 % outliers", FrameSettings(points=150, rate=_RATE)),
 )  # fmt: skip
-_LOOKS = {"tracked": Look("#0b3c8c", "", "-", 1.4), "untracked": Look("#f08a24", "", "--", 1.0)}
+_LOOKS = {"tracked": Look(BLUE, "", "-", 1.4), "untracked": Look(ORANGE, "", "--", 1.0)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,14 +77,19 @@ class Run:
     untracked: Array
     followed: Array  # (n,) whether the prediction alone was enough
 
-    def ratios(self, quantile: float) -> Array:
-        """Tracked in units of untracked errors (2,)."""
-        one, other = (
-            np.quantile(errors[1:], quantile, axis=0, method="lower")
-            for errors in (self.tracked, self.untracked)
-        )
-        ratio: Array = one / other
-        return ratio
+    def ratio(self, quantile: float, column: int) -> Interval:
+        """Tracked in units of untracked errors of position or velocity."""
+        tracked, untracked = (errors[1:, column] for errors in (self.tracked, self.untracked))
+
+        def of(chosen: IntArray) -> float:
+            one, other = (
+                np.quantile(errors[chosen], quantile, method="lower")
+                for errors in (tracked, untracked)
+            )
+            return float(one / other)
+
+        # Frames of one second are not independent.
+        return bootstrap(of, len(tracked), self.seconds[1:].astype(np.int64))
 
     @property
     def share(self) -> float:
@@ -142,7 +155,7 @@ def _map(case: Case, motion: RecordedMotion, rng: np.random.Generator) -> Array:
 
 def _run(camera: Camera, frames: Sequence[SimulatedFrame], context: Context) -> Run:
     localizer = Localizer(camera)
-    tracker = Tracker(localizer, Acceleration())
+    tracker = Tracker(localizer)
     tracked, untracked, followed = [], [], []
     for frame in context.track(frames, len(frames)):
         result = tracker.localize(frame.middle_ns, frame.points, frame.pixels)
@@ -164,27 +177,32 @@ def _errors(result: Estimate | Failure, frame: SimulatedFrame) -> tuple[float, f
 
 
 def _improves(case: Case, found: Run) -> Claim:
-    ratios = found.ratios(0.5)
-    return judge(
+    ratios = [found.ratio(0.5, column) for column in (_POSITION, _VELOCITY)]
+    return judge_intervals(
         f"tracking.{case.name}",
         "this project",
         f"tracking makes weak frames much better: {case.label}",
         "median errors of position and linear velocity at most 0.6 of the untracked ones",
-        f"{ratios[_POSITION]:.2f} and {ratios[_VELOCITY]:.2f}",
-        bool(np.all(ratios <= 0.6)),
+        f"{ratios[_POSITION].value:.2f} and {ratios[_VELOCITY].value:.2f}",
+        ratios,
+        (-np.inf, 0.6),
     )
 
 
 def _never_worse(case: Case, found: Run) -> Claim:
-    ratios = np.array([found.ratios(quantile) for quantile in _QUARTILES])
-    listed = [", ".join(f"{x:.2f}" for x in ratios[:, column]) for column in (0, 1)]
-    return judge(
+    ratios = [
+        [found.ratio(quantile, column) for quantile in _QUARTILES]
+        for column in (_POSITION, _VELOCITY)
+    ]
+    listed = [", ".join(f"{x.value:.2f}" for x in of_column) for of_column in ratios]
+    return judge_intervals(
         f"tracking.{case.name}",
         "this project",
         f"tracking never makes rich frames worse: {case.label}",
         "no quartile of the errors of position and linear velocity above the untracked one",
         f"quartiles {listed[_POSITION]} and {listed[_VELOCITY]} of the untracked ones",
-        bool(np.all(ratios <= 1.0)),
+        [*ratios[_POSITION], *ratios[_VELOCITY]],
+        (-np.inf, 1.0),
     )
 
 
@@ -201,7 +219,7 @@ def _one_start(runs: Mapping[str, Run]) -> Claim:
 
 
 def _after_a_gap(camera: Camera, frames: Sequence[SimulatedFrame]) -> Claim:
-    tracker = Tracker(Localizer(camera), Acceleration())
+    tracker = Tracker(Localizer(camera))
     found = []
     for start in range(0, len(frames) - _GAP - 1, _BETWEEN_GAPS):
         for frame in (frames[start], frames[start + 1], frames[start + 1 + _GAP]):

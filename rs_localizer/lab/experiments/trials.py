@@ -15,9 +15,9 @@ from functools import lru_cache
 import numpy as np
 
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.so3 import Array
 
 # So many points per frame are drawn; minimal solvers take the first ones of them.
 POINTS = 50

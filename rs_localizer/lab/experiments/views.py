@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.prior import state_in
 from rs_localizer.core.refine import step_between
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.so3 import Array
-from rs_localizer.core.types import BoolArray, Estimate, Failure
+from rs_localizer.core.state import MOTION_PARAMETERS
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.lab.experiments.kernels import informations
 from rs_localizer.lab.experiments.methods import states
 from rs_localizer.lab.experiments.trials import Setting, camera, draw_trials
@@ -50,7 +51,8 @@ class View:
     def off(self, found: Motion) -> Array:
         """The step (12,) from an estimate to the truth, in the order of its covariance."""
         centre = self.points.mean(axis=0)
-        return step_between(state_in(found, centre), state_in(self.motion, centre))
+        step = step_between(state_in(found, centre), state_in(self.motion, centre))
+        return step[:MOTION_PARAMETERS]
 
 
 @dataclass(frozen=True, slots=True)

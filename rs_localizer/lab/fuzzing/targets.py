@@ -22,7 +22,7 @@ from rs_localizer.io.map_files import read_map_file
 from rs_localizer.io.maps import MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum
-from rs_localizer.lab.fuzzing import seeds
+from rs_localizer.lab.fuzzing import calibrations, seeds
 from rs_localizer.lab.fuzzing.mutations import damaged, damaged_message
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
@@ -47,13 +47,6 @@ rs_localizer:
 """
 _ASSIGNMENTS = (b"readout_time:=0.03", b"matching.by:=id", b"tracking:=false", b"map_file:=''")
 _TUM = b"# t x y z qx qy qz qw\n1.5 0 0 1 0 0 0 1\n2.5 1 0 1 0 0 0.6 0.8\n"
-_CALIBRATION = b"""
-image_width: 640
-image_height: 480
-distortion_model: plumb_bob
-camera_matrix: {rows: 3, cols: 3, data: [500, 0, 319.5, 0, 500, 239.5, 0, 0, 1]}
-distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}
-"""
 _MARKERS = b"""
 map_frame: map
 markers:
@@ -136,7 +129,7 @@ def targets(folder: Path) -> dict[str, Target]:
             _bytes((_TUM,)), _file(folder / "poses.txt", read_tum), (TrajectoryError,)
         ),
         "calibration": Target(
-            _bytes((_CALIBRATION,)),
+            _bytes(calibrations.SEEDS),
             _file(folder / "camera.yaml", read_calibration),
             (CalibrationError,),
         ),

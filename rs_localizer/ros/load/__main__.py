@@ -56,7 +56,8 @@ def _report(index: int, result: Result) -> bool:
         f"{result.replaced} replaced ({replaced:.3%}), {result.refused} refused, "
         f"{result.lost} lost\n"
         f"  latency p50 {p50:.2f} ms, p99 {p99:.2f} ms, most {most:.1f} ms\n"
-        f"  memory {after_a_minute:.1f} MB after a minute, {growth:+.1f} MB at the end"
+        f"  memory {after_a_minute:.1f} MB after a minute, {growth:+.1f} MB at the end; "
+        f"CPU {result.cpu:.0%} of a core"
     )
     return (
         result.lost == 0

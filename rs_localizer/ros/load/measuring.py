@@ -22,7 +22,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from rs_localizer.core.so3 import Array
+from rs_localizer.core.arrays import Array
 from rs_localizer.ros.intake import Intake, NotByExecutor
 from rs_localizer.ros.load.camera import Camera
 from rs_localizer.ros.load.frames import READOUT_TIME, Frames
@@ -50,6 +50,7 @@ class Result:
     refused: int
     latencies: Array  # s, of the answered frames, from publishing to the pose's arrival
     memory: Array  # MB, once a second: the node's resident set
+    cpu: float  # of one core, on the average: the node's
 
     @property
     def lost(self) -> int:
@@ -145,10 +146,13 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
                 subprocess.Popen([sys.executable, "-m", Camera.__module__, *arguments])
             )
         memory: list[list[float]] = []
+        used: list[list[float]] = []
         while any(publisher.poll() is None for publisher in publishers):
             time.sleep(1.0)
             if sents[0][0] > 0.0:
                 memory.append([_memory(pid) for _, pid in nodes])
+                used.append([time.monotonic(), *(_cpu_time(pid) for _, pid in nodes)])
+        spent = np.subtract(used[-1], used[0])
         time.sleep(_REST_TIME)
         for ear in ears:
             ear.close()
@@ -160,8 +164,11 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
                 refused=ear.counts["Frames refused"],
                 latencies=(ear.arrived - sent)[np.isfinite(ear.arrived)],
                 memory=of_node,
+                cpu=float(cpu_time / spent[0]) if spent[0] > 0.0 else float("nan"),
             )
-            for ear, sent, of_node in zip(ears, sents, np.array(memory).T, strict=True)
+            for ear, sent, of_node, cpu_time in zip(
+                ears, sents, np.array(memory).T, spent[1:], strict=True
+            )
         ]
 
 
@@ -214,3 +221,9 @@ def _memory(pid: int) -> float:
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024.0
     return float("nan")
+
+
+def _cpu_time(pid: int) -> float:
+    """Seconds of all cores that a process has used."""
+    values = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")

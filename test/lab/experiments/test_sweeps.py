@@ -11,6 +11,7 @@ from rs_localizer.lab.experiments.sweeps import (
     crossing,
     largest_difference,
     quartiles,
+    sampled,
 )
 
 
@@ -54,3 +55,37 @@ def test_curves_by_method() -> None:
     assert not found.has(m.P3P, m.R9P)
     assert found.at(m.P3P, 1, 2.0) == 6.0
     np.testing.assert_array_equal(found.median(m.P3P, 0), [1.0, 5.0])
+
+
+def drawn(trials: int, ratio: float, seed: int) -> Curves:
+    """Two methods whose true medians differ by a ratio, at ten places."""
+    rng = np.random.default_rng(seed)
+    errors = {
+        name: scale * rng.exponential(size=(10, trials, 4))
+        for name, scale in (("one", 1.0), ("other", ratio))
+    }
+    found = {
+        name: np.array([quartiles(each) for each in values]) for name, values in errors.items()
+    }
+    return Curves("x", np.arange(10.0), found, errors)
+
+
+def excess(curves: Curves) -> float:
+    """The largest of many ratios, which noise makes larger."""
+    return float(np.max(curves.quartiles["other"][:, 1] / curves.quartiles["one"][:, 1]))
+
+
+def test_the_largest_of_many_ratios_is_not_taken_for_a_difference() -> None:
+    below = [sampled(excess, drawn(200, 1.0, seed)) for seed in range(20)]
+    # Every one looks 10 % off, and hardly one is.
+    assert min(interval.value for interval in below) > 1.1
+    assert np.mean([interval.outside(-np.inf, 1.1) for interval in below]) <= 0.1
+    assert sampled(excess, drawn(200, 2.0, 0)).outside(-np.inf, 1.1)
+    assert sampled(excess, drawn(20000, 1.0, 0)).within(-np.inf, 1.1)
+
+
+def test_a_figure_without_trials_is_exact() -> None:
+    known = drawn(50, 1.0, 0)
+    bare = Curves(known.x_name, known.x, known.quartiles)
+    found = sampled(excess, bare)
+    assert found.low == found.value == found.high

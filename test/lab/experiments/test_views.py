@@ -30,16 +30,18 @@ def moved(motion: Motion, step: np.ndarray) -> Motion:
     """The motion one step (12,) further on."""
     state = np.concatenate(
         [motion.rotation.ravel(), motion.translation, motion.angular_velocity,
-         motion.linear_velocity]
+         motion.linear_velocity, motion.angular_acceleration, motion.linear_acceleration]
     )  # fmt: skip
     state = apply_step(state, step)
-    return Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18])
+    return Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
+                  angular_acceleration=state[18:21], linear_acceleration=state[21:])  # fmt: skip
 
 
 def estimate(motion: Motion, covariance: np.ndarray) -> Estimate:
     fields = {field.name: getattr(motion, field.name) for field in dataclasses.fields(Motion)}
-    nothing = np.zeros(0)
-    return Estimate(**fields, inliers=nothing > 0, residuals=nothing, covariance=covariance,
+    nothing, joint = np.zeros(0), np.eye(18)
+    joint[:12, :12] = covariance
+    return Estimate(**fields, inliers=nothing > 0, residuals=nothing, joint_covariance=joint,
                     global_shutter_inliers=0, iterations=0)  # fmt: skip
 
 
@@ -120,15 +122,15 @@ def found(bounds: np.ndarray, reported: np.ndarray, at_most: float = 1.05) -> bo
 def test_at_the_bound_and_calibrated_or_not() -> None:
     draws = chi2.rvs(12, size=4000, random_state=0)
     right = found(draws, draws)
-    assert right.ratio == pytest.approx(1.0, abs=0.02)
-    assert right.coverage == pytest.approx(0.95, abs=0.01)
+    assert right.ratio.value == pytest.approx(1.0, abs=0.02)
+    assert right.coverage.value == pytest.approx(0.95, abs=0.01)
     assert {claim.verdict for claim in bound.claims(right)} == {Verdict.HELD}
     worse = found(1.2 * draws, 1.2 * draws)  # by a tenth in standard deviations
     verdicts = {claim.name: claim.verdict for claim in bound.claims(worse)}
     assert verdicts["bound.fast"] is Verdict.NOT_HELD
     assert verdicts["bound.fast_calibrated"] is Verdict.NOT_HELD
     modest = found(draws, 0.8 * draws)
-    assert modest.coverage > 0.97
+    assert modest.coverage.value > 0.97
     assert bound.claims(modest)[1].verdict is Verdict.NOT_HELD
 
 
@@ -138,8 +140,10 @@ def test_gross_errors_and_those_that_hide() -> None:
     one = found(with_two, np.concatenate([draws, [200.0, 12.0]]))
     assert one.gross == pytest.approx(2 / 102)
     assert one.overconfident == 1
-    assert bound.claims(one)[2].verdict is Verdict.NOT_HELD
-    missing = bound.Found(one.case, [*one.outcomes[:98], NO_POSE, NO_POSE])
+    assert bound.claims(one)[2].verdict is Verdict.UNDECIDED
+    many = found(np.repeat(with_two, 20), np.repeat(with_two, 20))
+    assert bound.claims(many)[2].verdict is Verdict.NOT_HELD
+    missing = bound.Found(one.case, [*one.outcomes[:90], *[NO_POSE] * 10])
     assert bound.claims(missing)[2].verdict is Verdict.NOT_HELD
 
 
@@ -183,7 +187,7 @@ def test_the_second_object_is_rigid_too() -> None:
 def test_ratios_of_tracking_are_by_quartile() -> None:
     errors = np.column_stack([np.arange(9.0), np.arange(9.0)])
     one = tracking.Run(np.arange(9.0), errors * [0.5, 2.0], errors, np.arange(9) > 4)
-    np.testing.assert_allclose(one.ratios(0.5), [0.5, 2.0])
+    assert [one.ratio(0.5, column).value for column in (0, 1)] == [0.5, 2.0]
     assert one.share == 0.5
     assert tracking._never_worse(tracking._CASES[2], one).verdict is Verdict.NOT_HELD
     assert tracking._improves(tracking._CASES[0], one).verdict is Verdict.NOT_HELD

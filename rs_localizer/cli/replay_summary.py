@@ -1,0 +1,113 @@
+"""What replay says at its end: how many frames have a pose, how good they are, why others not."""
+
+from __future__ import annotations
+
+import textwrap
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rs_localizer.cli.replay_result import BRIDGED
+from rs_localizer.config import NodeConfig
+from rs_localizer.image_clock import readout_fault
+from rs_localizer.io.outputs import Frame
+from rs_localizer.reasons import explained
+from rs_localizer.smoothed_frames import SmoothedFrames
+from rs_localizer.solvers import find_solver
+
+# Notices of a frame that could not follow the one before.
+_RESTARTS = ("time_went_back", "map_changed")
+_WIDTH = 96
+
+
+@dataclass(slots=True)
+class Tally:
+    """What became of the frames of a recording."""
+
+    total: int
+    notices: Counter[str]
+    frames: list[Frame] = field(default_factory=list)
+    refused: Counter[str] = field(default_factory=Counter)
+    last_refusal: str = "nothing came"
+    not_sent: int = 0
+    repeated: int = 0
+    seconds: float = 0.0
+    smoothed: SmoothedFrames | None = None
+
+    @property
+    def written(self) -> list[Frame]:
+        """What the result holds: the frames, or samples of one motion through all of them."""
+        return self.smoothed.frames if self.smoothed else self.frames
+
+
+def print_summary(tally: Tally, config: NodeConfig) -> None:
+    """Print it as a table, the reasons of refusals explained below."""
+    frames = tally.frames
+    rows: list[tuple[str, str]] = [("frames", str(tally.total)), ("localized", str(len(frames)))]
+    rows += [(f"  refused: {reason}", str(n)) for reason, n in tally.refused.most_common()]
+    for name, count in tally.notices.most_common():
+        kind = "started afresh" if name in _RESTARTS else "noticed"
+        rows.append((f"{kind}: {name}", str(count)))
+    dropped = sum(frame.dropped for frame in frames)
+    for name, count in (
+        ("rows dropped (not finite)", dropped),
+        ("stamps repeated, not in the text files", tally.repeated),
+        ("without a transform on /tf", tally.not_sent),
+    ):
+        rows += [(name, str(count))] if count else []
+    rows += _quality(frames, config)
+    rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
+    if tally.smoothed:
+        rows += _smoothing(tally.smoothed)
+    for name, text in rows:
+        print(f"{name:40} {text:>8}")
+    for reason in tally.refused:
+        if text := explained(reason):
+            print(textwrap.fill(f"{reason}: {text}", _WIDTH, subsequent_indent="    "))
+    fault = readout_fault(config.readout_time, _period(frames))
+    if fault is not None:
+        print(f"warning: {fault}")
+
+
+def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:
+    return [
+        ("samples of the smoothed motion", str(len(smoothed.frames))),
+        (f"  bridged, listed in {BRIDGED}", str(len(smoothed.bridged))),
+        ("  left out, not determined", str(smoothed.undetermined)),
+    ]
+
+
+def _quality(frames: Sequence[Frame], config: NodeConfig) -> list[tuple[str, str]]:
+    if not frames:
+        return []
+    estimates = [frame.estimate for frame in frames]
+    residual = np.median([estimate.residual_rms for estimate in estimates])
+    inliers = np.median([np.count_nonzero(estimate.inliers) for estimate in estimates])
+    still = np.median([estimate.global_shutter_inliers for estimate in estimates])
+    points = np.median([len(estimate.inliers) for estimate in estimates])
+    tracked = np.mean([estimate.tracked for estimate in estimates])
+    rows = [
+        ("residual of the inliers (px rms, median)", f"{residual:.3f}"),
+        ("points of a frame (median)", f"{points:.0f}"),
+    ]
+    if find_solver(config.solver).rolling_shutter:
+        rows += [
+            ("  inliers with a rolling shutter", f"{inliers:.0f}"),
+            ("  inliers with a global shutter", f"{still:.0f}"),
+            ("tracked from the frame before", f"{tracked:.1%}"),
+        ]
+    else:
+        rows.append(("  inliers", f"{inliers:.0f}"))
+    return rows
+
+
+def _period(frames: Sequence[Frame]) -> float:
+    """Seconds from frame to frame, median; NaN for less than two."""
+    stamps = np.unique(np.array([frame.input_stamp_ns for frame in frames], np.int64))
+    if len(stamps) < 2:
+        return np.nan
+    steps = np.diff(stamps) * 1e-9
+    # Between those with a pose others may have been refused.
+    return float(np.median(steps / np.round(steps / steps.min())))

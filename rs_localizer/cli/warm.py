@@ -1,0 +1,47 @@
+"""``rs_localizer warm``: compiles all kernels of the nodes before somebody waits for them."""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable
+
+from rs_localizer.config import SOLVER_NAMES, NodeConfig
+from rs_localizer.core.jit import cache_directory
+from rs_localizer.frames import FrameLocalizer
+from rs_localizer.markers import detection
+
+# Any that is known: with it, frames are tracked, too.
+_READOUT_TIME = 0.03
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--solver",
+        choices=SOLVER_NAMES,
+        action="append",
+        help="only what this one needs; may be repeated (default: all solvers)",
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Compile, and say where the machine code is.
+
+    Raises:
+        OSError: when it could not be kept there.
+    """
+    steps: dict[str, Callable[[], None]] = {"markers": detection.warm_up}
+    for name in arguments.solver or SOLVER_NAMES:
+        config = NodeConfig(solver=name, readout_time=_READOUT_TIME)
+        steps[f"solver {name}"] = FrameLocalizer(config).warm_up
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "cache of kernels .* at the next start", RuntimeWarning)
+        for name, compiles in steps.items():
+            started = time.monotonic()
+            try:
+                compiles()
+            except RuntimeWarning as warning:
+                raise OSError(str(warning)) from warning
+            print(f"{name:20} {time.monotonic() - started:6.1f} s", flush=True)
+    print(f"kernels are in {cache_directory()}")

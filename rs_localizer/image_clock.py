@@ -1,0 +1,115 @@
+"""When the images of a file were taken: what is known of it, and what is assumed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+DEFAULT_START_NS = 1_000_000_000
+"""Stamp of the first image where a file has only differences: to ROS, a time of 0 means none."""
+
+# Rates that differ by less are called the same by cameras and by those who give --rate: 29.97, 30.
+_SAME_RATE = 0.02
+
+
+class TimesError(ValueError):
+    """A file without times; the message says what to give instead."""
+
+
+@dataclass(slots=True)
+class ImageClock:
+    """Stamps of the images of a video or a folder, one after the other.
+
+    Args:
+        rate: images per second instead of the file's own times; None: these.
+        start_ns: stamp of the first image; None: its own where the file has absolute times,
+            otherwise :data:`DEFAULT_START_NS`.
+    """
+
+    rate: float | None = None
+    start_ns: int | None = None
+    _images: int = 0
+    _first_ns: int = 0  # own time of the first image
+    _last_ns: int = 0  # own time of the last image that has one
+    _timed: int = 0  # images with a time of their own, before any rate
+    _absolute: bool = False
+
+    def relative(self, own_ns: int | None) -> int | None:
+        """Stamp of the next image of a video.
+
+        Args:
+            own_ns: its presentation time; None: unknown.
+
+        Returns:
+            None for an image of which no time is known, among others that have one.
+
+        Raises:
+            TimesError: when the file has no times and no rate was given.
+        """
+        return self._stamp(own_ns, DEFAULT_START_NS)
+
+    def absolute(self, own_ns: int) -> int:
+        """Stamp of the next file of a folder whose names are times."""
+        self._absolute = True
+        stamp = self._stamp(own_ns, own_ns)
+        assert stamp is not None
+        return stamp
+
+    def _stamp(self, own_ns: int | None, default_start_ns: int) -> int | None:
+        index = self._images
+        self._images += 1
+        if own_ns is not None:
+            if self._timed == 0:
+                self._first_ns = own_ns
+            self._last_ns = own_ns
+            self._timed += 1
+        if index == 0 and self.start_ns is None:
+            self.start_ns = default_start_ns
+        assert self.start_ns is not None
+        if self.rate is not None:
+            return self.start_ns + round(index * 1e9 / self.rate)
+        if own_ns is None and index <= 1:  # the first is at 0 in a file without times, too
+            raise TimesError("the images have no times of their own: give --rate")
+        return None if own_ns is None else self.start_ns + own_ns - self._first_ns
+
+    @property
+    def own_rate(self) -> float | None:
+        """Mean images per second by the file's own times; None: it has none."""
+        span = self._last_ns - self._first_ns
+        return (self._timed - 1) * 1e9 / span if span > 0 else None
+
+    def told(self) -> str:
+        """What the stamps are, in one sentence."""
+        own = "the names of the files" if self._absolute else "the presentation times of the video"
+        source = own if self.rate is None else f"--rate {self.rate:g}"
+        own_rate = self.own_rate
+        pace = f", {own_rate:.4g} images/s on average" if own_rate and self.rate is None else ""
+        start = (self.start_ns or 0) * 1e-9
+        return f"times: {source}{pace}; the first image at {start:.9g} s (--start sets it)"
+
+    def fault(self) -> str | None:
+        """What speaks against a given rate."""
+        own_rate = self.own_rate
+        if self.rate is None or own_rate is None:
+            return None
+        if abs(self.rate / own_rate - 1.0) <= _SAME_RATE:
+            return None
+        return (
+            f"--rate {self.rate:g} disagrees with the file, whose own times mean "
+            f"{own_rate:.4g} images/s; velocities are wrong by that factor: leave --rate out "
+            "unless the file was slowed down or sped up"
+        )
+
+
+def readout_fault(readout_time: float, period: float) -> str | None:
+    """What to say of a readout that takes longer than from one image to the next.
+
+    Args:
+        readout_time: s.
+        period: s between images; NaN where unknown.
+    """
+    if not readout_time > period:  # NaN compares false
+        return None
+    return (
+        f"the readout time of {1e3 * readout_time:.4g} ms is longer than the "
+        f"{1e3 * period:.4g} ms from image to image: is it in seconds, and are the stamps right?"
+    )

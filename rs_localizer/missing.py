@@ -1,0 +1,39 @@
+"""What to say of a package that is not installed: one sentence with the command that brings it."""
+
+from __future__ import annotations
+
+# By the name that is imported: Ubuntu's package, and pip's where Ubuntu 24.04 has none.
+_UBUNTU = {
+    "PIL": "python3-pil",
+    "cv2": "python3-opencv",
+    "matplotlib": "python3-matplotlib",
+    "numpy": "python3-numpy",
+    "scipy": "python3-scipy",
+    "tqdm": "python3-tqdm",
+    "yaml": "python3-yaml",
+}
+_ONLY_PIP = ("numba", "rosbags")
+_PIP = {"PIL": "Pillow", "cv2": "opencv-python-headless", "yaml": "PyYAML"}
+
+
+def explain(error: ImportError) -> str:
+    """The sentence for an import that failed."""
+    name = (error.name or "").partition(".")[0]
+    # What is there and broken (built for another NumPy, say) tells of itself.
+    if not isinstance(error, ModuleNotFoundError):
+        return f"{_one_line(error)}; a package it needs is installed and cannot be imported"
+    if name in _UBUNTU:
+        return (
+            f"the Python package {name} is not installed: sudo apt install {_UBUNTU[name]}, or "
+            f"pip install {_PIP.get(name, name)}"
+        )
+    if name in _ONLY_PIP:
+        return (
+            f"the Python package {name} is not installed: pip install {name} (beside Ubuntu's ROS "
+            f'with --break-system-packages, and "numpy<2" to keep its NumPy)'
+        )
+    return f"{_one_line(error)}; source a ROS 2 workspace, or install it with pip (README.md)"
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

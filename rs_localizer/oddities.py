@@ -1,0 +1,64 @@
+"""What is odd about a frame and yet no reason to refuse it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.clouds import Correspondences
+
+# Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
+_FINE = 0.00097
+# Trackers of features may find a point somewhat outside, in px.
+_SLACK = 1.0
+
+
+def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[str, str]:
+    """Sentences by name: ``map_is_camera``, ``coarse_coordinates``, ``pixels_outside``.
+
+    Args:
+        cloud: of one image.
+        camera: that ``camera_info`` describes.
+        camera_frame: its optical frame.
+    """
+    found = {
+        "map_is_camera": _frame(cloud.frame, camera_frame),
+        "coarse_coordinates": _coordinates(cloud),
+        "pixels_outside": _pixels(cloud, camera),
+    }
+    return {name: text for name, text in found.items() if text}
+
+
+def _frame(frame: str, camera_frame: str) -> str:
+    if frame != camera_frame:
+        return ""
+    return (
+        f"the points are given in {frame!r}, which is the camera's own frame: header.frame_id of "
+        "the cloud (or map) must name the frame of x, y, z"
+    )
+
+
+def _coordinates(cloud: Correspondences) -> str:
+    if len(cloud.points) == 0 or cloud.table.dtype["x"].itemsize > 4:
+        return ""
+    largest = np.abs(cloud.points).max()
+    step = float(np.spacing(np.float32(largest)))
+    if step < _FINE:
+        return ""
+    return (
+        f"coordinates of {largest:.0f} m in FLOAT32 are known to {1e3 * step:.0f} mm only: send "
+        "them as FLOAT64, or from an origin nearby"
+    )
+
+
+def _pixels(cloud: Correspondences, camera: Camera) -> str:
+    width, height = camera.size
+    limit = np.array(camera.size) - 0.5 + _SLACK
+    outside = np.any((cloud.pixels < -0.5 - _SLACK) | (cloud.pixels > limit), axis=1)
+    if not np.any(outside):
+        return ""
+    u, v = cloud.pixels[outside][0]
+    return (
+        f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
+        f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
+    )

@@ -1,0 +1,63 @@
+"""Pixels as a global shutter would have seen them: what the rows' motion did, undone.
+
+By the motion model (:mod:`rs_localizer.core.shutter`), what the camera has before it at the row
+time ``tau`` of its pixel, it has at another one ``tau'`` at
+
+    camera_point(tau') = exp(-tau' [omega]x) (exp(tau [omega]x) camera_point(tau) + (tau - tau') v)
+
+Its depth is what a pixel alone does not say; far away, only the rotation counts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion
+
+
+def rectify(
+    camera: Camera,
+    motion: Motion,
+    pixels: ArrayLike,
+    depths: ArrayLike | None = None,
+    tau: float = 0.0,
+) -> Array:
+    """Where a global shutter would have seen what a rolling shutter saw at these pixels.
+
+    Args:
+        camera: that took the image.
+        motion: of the camera during the readout; an :class:`rs_localizer.Estimate` is one.
+        pixels: (n,2) raw image coordinates.
+        depths: (n,) or one for all: z (m) of each point in the camera, at its own row's time; None:
+            far away, so that the translation does not count. With the pose of an estimate, points
+            of the map have the depth ``(rotation @ point + translation)[2]``, which is near enough.
+        tau: row time of the global shutter: 0 for the middle row, -0.5 the first, 0.5 the last;
+            ``camera.row_time(pixel)`` for any other.
+
+    Returns:
+        (n,2) raw pixels, distorted by the lens as the given ones; NaN where the lens model has no
+        bearing for a pixel, or the point would be behind the camera.
+
+    Raises:
+        ValueError: wrong shapes, depths that are not positive, or a row time that is not finite.
+    """
+    pixels = np.ascontiguousarray(pixels, np.float64)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise ValueError(f"pixels must be (n,2), got {pixels.shape}")
+    if not np.isfinite(tau):
+        raise ValueError(f"tau must be finite, got {tau!r}")
+    rows = camera.row_time(pixels)
+    points = np.column_stack([camera.rays(pixels), np.ones(len(pixels))])
+    shift = np.zeros_like(points)
+    if depths is not None:
+        z = np.asarray(depths, np.float64)
+        if z.shape not in ((), (len(pixels),)) or not np.all(z > 0.0):
+            raise ValueError(f"depths must be one or (n,) numbers above 0, got {depths!r}")
+        # In units of the depth, which may be infinite.
+        shift = np.outer((rows - tau) / z, motion.linear_velocity)
+    turned = np.einsum("nij,nj->ni", so3.exp_many(rows[:, None] * motion.angular_velocity), points)
+    return camera.project((turned + shift) @ so3.exp(-tau * motion.angular_velocity).T)

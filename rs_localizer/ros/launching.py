@@ -1,0 +1,117 @@
+"""What the launch files share: arguments that are settings, and checks before anything starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.settings import Kind, settings
+
+PACKAGE = "rs_localizer"
+
+
+def share(*path: str) -> PathJoinSubstitution:
+    """A file that the package installs."""
+    return PathJoinSubstitution([FindPackageShare(PACKAGE), *path])
+
+
+def argument(name: str, default: object, description: str) -> DeclareLaunchArgument:
+    return DeclareLaunchArgument(name, default_value=default, description=description)
+
+
+def setting_arguments(kind: Kind = NodeConfig) -> list[DeclareLaunchArgument]:
+    """An argument for each setting of a node; not given, the params file decides."""
+    return [
+        argument(name, "", f"{setting.description} (not given: as in the params file)")
+        for name, setting in settings(kind).items()
+        if "." not in name
+    ]
+
+
+def given(configurations: Mapping[str, str], kind: Kind = NodeConfig) -> dict[str, Any]:
+    """The parameters of a node that were given as arguments, ``use_sim_time`` among them.
+
+    What cannot be read as the setting's type goes on as text: the node says what is wrong with it.
+    """
+    defaults: dict[str, Any] = {name: item.default for name, item in settings(kind).items()}
+    defaults["use_sim_time"] = False
+    return {
+        name: _typed(text, defaults[name])
+        for name, text in configurations.items()
+        if name in defaults and text != ""
+    }
+
+
+def _typed(text: str, default: Any) -> Any:
+    if isinstance(default, bool):
+        return {"true": True, "false": False}.get(text.lower(), text)
+    if isinstance(default, (int, float)):
+        try:
+            return type(default)(text)
+        except ValueError:
+            return text
+    return ParameterValue(text, value_type=str)  # or "1" would become a number
+
+
+def need_package(name: str, why: str) -> None:
+    """Raise ``RuntimeError`` if a package is not installed, before anything has been started."""
+    try:
+        get_package_prefix(name)
+    except PackageNotFoundError:
+        raise RuntimeError(
+            f"{why} needs the package {name}, which is not installed: "
+            f"sudo apt install ros-jazzy-{name.replace('_', '-')}"
+        ) from None
+
+
+def localizer(
+    configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]], **options: Any
+) -> Node:
+    """The node rs_localizer with its params file and the settings that were given."""
+    return Node(
+        package=PACKAGE,
+        executable="localizer",
+        name="rs_localizer",
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[LaunchConfiguration("params_file"), given(configurations)],
+        remappings=list(remappings),
+        arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
+        output="screen",
+        **options,
+    )
+
+
+def views(configurations: Mapping[str, str]) -> list[Node]:
+    """RViz, if it is asked for."""
+    if configurations["rviz"].lower() != "true":
+        return []
+    need_package("rviz2", "rviz:=true")
+    return [
+        Node(
+            package="rviz2",
+            executable="rviz2",
+            # Its topics are relative, so that they lie in this namespace, too.
+            namespace=LaunchConfiguration("namespace"),
+            arguments=["-d", share("config", "rs_localizer.rviz")],
+        )
+    ]
+
+
+def common_arguments() -> list[DeclareLaunchArgument]:
+    """Of every launch file with a localizer."""
+    return [
+        argument("namespace", "", "of all nodes and their topics"),
+        argument("params_file", share("config", "rs_localizer.yaml"), "parameters of rs_localizer"),
+        argument("use_sim_time", "", "true: take the time from /clock"),
+        argument("log_level", "info", "debug, info, warn, error or fatal"),
+        argument("rviz", "false", "start RViz with a view of the node's outputs, too"),
+        *setting_arguments(),
+    ]

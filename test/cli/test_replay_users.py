@@ -1,0 +1,107 @@
+"""What replay tells its users: how good the poses are, what to do first, nothing in the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rs_localizer.cli.replay as replay_command
+from rs_localizer.cli.main import main
+from rs_localizer.io.bags import BagWriter
+from rs_localizer.lab.recording import write_image
+
+FRAMES = 8
+SHUTTER = ["-p", "readout_time:=0.03"]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    words = ["--duration", str((FRAMES + 0.5) / 30), "--noise", "1", "--outliers", "0.2"]
+    assert main(["simulate", str(path), "--angular-velocity", "0", "1.2", "0.6", *words]) == 0
+    return path
+
+
+def test_the_summary_says_how_good_the_poses_are(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(flight), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
+    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines())
+    assert 0.5 < float(rows["residual of the inliers (px rms, median)"]) < 2.0
+    with_rows, without = (
+        int(rows[f"  inliers with a {kind} shutter"]) for kind in ("rolling", "global")
+    )
+    assert 12 <= without < with_rows <= int(rows["points of a frame (median)"])
+    # All but the first.
+    assert rows["tracked from the frame before"] == f"{(FRAMES - 1) / FRAMES:.1%}"
+
+
+def test_an_impossible_readout_time_is_warned_of(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["-p", "readout_time:=0.04", "--out", str(tmp_path / "out")]
+    assert main(["replay", str(flight), *words]) == 0
+    assert "warning: the readout time of 40 ms is longer than the 33.33 ms from image" in (
+        capsys.readouterr().out
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("film.mp4", "is a video"), ("one.PNG", "is an image"), ("folder", "is a folder of 2 images")],
+)
+def test_images_are_sent_to_detect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, text: str
+) -> None:
+    path = tmp_path / name
+    if path.suffix:
+        path.write_bytes(b"")
+    else:
+        path.mkdir()
+        for k in range(2):
+            (path / f"{k}.jpg").write_bytes(b"")
+    assert main(["replay", str(path)]) == 1
+    error = capsys.readouterr().err
+    assert f"{path} {text}, not matches: first run: rs_localizer detect {path} --map" in error
+    assert "--calibration camera.yaml" in error
+
+
+def test_a_bag_of_images_is_sent_to_detect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        write_image(bag, "/image", 10**9, "png", b"")
+    assert main(["replay", str(tmp_path / "bag")]) == 1
+    error = capsys.readouterr().err
+    assert f"bag holds images, not matches: first run: rs_localizer detect {tmp_path}/bag" in error
+    assert "--calibration" not in error
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_an_interrupted_replay_leaves_nothing_in_the_way(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: bool
+) -> None:
+    out = tmp_path / "out"
+    if before:
+        out.mkdir()  # as an earlier version left it
+    words = ["replay", str(flight), "--out", str(out), *SHUTTER]
+    real = replay_command.replay
+
+    def interrupted(*arguments: Any) -> Any:
+        for index, item in enumerate(real(*arguments)):
+            if index == 3:
+                raise KeyboardInterrupt
+            yield item
+
+    monkeypatch.setattr(replay_command, "replay", interrupted)
+    assert main(words) == 130
+    assert not out.exists()
+    monkeypatch.setattr(replay_command, "replay", real)
+    assert main(words) == 0
+    # Of an earlier result, too: half of a new one is worse than none.
+    (out / "notes.txt").write_text("mine")
+    monkeypatch.setattr(replay_command, "replay", interrupted)
+    assert main([*words, "--overwrite"]) == 130
+    assert [file.name for file in out.iterdir()] == ["notes.txt"]

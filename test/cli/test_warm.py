@@ -1,0 +1,47 @@
+"""rs_localizer warm: kernels are there, or the exit code says that they are not."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.jit import cache_directory
+
+
+def test_it_says_where_the_kernels_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["warm", "--solver", "p3p"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:10].strip() for line in lines[:2]] == ["markers", "solver p3p"]
+    assert lines[2:] == [f"kernels are in {cache_directory()}"]
+    assert list(cache_directory().rglob("*.nbc"))
+
+
+def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("a file in its place")
+    done = subprocess.run(
+        [sys.executable, "-m", "rs_localizer", "warm", "--solver", "p3p"],
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")},
+        text=True,
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"rs_localizer warm: cache of kernels in {tmp_path}/cache/")
+    assert done.stderr.endswith("Not a directory\n")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    assert cache_directory() == Path("/nonexistent/rs_localizer")

@@ -1,0 +1,83 @@
+"""A marker that is not where the map has it stands out, and nothing else does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.detect import _RollingFit
+from rs_localizer.markers.detection import Detections
+from rs_localizer.markers.displaced import Fit, LeaveOneOut, still_fit
+from rs_localizer.markers.maps import MarkerMap, wall
+
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(640, 480, K)
+MARKERS = MarkerMap(wall("4x4_50", 3, 2, 0.07, 0.03))
+
+
+def said(
+    shift: Any, marker: int = 4, spin: float = 0.0, noise: float = 0.1, fit: Fit = still_fit
+) -> str | None:
+    """What is said when a marker was mounted elsewhere, of a camera that turns (deg/readout)."""
+    rng = np.random.default_rng(1)
+    true = MARKERS.points.copy()
+    true[4 * marker : 4 * marker + 4] += shift
+    check = LeaveOneOut(MARKERS, fit)
+    for _ in range(30):
+        angles = rng.uniform(-35.0, 35.0, 3) * [0.3, 1.0, 1.0]
+        turn = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+        motion = Motion(
+            turn @ np.diag([1.0, -1.0, -1.0]),
+            np.array([*rng.normal(0.0, 0.02, 2), 0.5]),
+            np.radians(spin) * rng.normal(size=3),
+            np.zeros(3),
+        )
+        pixels, _ = project_rolling(CAMERA, motion.at_rows, true)
+        pixels += rng.normal(0.0, noise, pixels.shape)
+        ids = np.arange(len(true))
+        check.add(
+            CAMERA, Detections(ids, MARKERS.points, pixels, np.ones(len(true)), (), (), (), ())
+        )
+    return check.fault()
+
+
+def test_a_centimetre_is_named_with_its_direction() -> None:
+    text = said([0.01, 0.0, 0.0])
+    assert text is not None
+    assert text.startswith("marker 4x4_50 4 is not where the map has it")
+    assert "about 1.0 cm (+0.01" in text
+    text = said([0.0, -0.006, 0.004], marker=0)
+    assert text is not None
+    assert text.startswith("marker 4x4_50 0 ")
+
+
+def test_a_right_map_is_not_blamed_for_noise_or_the_shutter() -> None:
+    assert said(0.0) is None
+    assert said(0.0, noise=1.0) is None
+    assert said(0.0, spin=4.0) is None
+
+
+def test_a_shaking_rolling_shutter_hides_no_marker() -> None:
+    """The fit of detect: what the shutter does is tens of times what the marker does."""
+    text = said([0.01, 0.0, 0.0], spin=4.0, fit=_RollingFit())
+    assert text is not None
+    assert text.startswith("marker 4x4_50 4 is not where the map has it")
+    assert "about 1.0 cm (+0.0" in text
+    assert said(0.0, spin=4.0, fit=_RollingFit()) is None
+
+
+def test_with_two_markers_nobody_knows_which_is_off() -> None:
+    check = LeaveOneOut(MARKERS)
+    ids = np.arange(8)
+    for _ in range(10):
+        check.add(
+            CAMERA,
+            Detections(
+                ids, MARKERS.points[:8], np.zeros((8, 2)), np.ones(8), (), (), (), ()
+            ),
+        )
+    assert check.fault() is None

@@ -1,0 +1,92 @@
+"""The first start on a machine: while kernels are compiled, the node answers and says so."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import GetParameters
+
+SOON = 5.0  # s; compiling takes half a minute
+
+
+def said(peer: Any) -> list[tuple[bytes, str]]:
+    """Levels and states of the diagnostics, as they come."""
+    found: list[tuple[bytes, str]] = []
+
+    def take(message: DiagnosticArray) -> None:
+        for status in message.status:
+            found.append((status.level, {it.key: it.value for it in status.values}["State"]))
+
+    found_by = peer.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
+    assert found_by is not None
+    return found
+
+
+@pytest.mark.parametrize("autostart", [True, False])
+def test_services_answer_while_kernels_are_compiled(
+    start_node: Callable[..., Any], peer: Any, tmp_path: Path, autostart: bool
+) -> None:
+    states = said(peer)
+    chosen = f"autostart:={str(autostart).lower()}"
+    node = start_node("-p", chosen, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    if not autostart:
+        client = peer.node.create_client(ChangeState, "/rs_localizer/change_state")
+        assert peer.spin_until(client.service_is_ready)
+        peer.spin_until(lambda: False, 0.3)
+        request = ChangeState.Request()
+        request.transition.id = Transition.TRANSITION_CONFIGURE
+        configured = client.call_async(request)
+    node.wait_for_log("compiling kernels")
+    service = "/rs_localizer/get_parameters"
+    first = GetParameters.Request(names=["solver"])
+    peer.call(GetParameters, service, first)  # has found the node
+    times = []
+    while len(list(tmp_path.rglob("*.nbc"))) < 10:  # of some hundred
+        started = time.monotonic()
+        values = peer.call(GetParameters, service, first).values
+        assert [value.string_value for value in values] == ["r6p_vcwt"]
+        state = peer.call(GetState, "/rs_localizer/get_state", GetState.Request())
+        assert state.current_state.label == "unconfigured"
+        times.append(time.monotonic() - started)
+    assert len(times) > 1
+    # The first ones wait for discovery.
+    assert min(times) < SOON
+    assert (b"\1", "compiling") in states
+    assert "kernels are ready" not in node.log
+    if not autostart:
+        assert not configured.done()
+    assert node.stop() == 0
+    assert "Traceback" not in node.log
+
+
+def test_two_clients_configure_at_once(start_node: Callable[..., Any], peer: Any) -> None:
+    """The transition is made once, and both get an answer."""
+    node = start_node("-p", "autostart:=false")
+    clients = [peer.node.create_client(ChangeState, "/rs_localizer/change_state") for _ in range(2)]
+    assert peer.spin_until(lambda: all(client.service_is_ready() for client in clients))
+    peer.spin_until(lambda: False, 0.5)
+    request = ChangeState.Request()
+    request.transition.id = Transition.TRANSITION_CONFIGURE
+    answers = [client.call_async(request) for client in clients]
+    assert peer.spin_until(lambda: all(answer.done() for answer in answers))
+    assert sorted(answer.result().success for answer in answers) == [False, True]
+    assert "is refused: the node is inactive" in node.log
+    assert node.stop() == 0
+
+
+def test_a_cache_that_cannot_be_written_is_a_warning(
+    start_node: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "cache").write_text("a file in its place")
+    node = start_node(XDG_CACHE_HOME=str(tmp_path / "cache"))
+    node.wait_for_log("kernels are compiled again at the next start: Not a directory")
+    assert "[WARN]" in node.log
+    assert node.log.count("at the next start") == 1
+    assert node.stop() == 0

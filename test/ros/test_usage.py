@@ -1,0 +1,41 @@
+"""``localizer --help`` and ``--version`` answer, and start no node."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import rs_localizer
+from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.ros.usage import answer
+from rs_localizer.settings import settings
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("localizer", NodeConfig), ("marker_detector", DetectorConfig)]
+)
+def test_help_names_every_parameter_with_its_default(name: str, kind: type) -> None:
+    text = answer(name, ["--help"])
+    assert text is not None
+    assert f"ros2 run rs_localizer {name} --ros-args" in text
+    for parameter, one in settings(kind).items():
+        assert f"\n  {parameter}: " in text
+        assert one.description in text
+    assert "\n  readout_time: 0.0\n" in text
+
+
+@pytest.mark.parametrize("words", [[], ["--ros-args", "-p", "x:=--help"], ["-p", "seed:=1"]])
+def test_otherwise_a_node_starts(words: list[str]) -> None:
+    assert answer("localizer", words) is None
+
+
+@pytest.mark.parametrize(("function", "word"), [("main", "--version"), ("marker_detector", "-h")])
+def test_the_executables(function: str, word: str) -> None:
+    code = f"import sys; from rs_localizer.ros.main import {function} as f; sys.exit(f([{word!r}]))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(("usage: ", f"rs_localizer {rs_localizer.__version__}\n"))

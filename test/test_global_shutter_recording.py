@@ -1,0 +1,78 @@
+"""The bundled recording of a real global shutter: nothing moves within its images."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer import data
+from rs_localizer.config import NodeConfig
+from rs_localizer.frames import FrameLocalizer
+from rs_localizer.io.bags import open_bag
+from rs_localizer.moments import twist_at
+
+# Of 6 dimensions: what 95 % of a chi-squared variable lie below.
+REGION = 12.59
+SETTINGS = {
+    "default": {},
+    "20 ms, tracked": {"readout_time": 0.02},
+    "20 ms, single": {"readout_time": 0.02, "tracking": False},
+}
+
+
+@pytest.fixture(scope="module")
+def messages():
+    with open_bag(data.path(data.GLOBAL_SHUTTER_TAGS)) as bag:
+        return list(bag.messages(("/camera/camera_info", "/camera/correspondences")))
+
+
+def replayed(messages, **settings):
+    """What the node would publish: every frame has a pose."""
+    localizer = FrameLocalizer(NodeConfig(**settings))
+    frames = []
+    for topic, _, message in messages:
+        if topic == "/camera/camera_info":
+            localizer.take_camera_info(message)
+        else:
+            frames.append(localizer.localize(message))
+    assert all(frames)
+    return frames
+
+
+def jitter(frames) -> tuple[float, float]:
+    """Second difference of the orientation (deg): median and 95 %."""
+    poses = [Rotation.from_matrix(frame.pose.rotation) for frame in frames]
+    turns = [(a.inv() * b).as_rotvec() for a, b in pairwise(poses)]
+    return tuple(
+        np.quantile(np.degrees(np.linalg.norm(np.diff(turns, axis=0), axis=1)), (0.5, 0.95))
+    )
+
+
+@pytest.fixture(scope="module")
+def p3p(messages):
+    return jitter(replayed(messages, solver="p3p"))
+
+
+def test_p3p_is_what_it_was(p3p) -> None:
+    assert p3p == pytest.approx((0.22, 0.73), abs=0.01)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_global_shutter_stays_one(messages, p3p, name: str) -> None:
+    frames = replayed(messages, **SETTINGS[name])
+    median, most = jitter(frames)
+    still = []
+    for frame in frames:
+        twist = twist_at(frame.estimate, 0.0, 1.0)  # per readout
+        velocities = np.concatenate([twist.linear, twist.angular])
+        still.append(
+            not np.any(velocities)
+            or velocities @ np.linalg.solve(twist.covariance, velocities) < REGION
+        )
+    found = f"jitter {median:.3f} and {most:.3f} deg, {np.mean(still):.1%} insignificant"
+    assert median <= p3p[0], found
+    assert most <= p3p[1], found
+    assert np.mean(still) >= 0.93, found

@@ -1,0 +1,227 @@
+"""Predictions by themselves: how motions and errors are carried on, and what comes in between."""
+
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+from scipy.integrate import quad
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+from rs_localizer.config import Acceleration
+from rs_localizer.core.refine import apply_step, step_between
+from rs_localizer.core.types import Estimate
+from rs_localizer.tracking import acceleration_covariance, predict, unshaken
+
+READOUT = 0.03
+FADING = 0.1  # s
+ACCELERATIONS = np.array([0.02, -0.01, 0.015, 0.004, 0.003, -0.002])
+
+
+def motion_of(vector):
+    return rsl.Motion(
+        vector[:9].reshape(3, 3), vector[9:12], vector[12:15], vector[15:18],
+        angular_acceleration=vector[18:21], linear_acceleration=vector[21:],
+    )  # fmt: skip
+
+
+def state(motion):
+    return np.concatenate(
+        [
+            motion.rotation.ravel(), motion.translation,
+            motion.angular_velocity, motion.linear_velocity,
+            motion.angular_acceleration, motion.linear_acceleration,
+        ]
+    )  # fmt: skip
+
+
+def start(accelerations):
+    rng = np.random.default_rng(3)
+    rotation = Rotation.random(random_state=1).as_matrix()
+    return np.concatenate(
+        [rotation.ravel(), rng.normal(size=3), 0.05 * rng.normal(size=6), accelerations]
+    )
+
+
+def derivatives(function, size, h=1e-6):
+    return np.stack([(function(h * e) - function(-h * e)) / (2 * h) for e in np.eye(size)], axis=1)
+
+
+@pytest.mark.parametrize("readouts", [0.7, 1.1, 15.0])
+def test_accelerations_fade_and_leave_their_velocity_and_way(readouts):
+    fading = FADING / READOUT
+    first = motion_of(start(ACCELERATIONS))
+    later, _ = predict(first, np.eye(18), readouts, fading)
+
+    def left(s):
+        return np.exp(-s / fading)
+
+    faster = quad(left, 0, readouts)[0]
+    farther = quad(lambda s: (readouts - s) * left(s), 0, readouts)[0]
+    turn = Rotation.from_rotvec(
+        readouts * first.angular_velocity + farther * first.angular_acceleration
+    ).as_matrix()
+    way = readouts * first.linear_velocity + farther * first.linear_acceleration
+    np.testing.assert_allclose(later.rotation.T, first.rotation.T @ turn, atol=1e-12)
+    centre = -first.rotation.T @ first.translation + first.rotation.T @ way
+    np.testing.assert_allclose(-later.rotation.T @ later.translation, centre, atol=1e-12)
+    velocity = first.linear_velocity + faster * first.linear_acceleration
+    np.testing.assert_allclose(turn @ later.linear_velocity, velocity, atol=1e-12)
+    np.testing.assert_allclose(
+        turn @ later.linear_acceleration, left(readouts) * first.linear_acceleration, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        later.angular_acceleration, left(readouts) * first.angular_acceleration, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("readouts", [0.7, 1.1, 15.0])
+def test_the_body_rate_of_later_is_how_the_pose_goes_on(readouts):
+    fading, h = FADING / READOUT, 1e-4
+    first = motion_of(start(ACCELERATIONS))
+    now, ahead, behind = (
+        predict(first, np.eye(18), readouts + shift, fading)[0] for shift in (0.0, h, -h)
+    )
+    rate = Rotation.from_matrix(behind.rotation @ ahead.rotation.T).as_rotvec() / (2 * h)
+    np.testing.assert_allclose(now.angular_velocity, rate, atol=1e-7)
+
+
+@pytest.mark.parametrize("readouts", [0.7, 1.1, 15.0])
+def test_errors_are_carried_along_to_first_order(readouts):
+    fading = FADING / READOUT
+    factor = 0.1 * np.random.default_rng(3).normal(size=(18, 18))
+    spread, first = factor @ factor.T, start(np.zeros(6))
+    later, covariance = predict(motion_of(first), spread, readouts, fading)
+
+    def moved(step):
+        """Where the prediction goes when the start moves."""
+        other, _ = predict(motion_of(apply_step(first, step)), spread, readouts, fading)
+        return step_between(state(later), state(other))
+
+    jacobian = derivatives(moved, 18)
+    expected = jacobian @ spread @ jacobian.T
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-6
+    )
+
+
+# The closed form is left for a series below 3 ms.
+@pytest.mark.parametrize(("dt", "exact"), [(0.001, 0.02), (0.0029, 0.05), (0.0031, 1e-6),
+                                           (1 / 30, 1e-9), (0.4, 1e-9)])  # fmt: skip
+def test_new_accelerations_are_those_of_singers_process(dt, exact):
+    found = acceleration_covariance(Acceleration(3.0, 2.0), dt, READOUT)
+    dynamics = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / FADING]])
+    nodes, weights = legendre.leggauss(40)
+    expected = np.zeros((3, 3))
+    for node, weight in zip(0.5 * dt * (nodes + 1.0), 0.5 * dt * weights, strict=True):
+        reached = expm(node * dynamics)[:, 2]
+        expected += weight * 2.0 / FADING * np.outer(reached, reached)
+    units = np.array([1.0, READOUT, READOUT**2])  # way, and what is per readout
+    expected *= np.outer(units, units)
+    for first, deviation in ((0, 3.0), (3, 2.0)):
+        for axis in range(3):
+            own = np.arange(first + axis, 18, 6)
+            block = found[np.ix_(own, own)]
+            np.testing.assert_allclose(block, deviation**2 * expected, rtol=exact)
+            found[np.ix_(own, own)] = 0.0
+    assert not found.any()
+
+
+def test_new_accelerations_take_over_from_those_that_fade():
+    """In the long run their variance is the configured one, whatever it was at the start."""
+    acceleration, dt = Acceleration(3.0, 2.0), 0.05
+    spread = np.zeros((18, 18))
+    motion = motion_of(np.concatenate([np.eye(3).ravel(), np.zeros(15)]))
+    for _ in range(40):
+        _, spread = predict(motion, spread, dt / READOUT, FADING / READOUT)
+        spread += acceleration_covariance(acceleration, dt, READOUT)
+    deviations = np.sqrt(np.diag(spread)[12:]) / READOUT**2
+    np.testing.assert_allclose(deviations, [3.0] * 3 + [2.0] * 3, rtol=1e-6)
+
+
+def shaking(seed=0, size=0.003):
+    rng = np.random.default_rng(seed)
+    factor = 0.003 * rng.normal(size=(30, 30))
+    vector, nothing = start(ACCELERATIONS), np.zeros(0)
+    motion = motion_of(vector)
+    return Estimate(
+        motion.rotation, motion.translation, motion.angular_velocity, motion.linear_velocity,
+        angular_acceleration=motion.angular_acceleration,
+        linear_acceleration=motion.linear_acceleration,
+        inliers=nothing > 0, residuals=nothing, joint_covariance=factor @ factor.T,
+        global_shutter_inliers=0, iterations=0, shake=size * rng.normal(size=(4, 3)),
+    )  # fmt: skip
+
+
+def whole_polynomials(estimate):
+    """Value (3,) and slope (3,) at the middle of the shaking that nothing was taken from."""
+    sizes = (3.0 / np.arange(2, 2 + len(estimate.shake))) ** 2
+    coefficients = np.vstack([np.zeros((2, 3)), sizes[:, None] * estimate.shake])
+    slope = 2.0 * legendre.legval(0.0, legendre.legder(coefficients))
+    return legendre.legval(0.0, coefficients), slope
+
+
+def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
+    """Whole polynomials vanish on average; those of a frame are taken from the middle row."""
+    estimate = shaking()
+    motion, _, swing = unshaken(estimate)
+    value, slope = whole_polynomials(estimate)
+    # The camera at tau = 0 is the motion's, turned by the polynomials in its own axes.
+    turned = motion.rotation.T @ Rotation.from_rotvec(value).as_matrix()
+    np.testing.assert_allclose(turned, estimate.rotation.T, atol=1e-12)
+    np.testing.assert_allclose(
+        motion.rotation.T @ motion.translation, estimate.rotation.T @ estimate.translation,
+        atol=1e-12,
+    )  # fmt: skip
+    np.testing.assert_allclose(motion.angular_velocity + slope, estimate.angular_velocity)
+    np.testing.assert_array_equal(motion.linear_velocity, estimate.linear_velocity)
+    np.testing.assert_array_equal(motion.linear_acceleration, estimate.linear_acceleration)
+    for part, at in ((slice(0, 3), legendre.legval), (slice(6, 9), None)):
+        size = 0.0
+        for degree, row in enumerate(estimate.shake, start=2):
+            series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
+            amount = at(0.0, series) if at else 2 * legendre.legval(0.0, legendre.legder(series))
+            size += amount**2 * np.mean(row**2)
+        np.testing.assert_allclose(swing[part, part], size * np.eye(3), atol=1e-15)
+        swing[part, part] = 0.0
+    assert not swing.any()
+
+
+def test_without_its_shaking_the_covariance_knows_of_it():
+    estimate = shaking()
+    motion, covariance, _ = unshaken(estimate)
+
+    def moved(error):
+        s = apply_step(state(estimate), error[:18])
+        other = motion_of(s)
+        fields = {name: getattr(other, name) for name in (
+            "rotation", "translation", "angular_velocity", "linear_velocity",
+            "angular_acceleration", "linear_acceleration")}  # fmt: skip
+        shake = estimate.shake + error[18:].reshape(-1, 3)
+        changed = rsl.Estimate(
+            **fields, inliers=estimate.inliers, residuals=estimate.residuals, shake=shake,
+            joint_covariance=estimate.joint_covariance, global_shutter_inliers=0, iterations=0,
+        )  # fmt: skip
+        return step_between(state(motion), state(unshaken(changed)[0]))
+
+    jacobian = derivatives(moved, 30)
+    expected = jacobian @ estimate.joint_covariance @ jacobian.T
+    scale = np.sqrt(np.diag(expected))
+    # The turn back is of first order in the shaking, its part in the errors is left out.
+    np.testing.assert_allclose(
+        covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.005
+    )
+
+
+def test_what_did_not_shake_stays_what_it_is():
+    estimate = shaking()
+    still = rsl.Estimate(
+        estimate.rotation, estimate.translation, estimate.angular_velocity,
+        estimate.linear_velocity, inliers=estimate.inliers, residuals=estimate.residuals,
+        joint_covariance=np.eye(18), global_shutter_inliers=0, iterations=0,
+    )  # fmt: skip
+    motion, covariance, swing = unshaken(still)
+    np.testing.assert_allclose(state(motion), state(still), atol=1e-15)
+    np.testing.assert_array_equal(covariance, np.eye(18))
+    assert not swing.any()

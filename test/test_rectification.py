@@ -1,0 +1,118 @@
+"""Rectified pixels are those of a global shutter, by a projector of the test's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+
+K = np.array([[500.0, 0.0, 319.5], [0.0, 480.0, 239.5], [0.0, 0.0, 1.0]])
+OMEGA, V = np.array([0.1, -0.25, 0.15]), np.array([0.05, -0.03, 0.08])  # per readout
+RNG = np.random.default_rng(0)
+POINTS = RNG.uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 6.0], (60, 3))
+MOTION = rsl.Motion(Rotation.from_rotvec([0.1, 0.2, -0.1]).as_matrix(), np.zeros(3), OMEGA, V)
+
+
+def before(tau: float, points: Any) -> Any:
+    """Points in the camera's axes at a row time: it has flown straight, turning steadily."""
+    start = points @ MOTION.rotation.T + MOTION.translation
+    return (start - tau * V) @ Rotation.from_rotvec(-tau * OMEGA).as_matrix().T
+
+
+def seen(camera: rsl.Camera, point: Any) -> tuple[Any, float]:
+    """Pixel and depth by a rolling shutter: the row that sees the point, by bisection."""
+    low, high = -0.7, 0.7
+    for _ in range(60):
+        tau = 0.5 * (low + high)
+        pixel = camera.project(before(tau, point[None]))[0]
+        if camera.row_time(pixel[None])[0] > tau:
+            low = tau
+        else:
+            high = tau
+    return pixel, float(before(tau, point[None])[0, 2])
+
+
+@pytest.mark.parametrize("tau", [0.0, -0.5, 0.37])
+@pytest.mark.parametrize("D", [[], [-0.2, 0.05, 1e-3, -1e-3]])
+@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
+def test_with_depths_pixels_are_exact(tau: float, D: list[float], direction: str) -> None:
+    camera = rsl.Camera(640, 480, K, D, readout_time=0.03, scan_direction=direction)
+    found = [seen(camera, point) for point in POINTS]
+    pixels, depths = np.array([p for p, _ in found]), np.array([d for _, d in found])
+    expected = camera.project(before(tau, POINTS))
+    rectified = rsl.rectify(camera, MOTION, pixels, depths, tau)
+    np.testing.assert_allclose(rectified, expected, atol=1e-4)
+    assert np.abs(pixels - expected).max() > 10.0  # there is something to undo
+
+
+def test_without_depths_it_is_exact_for_what_is_far_away() -> None:
+    camera = rsl.Camera(640, 480, K, readout_time=0.03)
+    far = 1e6 * POINTS
+    pixels = np.array([seen(camera, point)[0] for point in far])
+    expected = camera.project(before(0.0, far))
+    np.testing.assert_allclose(rsl.rectify(camera, MOTION, pixels), expected, atol=1e-3)
+    np.testing.assert_allclose(
+        rsl.rectify(camera, MOTION, pixels, np.inf), rsl.rectify(camera, MOTION, pixels)
+    )
+
+
+def test_what_does_not_move_stays() -> None:
+    camera = rsl.Camera(640, 480, K, [-0.2, 0.05, 0, 0])
+    still = rsl.Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    pixels = RNG.uniform([0, 0], [639, 479], (50, 2))
+    np.testing.assert_allclose(rsl.rectify(camera, still, pixels, 3.0), pixels, atol=1e-6)
+    # The row that is asked for stays where it is, whatever moves.
+    row = np.column_stack([np.linspace(0, 639, 20), np.full(20, 100.0)])
+    tau = float(camera.row_time(row)[0])
+    np.testing.assert_allclose(rsl.rectify(camera, MOTION, row, 2.0, tau), row, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "depths", "tau", "text"),
+    [
+        ([1.0, 2.0], None, 0.0, r"pixels must be \(n,2\), got \(2,\)"),
+        ([[1.0, 2.0]], [0.0], 0.0, r"depths must be one or \(n,\) numbers above 0"),
+        ([[1.0, 2.0]], [1.0, 2.0], 0.0, r"depths must be one"),
+        ([[1.0, 2.0]], None, np.nan, "tau must be finite"),
+    ],
+)
+def test_bad_input_is_refused(pixels: Any, depths: Any, tau: float, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        rsl.rectify(rsl.Camera(640, 480, K), MOTION, pixels, depths, tau)
+
+
+@pytest.mark.parametrize("tau", [0.0, -0.5, 0.3])
+def test_states_are_derivatives_of_the_poses(tau: float) -> None:
+    """Position and velocities in SI units, against finite differences of the motion."""
+    readout, step = 0.02, 1e-6
+    camera = rsl.Camera(640, 480, K, readout_time=readout)
+    motion = rsl.Motion(MOTION.rotation, np.array([0.3, -0.2, 1.0]), OMEGA, V)
+    state = rsl.camera_state(motion, camera, tau)
+
+    def place(at: float) -> tuple[Any, Any]:
+        rotation, translation = motion.at(at)
+        return rotation.T, -rotation.T @ translation
+
+    (before_turn, before_place), (turn, here), (after_turn, after_place) = (
+        place(tau + k * step) for k in (-1, 0, 1)
+    )
+    np.testing.assert_allclose(state.position, here, atol=1e-12)
+    np.testing.assert_allclose(state.rotation, turn, atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(state.orientation).as_matrix(), turn, atol=1e-12)
+    seconds = 2 * step * readout
+    velocity = (after_place - before_place) / seconds
+    np.testing.assert_allclose(state.linear_velocity_in_map, velocity, atol=1e-6)
+    rate = Rotation.from_matrix(after_turn @ before_turn.T).as_rotvec() / seconds
+    np.testing.assert_allclose(state.angular_velocity_in_map, rate, atol=1e-5)
+
+
+def test_without_a_readout_time_velocities_are_unknown() -> None:
+    state = rsl.camera_state(MOTION, rsl.Camera(640, 480, K))
+    assert np.isnan([*state.angular_velocity, *state.linear_velocity]).all()
+    assert np.isfinite(state.position).all()
+    with pytest.raises(ValueError, match="tau must be finite"):
+        rsl.camera_state(MOTION, rsl.Camera(640, 480, K), np.inf)
