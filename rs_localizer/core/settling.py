@@ -32,7 +32,7 @@ from rs_localizer.core.state import PARAMETERS, VELOCITIES
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
 # Odds by which motion must explain the points better than rest, to count in the estimate: what
 # explains little is often a slightly wrong map or lens. The covariance allows for it at even odds.
-_ODDS_AGAINST_MOTION = 1e6
+_ODDS_AGAINST_MOTION = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5

@@ -168,8 +168,8 @@ def dense(matrix, errors, noise, *groups):
 
 
 def dense_evidence(matrix, errors, freedom, noise, group, size, *beside):
-    """As :func:`evidence_of_sizes` defines it: the noise is what the errors leave, twice."""
-    for _ in range(2):
+    """As :func:`evidence_of_sizes` defines it: the noise is what the errors leave, three times."""
+    for _ in range(3):
         before = noise  # px
         held = [(columns, before / weight) for columns, weight in beside]
         distance, volume = dense(matrix, errors, before, (group, size), *held)
