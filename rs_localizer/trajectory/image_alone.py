@@ -8,7 +8,6 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
-from rs_localizer.trajectory.lens import lens_values, project
 
 # Directions that the image does not see: least eigenvalue of the information, diagonal scaled to 1.
 _LEAST_EIGENVALUE = 1e-9
@@ -30,15 +29,19 @@ def image_alone(
     model on points (n,3) and raw pixels (n,2), all of them inliers, whose noise it leaves is
     theirs. None when they are too few.
     """
+    if len(points) <= _PARAMETERS:
+        return None
     tau = camera.row_time(pixels)
     omega, v = motion.angular_velocity, motion.linear_velocity
     rotations, translations = motion.at_rows(tau)
     local = np.einsum("nij,nj->ni", rotations, points) + translations
-    seen = project(camera, lens_values(camera), np.where(local[:, 2:] > 0.0, local, 1.0), False)
+    before = np.where(local[:, 2:] > 0.0, local, 1.0)
+    seen = camera.project(before)
+    by_ray = camera.pixel_jacobian(before[:, :2] / before[:, 2:])
     turned = so3.exp_many(-tau[:, None] * omega)  # row from middle axes
     inverse_depth = 1.0 / local[:, 2]
     by_point = np.empty((len(points), 2, 3))
-    by_point[:, :, :2] = seen.by_ray * inverse_depth[:, None, None]
+    by_point[:, :, :2] = by_ray * inverse_depth[:, None, None]
     by_point[:, :, 2] = -np.einsum(
         "nij,nj->ni", by_point[:, :, :2], local[:, :2] * inverse_depth[:, None]
     )
@@ -47,9 +50,9 @@ def image_alone(
     flow = np.einsum("nij,nj->ni", by_point, np.einsum("nij,j->ni", crossed, omega) - carried)
     pace = 1.0 - flow @ camera.row_time_gradient
     whitener = np.eye(2) + flow[:, :, None] * camera.row_time_gradient / pace[:, None, None]
-    error = np.einsum("nij,nj->ni", whitener, seen.pixels - pixels)
+    error = np.einsum("nij,nj->ni", whitener, seen - pixels)
     usable = (local[:, 2] > 0.0) & (np.abs(pace) > _LEAST_PACE) & np.isfinite(error).all(axis=1)
-    if 2 * np.count_nonzero(usable) <= 2 * _PARAMETERS:
+    if np.count_nonzero(usable) <= _PARAMETERS:
         return None
     by_row = np.concatenate([crossed @ turned, -turned], axis=2)  # turn, place
     by_row[:, :, :3] += tau[:, None, None] * (turned @ so3.hat(v))

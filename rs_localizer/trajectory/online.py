@@ -27,10 +27,18 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
+from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.trajectory.image_alone import image_alone
+
+REVERSED = {
+    ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
+    ScanDirection.BOTTOM_TO_TOP: ScanDirection.TOP_TO_BOTTOM,
+    ScanDirection.LEFT_TO_RIGHT: ScanDirection.RIGHT_TO_LEFT,
+    ScanDirection.RIGHT_TO_LEFT: ScanDirection.LEFT_TO_RIGHT,
+}
+"""The opposite of each direction."""
 
 # Motion before this (s) is forgotten.
 _WINDOW = 10.0
@@ -38,6 +46,7 @@ _WINDOW = 10.0
 _LONGEST_INTERVAL, _MOST_UNLIKE = 0.15, 2.5
 # Fewer triples than this have no scatter worth the name.
 _LEAST_TRIPLES = 20
+_MOST_POINTS = 200  # of a frame: more take longer than they are worth
 _LAGS = 6  # neighbouring triples share frames, and errors of the map
 _ROUNDS, _SETTLED = 12, 1e-4
 # What a camera may do (rad/s, m/s): where the way is less certain than this, it says less.
@@ -123,7 +132,8 @@ class ReadoutMonitor:
         """
         if self._views and time_ns <= self._views[-1].time_ns:
             self.reset()
-        chosen = estimate.inliers
+        chosen = np.flatnonzero(estimate.inliers)
+        chosen = chosen[:: 1 + len(chosen) // _MOST_POINTS]
         # Without accelerations and shaking: what a prior has wrong about the velocities, they mend.
         steady = Motion(
             estimate.rotation,

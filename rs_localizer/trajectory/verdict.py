@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from rs_localizer.core.camera import ScanDirection
 from rs_localizer.trajectory.calibration import Calibration
+from rs_localizer.trajectory.online import REVERSED
 
-REVERSED = {
-    ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
-    ScanDirection.BOTTOM_TO_TOP: ScanDirection.TOP_TO_BOTTOM,
-    ScanDirection.LEFT_TO_RIGHT: ScanDirection.RIGHT_TO_LEFT,
-    ScanDirection.RIGHT_TO_LEFT: ScanDirection.LEFT_TO_RIGHT,
-}
 # Of the images' own times, beyond which stamps are worth a word (s).
 _MOST_JITTER = 5e-4
 # Readouts cannot take longer than this part of the interval between images.

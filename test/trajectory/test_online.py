@@ -48,8 +48,13 @@ def watch(
     return monitor, said
 
 
-@pytest.mark.parametrize("points", ["room", "board"])
-@pytest.mark.parametrize("believed", [READOUT, 0.8 * READOUT, 1.2 * READOUT, 0.0])
+@pytest.mark.parametrize(
+    ("points", "believed"),
+    [
+        *(("room", factor * READOUT) for factor in (1.0, 0.8, 1.2, 0.0)),
+        ("board", 1.2 * READOUT),
+    ],
+)
 def test_the_readout_time_whatever_is_believed(points: str, believed: float) -> None:
     noise, turn = (1.0, 0.14) if points == "room" else (0.3, 0.06)
     _, said = watch(recording(points, turn=turn, noise=noise), believed)
@@ -71,8 +76,7 @@ def test_a_reversed_direction_is_a_negative_readout_time() -> None:
     assert said[-1].contradicts(READOUT)
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.0003, 0.003])
-@pytest.mark.parametrize("believed", [READOUT, 0.0])
+@pytest.mark.parametrize(("turn", "believed"), [(0.0, READOUT), (0.0003, 0.0), (0.003, READOUT)])
 def test_no_alarm_at_rest_nor_at_slow_motion(turn: float, believed: float) -> None:
     _, said = watch(recording(turn=turn), believed)
     assert not any(measured and measured.contradicts(READOUT) for measured in said)

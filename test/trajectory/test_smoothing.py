@@ -62,7 +62,7 @@ def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn: f
     rng = np.random.default_rng(11)
     motion = projector.Motion.random(rng, turn, 0.08)
     recorded = projector.record(rng, motion, projector.room(rng, 1500), readout=READOUT,
-                                seconds=4.0, noise=1.0, outliers=0.2)  # fmt: skip
+                                seconds=2.5, noise=1.0, outliers=0.2)  # fmt: skip
     frames = track(recorded)
     times = np.array([time for time, _, _ in frames])
     sampled = run(frames).sample(np.round(times * 1e9).astype(np.int64))
@@ -85,11 +85,11 @@ def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn: f
 def test_gaps_are_bridged_only_where_the_neighbours_determine_them() -> None:
     rng = np.random.default_rng(12)
     motion = projector.Motion.random(rng)
-    recorded = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=4.0)
+    recorded = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=3.2)
     short = [f for f in recorded if not 1.0 < f.stamp < 1.09]
-    both = [f for f in short if not 2.0 < f.stamp < 2.8]
+    both = [f for f in short if not 1.8 < f.stamp < 2.6]
     found = run(track(both))
-    moments = np.array([0.5, 1.05, 2.4, 3.5])
+    moments = np.array([0.5, 1.05, 2.2, 3.0])
     sampled = found.sample(np.round(moments * 1e9).astype(np.int64))
     assert sampled.determined.tolist() == [True, True, False, True]
     assert sampled.bridged.tolist() == [False, True, True, False]
