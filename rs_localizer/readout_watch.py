@@ -17,8 +17,8 @@ from rs_localizer.trajectory.online import REVERSED, MeasuredReadout, ReadoutMon
 # Frames from one measurement to the next: few at first, more when there is more to compute.
 _AT_FIRST, _LATER = 5, 30
 _GROWTH = 0.1
-# A value is adopted when it is known to this share of itself.
-_WELL_KNOWN = 0.02
+# A value is adopted when it is known to this share of itself, by so many frames.
+_WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
 
@@ -91,7 +91,8 @@ class ReadoutWatch:
 
     def _adopt(self, config: NodeConfig, found: MeasuredReadout) -> NodeConfig:
         value = abs(found.readout_time)
-        if found.relative_deviation >= _WELL_KNOWN or value > LONGEST_READOUT_TIME:
+        known = found.relative_deviation < _WELL_KNOWN and found.triples >= _ENOUGH
+        if not known or value > LONGEST_READOUT_TIME:
             return config
         given = ScanDirection(config.scan_direction)
         direction = given if found.readout_time > 0.0 else REVERSED[given]

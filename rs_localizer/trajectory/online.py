@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
@@ -56,8 +57,9 @@ _MEDIAN = 5.35  # median of chi-squared of six degrees of freedom
 # Covariances of frames may be wrong by this share; so is the correction for noise at slow motion.
 _COVARIANCE_ERROR = 0.5
 _MODEL_ERROR = 0.005  # of Simpson's rule and of constant velocities in a frame
-# Contradicted is a value that is off by so many deviations and by more than this share.
-_CONTRADICTION, _LEAST_DIFFERENCE = 4.0, 0.06
+# Contradicted is a value that chance puts so far away as seldom as four deviations of a Gaussian,
+# one-sided, and that is off by more than this share.
+_CHANCE, _LEAST_DIFFERENCE = 3.2e-5, 0.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,9 @@ class MeasuredReadout:
         """Whether this readout time (s, of the assumed direction) must be wrong."""
         off = abs(self.readout_time - readout_time)
         largest = max(abs(self.readout_time), readout_time)
-        return off > max(_CONTRADICTION * self.deviation, _LEAST_DIFFERENCE * largest)
+        # Of few triples the deviation itself is uncertain: Student's t.
+        deviations = float(stdtrit(self.triples / _LAGS, 1.0 - _CHANCE))
+        return off > max(deviations * self.deviation, _LEAST_DIFFERENCE * largest)
 
     @property
     def relative_deviation(self) -> float:
