@@ -271,6 +271,10 @@ def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
     return LocalizerConfig(**settings)
 
 
+LONGEST_READOUT_TIME = 0.2
+"""What a camera may take from the first row to the last, in s."""
+
+
 @dataclass(frozen=True, slots=True)
 class NodeConfig(LocalizerConfig):
     """Settings of the node and of the offline replay: the localizer's, the shutter's, the times."""
@@ -280,7 +284,18 @@ class NodeConfig(LocalizerConfig):
         "Time from the first to the last row of the full sensor image, in s; "
         "0: unknown, then no twist is published",
         minimum=0.0,
-        maximum=0.2,
+        maximum=LONGEST_READOUT_TIME,
+    )
+    readout_time_deviation: float = setting(
+        0.0,
+        "Standard deviation of readout_time, in s, as rs_localizer calibrate finds it",
+        minimum=0.0,
+        maximum=LONGEST_READOUT_TIME,
+    )
+    estimate_readout_time: bool = setting(
+        False,
+        "Where readout_time is 0, find it and the scan direction from the camera's motion: after "
+        "some seconds of it frames have twists and are tracked",
     )
     scan_direction: str = setting(
         ScanDirection.TOP_TO_BOTTOM.value,

@@ -38,6 +38,7 @@ from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.moments import pose_at, twist_at
 from rs_localizer.mounting import base_pose, base_twist, find_mounting
 from rs_localizer.oddities import oddities
+from rs_localizer.readout_watch import ReadoutWatch
 from rs_localizer.solvers import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -101,7 +102,8 @@ class FrameLocalizer:
         config: settings; assigning :attr:`config` changes them from the next frame on.
         notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
             (a recording that starts over), ``map_changed`` (another frame of the points),
-            ``map_replaced``, ``map_incomplete``, ``camera_changed``, ``too_many_keypoints`` and
+            ``map_replaced``, ``map_incomplete``, ``camera_changed``, ``too_many_keypoints``,
+            ``readout_time`` (the motion contradicts it, or it was estimated) and
             those of :func:`rs_localizer.oddities.oddities`. Frames are localized all the same.
         transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
@@ -122,8 +124,9 @@ class FrameLocalizer:
         self._calibration: Calibration | None = None
         self._matcher: Matcher | None = None
         self._lacks_map = False
-        self._config = config
-        self._camera, self._localizer, self._tracker = _build(_ANY_CALIBRATION, config)
+        self.readout_watch = ReadoutWatch(notice)
+        self._given = config  # the readout time may be found on the way
+        self._use(_ANY_CALIBRATION, config)
 
     @property
     def config(self) -> NodeConfig:
@@ -131,11 +134,14 @@ class FrameLocalizer:
 
     @config.setter
     def config(self, config: NodeConfig) -> None:
+        self._use(self._calibration or _ANY_CALIBRATION, config)
+        self._given = config
+
+    def _use(self, calibration: Calibration, config: NodeConfig) -> None:
         # Nothing changes if this raises: camera, localizer and settings always belong together.
-        self._camera, self._localizer, self._tracker = _build(
-            self._calibration or _ANY_CALIBRATION, config
-        )
+        self._camera, self._localizer, self._tracker = _build(calibration, config)
         self._config = config
+        self.readout_watch.reset()
 
     @property
     def calibration(self) -> Calibration | None:
@@ -161,6 +167,7 @@ class FrameLocalizer:
     def reset(self) -> None:
         """Forget the previous frames."""
         self._last = None
+        self.readout_watch.reset()
         if self._tracker is not None:
             self._tracker.reset()
 
@@ -187,7 +194,7 @@ class FrameLocalizer:
             MessageError: for one that no camera can have; the previous stays.
         """
         if calibration != self._calibration:  # drivers repeat it with every image
-            self._camera, self._localizer, self._tracker = _build(calibration, self._config)
+            self._use(calibration, self._given)
             before, self._calibration = self._calibration, calibration
             if before is not None:
                 self._notice(
@@ -322,7 +329,16 @@ class FrameLocalizer:
             result = self._tracker.localize(self._middle_row_ns(cloud.stamp_ns), *given)
         if not result:
             return Refusal(str(result.reason), result.detail)
-        return self._mounted(self._frame(cloud, result, self._calibration.frame))
+        frame = self._frame(cloud, result, self._calibration.frame)
+        self._watch_readout(cloud, result)
+        return self.mounted(frame)
+
+    def _watch_readout(self, cloud: Correspondences, estimate: Estimate) -> None:
+        assert self._calibration is not None
+        time_ns = self._middle_row_ns(cloud.stamp_ns)
+        config = self.readout_watch.add(self._config, self._camera, time_ns, estimate, cloud)
+        if config is not self._config:
+            self._use(self._calibration, config)
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""
@@ -373,7 +389,7 @@ class FrameLocalizer:
             estimate=estimate,
         )
 
-    def _mounted(self, frame: Frame) -> Frame | Refusal:
+    def mounted(self, frame: Frame) -> Frame | Refusal:
         """The frame of ``base_frame``, from that of the camera."""
         base = self._config.base_frame
         if base in ("", frame.body_frame):
@@ -388,7 +404,7 @@ class FrameLocalizer:
             if not isinstance(error, NotYetError):
                 return Refusal(_NO_TRANSFORM, text)
             patience = self._config.transform_tolerance
-            return Waiting(_NO_TRANSFORM, text, lambda: self._mounted(frame), patience)
+            return Waiting(_NO_TRANSFORM, text, lambda: self.mounted(frame), patience)
         return replace(
             frame,
             body_frame=base,

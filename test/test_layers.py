@@ -19,11 +19,13 @@ MAY_IMPORT = {
     "rectification": {"core"},
     "units": {"core"},
     "localizer": {"core", "config", "solvers", "searching"},
+    "trajectory": {"core", "config", "solvers", "localizer", "tracking"},
     "io": {"core"},
     "markers": {"core", "io"},
     "lab": {
         *("core", "config", "solvers", "localizer", "tracking"),
         *("io", "markers", "matching", "moments", "frames", "settings", "arguments", "data"),
+        "trajectory",
     },
 }
 ABOVE = {"ros", "cli"}

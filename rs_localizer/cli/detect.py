@@ -140,7 +140,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    marker_map = _map(args)
+    marker_map = find_map(args)
     notices: Counter[str] = Counter()
     config = DetectorConfig(min_side=args.min_side)
     detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
@@ -179,7 +179,7 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
     )
 
 
-def _map(args: argparse.Namespace) -> MarkerMap:
+def find_map(args: argparse.Namespace) -> MarkerMap:
     if (args.map is None) == (args.board is None):
         raise UsageError("give either --map or --board")
     if args.map is not None:

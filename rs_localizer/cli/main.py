@@ -64,6 +64,16 @@ COMMANDS = {
         "rs_localizer detect video.mp4 --map wall.yaml --calibration camera.yaml --rate 30 "
         "--out seen",
     ),
+    "calibrate": Command(
+        "rs_localizer.cli.calibrate",
+        "readout time, scan direction and lens of a camera, from a recording in which it moves",
+        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --rate 30 --out camera.yaml",
+    ),
+    "readout": Command(
+        "rs_localizer.cli.readout",
+        "what others say of a camera's readout time: median, spread, sources",
+        "rs_localizer readout imx219 1920x1080",
+    ),
     "evaluate": Command(
         "rs_localizer.cli.evaluate",
         "errors of estimated poses and twists against the truth, as tables and plots",

@@ -13,12 +13,14 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.replay_result import (
+    BRIDGED,
     POSES,
     RESULT,
     TWISTS,
     fresh,
+    write_bridged,
+    write_frame,
     write_texts,
-    write_transform,
 )
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
@@ -26,7 +28,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.frames import FrameLocalizer
 from rs_localizer.image_sources import holds_images, image_topics
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
-from rs_localizer.io.outputs import messages
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.replay import (
     NO_FRAMES,
     Topics,
@@ -35,7 +37,8 @@ from rs_localizer.replay import (
     has_frames,
     replay,
 )
-from rs_localizer.settings import NODE_NAME, build, load_params_file, parse_assignment
+from rs_localizer.settings import build, load_params_file, parse_assignment
+from rs_localizer.smoothed_frames import smooth_frames
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,6 +80,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="the map of the keypoints: as -p map_file:=FILE",
     )
+    offline.add_argument(
+        "--smooth",
+        action="store_true",
+        help="one motion through all images, from those before and after each; images without a "
+        f"pose are bridged where their neighbours determine them, and listed in {BRIDGED}",
+    )
     offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
     graph = parser.add_argument_group("through the ROS graph")
     graph.add_argument(
@@ -85,7 +94,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="publish the recording, images too, with /clock and its /tf, for live nodes",
     )
     graph.add_argument(
-        "--rate", type=float, metavar="R", help="times real time, with --ros (default: 1)"
+        "--rate",
+        type=float,
+        metavar="R",
+        help="times real time, with --ros (default: 1); with --smooth: samples of the motion, Hz "
+        "(default: one for each image)",
     )
 
 
@@ -114,10 +127,12 @@ def run(args: argparse.Namespace) -> None:
         transforms = find_transforms(bag, topics, config)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         localizer.load_map()
+        if args.smooth and config.readout_time == 0.0:
+            raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         with fresh(out, args.overwrite):
             _hint(args.bag, args.params)
-            tally = _replay(bag, topics, localizer, notices, out, args.storage)
+            tally = _replay(bag, topics, localizer, notices, out, args)
         _tell(tally, config, out)
         if not tally.frames:
             raise ValueError(
@@ -137,26 +152,26 @@ def _detect_command(path: Path) -> str:
 
 
 def _find_topics(bag: BagReader, args: argparse.Namespace) -> Topics:
-    return find_topics(
-        bag, args.correspondences, args.camera_info, args.keypoints, args.map_points
-    )
+    return find_topics(bag, args.correspondences, args.camera_info, args.keypoints, args.map_points)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
     if args.correspondences is not None and args.keypoints is not None:
         raise UsageError("give --correspondences or --keypoints, not both")
-    if not args.ros:
-        if args.rate is not None:
-            raise UsageError("--rate goes with --ros; offline replay runs at full speed")
-        return
-    given = (args.out, args.params, args.assignments, args.map, args.overwrite)
-    if any(given):
-        raise UsageError(
-            "--out, --overwrite, --params, --map and -p are for offline replay; with --ros the "
-            "running node has the settings and publishes the result"
-        )
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
+    if not args.ros:
+        if args.rate is not None and not args.smooth:
+            raise UsageError(
+                "--rate goes with --ros or --smooth; offline replay runs at full speed"
+            )
+        return
+    given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
+    if any(given):
+        raise UsageError(
+            "--out, --overwrite, --params, --map, --smooth and -p are for offline replay; with "
+            "--ros the running node has the settings and publishes the result"
+        )
 
 
 def _config(params: Path | None, assignments: list[str]) -> NodeConfig:
@@ -188,37 +203,43 @@ def _replay(
     localizer: FrameLocalizer,
     notices: Counter[str],
     out: Path,
-    storage: str,
+    args: argparse.Namespace,
 ) -> Tally:
     localizer.warm_up()
     tally = Tally(total=bag.count([topics.frames]), notices=notices)
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
-        BagWriter(out / RESULT, storage) as writer,
+        BagWriter(out / RESULT, args.storage) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
         for recorded_ns, result in replay(bag, topics, localizer):
             if result:
                 tally.frames.append(result)
-                for name, message in messages(result, writer.make).items():
-                    writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
-                tally.not_sent += not write_transform(writer, result, localizer, recorded_ns)
+                if not args.smooth:
+                    tally.not_sent += not write_frame(writer, result, localizer, recorded_ns)
             else:
                 tally.refused[result.reason] += 1
                 tally.last_refusal = f"{result.reason}: {result.detail}"
             bar.update(1 if result or result.reason not in NO_FRAMES else 0)
+        if args.smooth and tally.frames:
+            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
+            tally.smoothed = smooth_frames(localizer, tally.frames, stamps, args.rate)
+            for frame in tally.written:
+                tally.not_sent += not write_frame(writer, frame, localizer, frame.input_stamp_ns)
+            write_bridged(out, tally.smoothed.bridged)
     tally.seconds = time.perf_counter() - start
-    tally.repeated = write_texts(out, tally.frames, localizer.config)
+    tally.repeated = write_texts(out, tally.written, localizer.config)
     return tally
 
 
 def _tell(tally: Tally, config: NodeConfig, out: Path) -> None:
     print_summary(tally, config)
-    moving = any(frame.twist for frame in tally.frames)
+    moving = any(frame.twist for frame in tally.written)
     if tally.frames and not moving:
         print(f"no twists: {_why_no_twists(config)}")
-    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}")
+    bridged = f", {BRIDGED}" if tally.smoothed else ""
+    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}{bridged}")
 
 
 def _why_no_twists(config: NodeConfig) -> str:

@@ -13,16 +13,17 @@ import numpy as np
 from rs_localizer.broadcasts import broadcast
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Frame, messages
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.io.whole import told, whole
 from rs_localizer.replay import TF_TYPE
+from rs_localizer.settings import NODE_NAME
 
-POSES, TWISTS, RESULT = "poses.txt", "twists.txt", "result"
+POSES, TWISTS, RESULT, BRIDGED = "poses.txt", "twists.txt", "result", "bridged.txt"
 """What replay writes into its output directory."""
 
 
@@ -49,7 +50,7 @@ def fresh(out: Path, overwrite: bool) -> Iterator[None]:
 
 
 def _remove_results(out: Path) -> None:
-    for name in (POSES, TWISTS):
+    for name in (POSES, TWISTS, BRIDGED):
         (out / name).unlink(missing_ok=True)
     shutil.rmtree(out / RESULT, ignore_errors=True)
 
@@ -59,7 +60,16 @@ def _is_ours(out: Path) -> bool:
     return out.is_dir() and ((out / RESULT / "metadata.yaml").is_file() or not any(out.iterdir()))
 
 
-def write_transform(
+def write_frame(
+    writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
+) -> bool:
+    """Write all messages of a frame; whether its transform could be told."""
+    for name, message in messages(frame, writer.make).items():
+        writer.write(f"/{NODE_NAME}/{name}", message, recorded_ns)
+    return _write_transform(writer, frame, localizer, recorded_ns)
+
+
+def _write_transform(
     writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
 ) -> bool:
     """Write what publish_tf asks for; whether it could be told."""
@@ -99,6 +109,12 @@ def write_texts(out: Path, frames: list[Frame], config: NodeConfig) -> int:
         )
         write_twists(out / TWISTS, twists, about.twists)
     return len(frames) - len(once)
+
+
+def write_bridged(out: Path, stamps_ns: IntArray) -> None:
+    """Write the stamps (b,) of poses without an image of their own, in s, one a line."""
+    text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps_ns.tolist())
+    (out / BRIDGED).write_text(text, encoding="utf-8")
 
 
 class _About(NamedTuple):

@@ -9,10 +9,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rs_localizer.cli.replay_result import BRIDGED
 from rs_localizer.config import NodeConfig
 from rs_localizer.image_clock import readout_fault
 from rs_localizer.io.outputs import Frame
 from rs_localizer.reasons import explained
+from rs_localizer.smoothed_frames import SmoothedFrames
 from rs_localizer.solvers import find_solver
 
 # Notices of a frame that could not follow the one before.
@@ -32,6 +34,12 @@ class Tally:
     not_sent: int = 0
     repeated: int = 0
     seconds: float = 0.0
+    smoothed: SmoothedFrames | None = None
+
+    @property
+    def written(self) -> list[Frame]:
+        """What the result holds: the frames, or samples of one motion through all of them."""
+        return self.smoothed.frames if self.smoothed else self.frames
 
 
 def print_summary(tally: Tally, config: NodeConfig) -> None:
@@ -51,6 +59,8 @@ def print_summary(tally: Tally, config: NodeConfig) -> None:
         rows += [(name, str(count))] if count else []
     rows += _quality(frames, config)
     rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
+    if tally.smoothed:
+        rows += _smoothing(tally.smoothed)
     for name, text in rows:
         print(f"{name:40} {text:>8}")
     for reason in tally.refused:
@@ -59,6 +69,14 @@ def print_summary(tally: Tally, config: NodeConfig) -> None:
     fault = readout_fault(config.readout_time, _period(frames))
     if fault is not None:
         print(f"warning: {fault}")
+
+
+def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:
+    return [
+        ("samples of the smoothed motion", str(len(smoothed.frames))),
+        (f"  bridged, listed in {BRIDGED}", str(len(smoothed.bridged))),
+        ("  left out, not determined", str(smoothed.undetermined)),
+    ]
 
 
 def _quality(frames: Sequence[Frame], config: NodeConfig) -> list[tuple[str, str]]:
@@ -89,5 +107,9 @@ def _quality(frames: Sequence[Frame], config: NodeConfig) -> list[tuple[str, str
 
 def _period(frames: Sequence[Frame]) -> float:
     """Seconds from frame to frame, median; NaN for less than two."""
-    stamps = np.array([frame.input_stamp_ns for frame in frames], np.int64)
-    return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.nan
+    stamps = np.unique(np.array([frame.input_stamp_ns for frame in frames], np.int64))
+    if len(stamps) < 2:
+        return np.nan
+    steps = np.diff(stamps) * 1e-9
+    # Between those with a pose others may have been refused.
+    return float(np.median(steps / np.round(steps / steps.min())))

@@ -150,3 +150,22 @@ def _boofcv(tree: dict[str, Any]) -> Camera:
         ),
         D=np.array([k1, k2, float(lens.get("t1", 0.0)), float(lens.get("t2", 0.0)), k3]),
     )
+
+
+def write_calibration(path: Path, camera: Camera) -> None:
+    """Write a camera's lens as ROS' camera_calibration and camera_info_manager do."""
+    projection = np.hstack([camera.K, np.zeros((3, 1))])
+    matrices = (
+        ("camera_matrix", camera.K),
+        ("distortion_coefficients", camera.D[None]),
+        ("rectification_matrix", np.eye(3)),
+        ("projection_matrix", projection),
+    )
+    text = f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: camera\n"
+    for name, matrix in matrices:
+        values = ", ".join(repr(float(value)) for value in matrix.ravel())
+        rows, columns = matrix.shape
+        text += f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: [{values}]\n"
+        if name == "camera_matrix":
+            text += f"distortion_model: {camera.distortion_model}\n"
+    path.write_text(text, encoding="utf-8")

@@ -8,6 +8,7 @@ from enum import IntEnum
 
 from rs_localizer.ros.inputs import Silence
 from rs_localizer.ros.statistics import WINDOW, Percentiles, Summary
+from rs_localizer.trajectory.online import MeasuredReadout
 
 # Frames in a row without a pose after which the camera is lost.
 _LOST = 5
@@ -40,6 +41,7 @@ class Condition:
     frame_topics: Sequence[str]  # of the inputs, those with frames
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
+    readout: MeasuredReadout | None = None  # as the camera's motion shows it
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +179,9 @@ def _values(condition: Condition, summary: Summary) -> dict[str, str]:
             "Model error (px)": f"{summary.last.model_error:.3f}",
             "Iterations": str(summary.last.iterations),
         }
+    if condition.readout is not None:
+        seen, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
+        values["Readout time seen (ms)"] = f"{seen:.2f} +- {deviation:.2f}"
     values |= {
         "Frames received": str(sum(summary.received.values())),
         "Poses published": str(summary.answered),

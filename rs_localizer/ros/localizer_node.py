@@ -120,8 +120,10 @@ class LocalizerNode(RobustLifecycleNode):
             return TransitionCallbackReturn.FAILURE
         config = parameters.read(self)
         if config.readout_time == 0.0:
+            until = " until it is estimated" if config.estimate_readout_time else ""
             self._warn(
                 "readout_time is 0 (unknown): no twist is published and frames are not tracked"
+                f"{until}"
             )
         self.get_logger().info(
             f"active with solver {config.solver}, listening to {' and '.join(self._inputs.topics)}"
@@ -183,13 +185,17 @@ class LocalizerNode(RobustLifecycleNode):
         frames = self._localizer
         missing = () if frames is None else frames.missing
         silence = {} if self._inputs is None else self._inputs.silence()
+        watch = None if frames is None else frames.readout_watch
         condition = Condition(
             life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,
             missing=missing,
             frame_topics=FRAME_TOPICS,
             silence=of_interest(silence, FRAME_TOPICS, missing),
-            oddities=self.refusals.recent(_ODD, WINDOW) | self._broadcaster.fault(),
+            oddities=self.refusals.recent(_ODD, WINDOW)
+            | self._broadcaster.fault()
+            | ({"readout_time": watch.fault} if watch and watch.fault else {}),
+            readout=watch.measured if watch else None,
         )
         health = diagnose(condition, self._statistics.summary())
         return health, "" if frames is None else frames.camera_frame

@@ -128,7 +128,7 @@ def test_a_recording_of_everything(
     [
         (["keypoints"], 1, "has keypoints and no map on map_points; give one with --map"),
         (["keypoints", "--map", "nowhere.npz"], 1, "map_file: [Errno 2] No such file"),
-        (["keypoints", "--map", "x.npz", "--ros"], 2, "--map and -p are for offline replay"),
+        (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth and -p are for offline replay"),
         (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),
         (["all", "--keypoints", "/nowhere"], 1, "topic /nowhere does not exist"),
         (["all", "--keypoints", "/ids", "--map-points", "/x"], 1, "topic /x does not exist"),

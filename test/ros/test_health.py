@@ -15,6 +15,7 @@ from rs_localizer.ros.health import Condition, Level, diagnose, of_interest
 from rs_localizer.ros.inputs import Silence
 from rs_localizer.ros.refusals import Refusals
 from rs_localizer.ros.statistics import Statistics
+from rs_localizer.trajectory.online import MeasuredReadout
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")
@@ -156,6 +157,13 @@ def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
         r"messages are lost: by their stamps, 5\d of 14\d have not come", health.message
     )
     assert int(health.values["Frames missing by their stamps, recently"]) in range(50, 61)
+
+
+def test_the_readout_time_that_the_motion_shows() -> None:
+    summary, name = Statistics(Refusals(print)).summary(), "Readout time seen (ms)"
+    assert name not in diagnose(GOOD, summary).values
+    seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100))
+    assert diagnose(seen, summary).values[name] == "-20.04 +- 0.12"
 
 
 def test_what_is_odd_is_a_warning(world: World) -> None:

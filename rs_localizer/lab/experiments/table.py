@@ -14,6 +14,7 @@ from rs_localizer.lab.experiments import (
     noise,
     p3p_initialisation,
     planes,
+    readout_time,
     real,
     robustness,
     timings,
@@ -37,6 +38,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "robustness": robustness.run,
     "timings": timings.run,
     "matching": matching.run,
+    "readout-time": readout_time.run,
     "real": real.run,
     "augmented-reality": augmented_reality.run,
 }

@@ -1,0 +1,282 @@
+"""``rs_localizer calibrate``: a recording in motion -> readout time, direction, and the lens."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.arguments import number
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.detect import find_map
+from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.image_clock import ImageClock
+from rs_localizer.image_sources import (
+    IMAGE_TYPES,
+    INFO_TYPE,
+    Carried,
+    Shot,
+    find_topic,
+    from_bag,
+    from_files,
+    from_video,
+    have_times,
+    image_files,
+)
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
+from rs_localizer.io.calibration import read_calibration, write_calibration
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.images import Image
+from rs_localizer.io.map_files import read_map_file
+from rs_localizer.lab.calibration_plots import save_plots
+from rs_localizer.lab.video import has_times
+from rs_localizer.marker_frames import FrameDetector
+from rs_localizer.recordings import read_recording
+from rs_localizer.replay import find_topics
+from rs_localizer.settings import build, load_params_file, parse_assignment
+from rs_localizer.trajectory import verdict
+from rs_localizer.trajectory.calibration import Calibration, calibrate
+from rs_localizer.trajectory.first_lens import first_lens
+from rs_localizer.trajectory.observe import Observed, in_order
+
+_CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recording",
+        type=Path,
+        metavar="RECORDING",
+        help="a bag of correspondences or keypoints; or, with --map or --board, images: a video, "
+        "a folder, a bag",
+    )
+    above = number(0.0, above=True)
+    parser.add_argument(
+        "--map", type=Path, metavar="FILE", help="map of the keypoints, or marker map of the images"
+    )
+    parser.add_argument("--board", metavar="9x6", help="a chessboard: inner corners along x rows")
+    parser.add_argument("--square", type=above, metavar="M", help="side of its squares")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="lens; without one it is found, too"
+    )
+    parser.add_argument(
+        "--intrinsics", action="store_true", help="find the lens as well, and write camera_info"
+    )
+    parser.add_argument(
+        "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
+    )
+    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: ROS 2 params file")
+    parser.add_argument(
+        "-p",
+        dest="assignments",
+        action="append",
+        default=[],
+        metavar="NAME:=VALUE",
+        help="one setting; scan_direction gives the axis (its reverse is tried as well)",
+    )
+    topics = parser.add_argument_group("topics of a bag (default: found by name and type)")
+    topics.add_argument("--correspondences", metavar="TOPIC")
+    topics.add_argument("--keypoints", metavar="TOPIC")
+    topics.add_argument("--map-points", metavar="TOPIC")
+    topics.add_argument("--image", metavar="TOPIC")
+    topics.add_argument("--camera-info", metavar="TOPIC")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.yaml", help="parameters for node and replay --params"
+    )
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="directory for pictures")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Source:
+    """Images with correspondences, and their camera; without a lens, its size only."""
+
+    images: list[Observed]
+    camera: Camera | None
+    size: tuple[int, int]
+
+
+def run(args: argparse.Namespace) -> None:
+    config = _config(args)
+    source = _read(args, config)
+    intrinsics, camera = args.intrinsics or source.camera is None, source.camera
+    if camera is None:
+        camera = first_lens(source.size, in_order(source.images))
+    camera = replace(camera, scan_direction=config.scan_direction)
+    with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
+        found = calibrate(camera, source.images, intrinsics=intrinsics, done=bar.update)
+    _tell(found, args.rate)
+    if intrinsics:
+        _tell_lens(found)
+    if args.plots is not None:
+        save_plots(camera, found, args.plots)
+    refusal = verdict.refusal(found)
+    if refusal:
+        raise ValueError(refusal)
+    if args.out is not None:
+        _write(found, args.out, intrinsics)
+
+
+def _config(args: argparse.Namespace) -> NodeConfig:
+    if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"--out must end in .yaml, got {args.out}")
+    try:
+        values = {} if args.params is None else load_params_file(args.params)
+        return build(values | dict(map(parse_assignment, args.assignments)))
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
+    path: Path = args.recording
+    if not path.exists():
+        raise ValueError(f"{path} does not exist")
+    if not is_bag(path):
+        with _files(args) as shots:
+            return _detected(args, shots)
+    with open_bag(path) as bag:
+        if args.image is None and any(kind == _CLOUD_TYPE for kind in bag.topics.values()):
+            return _correspondences(args, bag, config)
+        topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
+        given = None if args.calibration is None else read_calibration(args.calibration)
+        info = None
+        if given is None:
+            info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
+        return _detected(args, from_bag(bag, topic, info, given))
+
+
+def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:
+    if args.board is not None:
+        raise UsageError("--board is for images; the recording has correspondences")
+    topics = find_topics(
+        bag, args.correspondences, args.camera_info, args.keypoints, args.map_points
+    )
+    landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
+    recorded = read_recording(bag, topics, config.matching, landmarks)
+    camera = recorded.calibration.camera(0.0, config.scan_direction)
+    if args.calibration is not None:
+        camera = read_calibration(args.calibration)
+    images = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in recorded.clouds]
+    return _Source(images, camera, camera.size)
+
+
+# Stands in where no lens is known: only the size of images is asked of it.
+def _unknown(size: tuple[int, int]) -> Camera:
+    width, height = size
+    K = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(width=width, height=height, K=K)
+
+
+@contextmanager
+def _files(args: argparse.Namespace) -> Iterator[Iterator[Shot | Carried]]:
+    """The images of a video or folder."""
+    path: Path = args.recording
+    known = args.calibration is not None
+    camera = read_calibration(args.calibration) if known else _unknown((2, 2))
+    clock = ImageClock(args.rate)
+    if not path.is_dir():
+        if args.rate is None and not has_times(path):
+            raise UsageError("this video has no presentation times: give --rate; the readout time "
+                             "scales with it")  # fmt: skip
+        yield from_video(path, camera, clock)
+        _tell_clock(clock)
+        return
+    files = image_files(path)
+    if args.rate is None and not have_times(files):
+        raise UsageError("the names of the files are no times in ns: give --rate")
+    yield from_files(files, camera, clock)
+    _tell_clock(clock)
+
+
+def _tell_clock(clock: ImageClock) -> None:
+    print(clock.told())
+    if fault := clock.fault():
+        print(f"warning: {fault}")
+
+
+def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Source:
+    """Markers or a board in images."""
+    detector = FrameDetector(DetectorConfig(), lambda name, text: None, find_map(args))
+    detector.warm_up()
+    images: list[Observed] = []
+    camera, size, count = None, (0, 0), 0
+    for shot in tqdm(shots, unit="image", desc="detect", disable=None):
+        if isinstance(shot, Carried):
+            continue
+        count += 1
+        if not isinstance(shot.image, Image):
+            continue
+        height, width = shot.image.pixels.shape
+        size = (width, height)
+        found = detector.detect(shot.image).detections
+        images.append(Observed(shot.image.stamp_ns, found.points, found.pixels))
+        if camera is None and (args.calibration is not None or is_bag(args.recording)):
+            camera = read_camera_info(shot.camera_info).camera(0.0, NodeConfig().scan_direction)
+            if camera.size != size:
+                raise ValueError(
+                    f"the images are of {width}x{height}, the calibration is for "
+                    f"{camera.size[0]}x{camera.size[1]}"
+                )
+    seen = sum(len(image.points) > 0 for image in images)
+    print(f"{seen} of {count} images show the map")
+    return _Source(images, camera, size)
+
+
+def _tell(found: Calibration, rate: float | None) -> None:
+    direction = verdict.scan_direction(found)
+    rows = [
+        ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
+        ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
+        ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
+        ("scan direction", str(direction)),
+        ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
+        ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
+        ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
+        ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
+        ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
+    ]
+    for name, text in rows:
+        print(f"{name:26} {text}")
+    for block in found.blocks:
+        print(
+            f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"
+            f"{1e3 * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
+        )
+    for remark in verdict.remarks(found):
+        print(remark)
+    if rate is not None:
+        share = abs(found.readout_time) / found.stamps.interval
+        print(
+            f"the readout time is {share:.3f} of the interval: it scales with --rate, "
+            f"assumed to be {rate:g} Hz"
+        )
+
+
+def _tell_lens(found: Calibration) -> None:
+    values, state = found.fit.border_covariance, found.fit.state
+    deviations = np.sqrt(np.diag(values)[1 : 1 + len(state.lens)])
+    names = ("fx", "fy", "cx", "cy")
+    for k, value in enumerate(state.lens):
+        name = names[k] if k < len(names) else f"D[{k - len(names)}]"
+        print(f"{name:26} {value:.5g} +- {found.inflation * deviations[k]:.2g}")
+
+
+def _write(found: Calibration, path: Path, intrinsics: bool) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(
+        "/**:\n  ros__parameters:\n"
+        f"    readout_time: {verdict.readout_time(found)!r}\n"
+        f"    readout_time_deviation: {found.deviation!r}\n"
+        f"    scan_direction: {verdict.scan_direction(found)}\n",
+        encoding="utf-8",
+    )
+    print(f"written: {path}")
+    if intrinsics:
+        lens = path.with_name(f"{path.stem}_camera_info.yaml")
+        write_calibration(lens, found.fit.camera)
+        print(f"written: {lens}")

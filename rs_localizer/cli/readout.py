@@ -1,0 +1,29 @@
+"""``rs_localizer readout``: what others say of a camera's readout time."""
+
+from __future__ import annotations
+
+import argparse
+
+from rs_localizer.readout import find_readout
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help='words of its name: "sony a7siii", imx219')
+    parser.add_argument(
+        "mode", nargs="?", default="", metavar="MODE", help='words of its mode: "3840x2160 60"'
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    found = find_readout(args.name, args.mode)
+    width = max(len(entry.name) for entry in found)
+    modes = max(len(entry.mode) for entry in found)
+    print(f"{'camera':{width}}  {'mode':{modes}}  median ms  quartiles ms   number  source")
+    for entry in found:
+        spread = f"{1e3 * entry.low:.2f} to {1e3 * entry.high:.2f}"
+        note = "; about the interval between images, rather an upper bound"
+        print(
+            f"{entry.name:{width}}  {entry.mode:{modes}}  {1e3 * entry.median:9.2f}  {spread:14} "
+            f"{entry.number:6}  {entry.source}{note if entry.upper_bound else ''}"
+        )
+    print("What others say, of modes that may not be yours: rs_localizer calibrate measures it.")

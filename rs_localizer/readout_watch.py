@@ -1,0 +1,128 @@
+"""The readout time that the camera's own motion shows, beside the one that is set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
+from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.types import Estimate
+from rs_localizer.io.clouds import Correspondences
+from rs_localizer.solvers import find_solver
+from rs_localizer.trajectory.online import REVERSED, MeasuredReadout, ReadoutMonitor
+
+# Frames from one measurement to the next: few at first, more when there is more to compute.
+_AT_FIRST, _LATER = 5, 30
+_GROWTH = 0.1
+# A value is adopted when it is known to this share of itself, by so many frames.
+_WELL_KNOWN, _ENOUGH = 0.02, 60
+# So many deviations below zero, rows run the other way.
+_SURELY = 4.0
+
+
+class ReadoutWatch:
+    """Measures the readout time while frames are localized, and says when it contradicts.
+
+    Args:
+        notice: told of a contradiction, once until :meth:`reset`, and of a value that is adopted;
+            by the name ``readout_time`` and one sentence.
+    """
+
+    def __init__(self, notice: Callable[[str, str], None]) -> None:
+        self._notice = notice
+        self._monitor = ReadoutMonitor()
+        self._frames, self._next = 0, _AT_FIRST
+        self._said = False
+        # What the last seconds of motion showed; None: nothing yet.
+        self.measured: MeasuredReadout | None = None
+        self.fault = ""  # how that contradicts the setting, in one sentence
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self._monitor.reset()
+        self._frames, self._next = 0, _AT_FIRST
+        self._said, self.measured, self.fault = False, None, ""
+
+    def add(
+        self,
+        config: NodeConfig,
+        camera: Camera,
+        time_ns: int,
+        estimate: Estimate,
+        cloud: Correspondences,
+    ) -> NodeConfig:
+        """Take a localized frame whose middle row was exposed at ``time_ns``.
+
+        Returns:
+            the settings, with the readout time that was found where they ask for it.
+        """
+        estimates = config.estimate_readout_time and config.readout_time == 0.0
+        wanted = estimates or config.readout_time > 0.0
+        if not (wanted and find_solver(config.solver).rolling_shutter):
+            return config
+        try:
+            found = self._measure(camera, time_ns, estimate, cloud)
+        except np.linalg.LinAlgError:  # a frame that says nothing must not stop the next ones
+            self._monitor.reset()
+            return config
+        if found is None:
+            return config
+        self.measured = found
+        if estimates:
+            return self._adopt(config, found)
+        self.fault = _fault(config, found) if found.contradicts(config.readout_time) else ""
+        if self.fault and not self._said:
+            self._said = True
+            self._notice("readout_time", self.fault)
+        return config
+
+    def _measure(
+        self, camera: Camera, time_ns: int, estimate: Estimate, cloud: Correspondences
+    ) -> MeasuredReadout | None:
+        self._monitor.add(time_ns, camera, estimate, cloud.points, cloud.pixels)
+        self._frames += 1
+        if self._frames < self._next:
+            return None
+        self._next += min(max(_AT_FIRST, round(_GROWTH * self._frames)), _LATER)
+        return self._monitor.measure()
+
+    def _adopt(self, config: NodeConfig, found: MeasuredReadout) -> NodeConfig:
+        value = abs(found.readout_time)
+        known = found.relative_deviation < _WELL_KNOWN and found.triples >= _ENOUGH
+        if not known or value > LONGEST_READOUT_TIME:
+            return config
+        given = ScanDirection(config.scan_direction)
+        direction = given if found.readout_time > 0.0 else REVERSED[given]
+        self._notice(
+            "readout_time",
+            f"estimated: {_milliseconds(value, found.deviation)}, {direction}; set readout_time to "
+            f"{value:.5f} and scan_direction to {direction} to have it from the start",
+        )
+        return replace(
+            config,
+            readout_time=value,
+            readout_time_deviation=min(found.deviation, LONGEST_READOUT_TIME),
+            scan_direction=direction.value,
+        )
+
+
+def _fault(config: NodeConfig, found: MeasuredReadout) -> str:
+    if found.readout_time < -_SURELY * found.deviation:
+        given = ScanDirection(config.scan_direction)
+        span = _milliseconds(-found.readout_time, found.deviation)
+        return (
+            f"the camera's motion says that the shutter moves against scan_direction {given}, in "
+            f"{span}: is it {REVERSED[given]}?"
+        )
+    return (
+        "the camera's motion says a readout time of "
+        f"{_milliseconds(found.readout_time, found.deviation)}; readout_time is "
+        f"{config.readout_time:g}"
+    )
+
+
+def _milliseconds(value: float, deviation: float) -> str:
+    return f"{1e3 * value:.1f} +- {1e3 * deviation:.1f} ms"

@@ -1,0 +1,1 @@
+"""Many frames at once: continuous-time motion, its estimator, calibration and smoothing."""

@@ -1,0 +1,298 @@
+"""The readout time of a recording: value, honest deviation, direction, and what is odd about it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.stats import chi2
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.trajectory.banded import Undetermined
+from rs_localizer.trajectory.fit import Fit, cost_at, fit
+from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
+from rs_localizer.trajectory.observe import Observed, Posed, collect, in_order, localize_each
+from rs_localizer.trajectory.spline import Spline
+from rs_localizer.trajectory.stamps import Stamps, examine
+from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
+
+_LEAST_IMAGES = 20
+# A board: few landmarks, seen often. Its shape is known to about this part of its size.
+_MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
+# A given lens, and one that is to be found (see Freedom.lens_deviations).
+_GIVEN_LENS, _UNKNOWN_LENS = (0.02, 0.1), (0.3, 1.0)
+# Parts of the recording that are calibrated on their own.
+_BLOCK_SECONDS, _MOST_BLOCKS = 3.0, 8
+# Blocks that would differ this much by chance once in a hundred recordings disagree.
+_DISAGREEMENT = 0.01
+# Blocks whose scatter is this part of the value: the camera may turn its picture.
+_STABILISED = 0.1
+# Images that were not taken at their even stamps may be missing others between them: the mean
+# interval, and with it the readout time, is off by about this part of what they are off.
+_INTERVAL_SHARE = 0.5
+# A readout time is determined to this part of it, or to this many seconds.
+_DETERMINED_SHARE, _DETERMINED = 0.1, 1e-3
+_GLOBAL_SIGMAS = 3.0
+# Standard deviations of the images' own times, by the interval, to begin with.
+_FIRST_JITTERS = (0.1, 0.3)
+# Less than this does no harm, and may be a motion that the knots do not follow.
+_LEAST_JITTER = 0.03
+_LEAST_STAMPS = 1e-5  # s
+# The prior of the accelerations is so many times their median, and at least this.
+_ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
+# Finer knots, or images' own times, must lower the cost by this much per new parameter (Akaike).
+_COST_PER_PARAMETER = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A part of the recording on its own."""
+
+    start: float  # s
+    end: float  # s
+    readout_time: float  # s
+    deviation: float  # s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """What a recording says of its camera."""
+
+    readout_time: float  # s; negative: against the scan direction that was given
+    deviation: float  # s, with the blocks' disagreement and doubts of the stamps
+    formal_deviation: float  # s, of the noise alone
+    blocks: tuple[Block, ...]
+    inflation: float  # of the deviation, because the blocks disagree; 1: they do not
+    reversed_cost: float  # by how much the reversed direction costs more, noise variances
+    stamps: Stamps
+    fit: Fit
+    posed: Posed
+    images: int
+
+    @property
+    def jitter(self) -> float:
+        """By how much (s rms) images were exposed beside their stamps; 0: they were not."""
+        return float(np.std(self.fit.state.delays)) if self.fit.freedom.stamps > 0.0 else 0.0
+
+    @property
+    def odds(self) -> float:
+        """Decimal logarithm of the odds for the direction of the sign."""
+        return 0.5 * self.reversed_cost / self.inflation**2 / math.log(10.0)
+
+    @property
+    def determined(self) -> bool:
+        """Whether the motion determines the readout time."""
+        return self.deviation < max(_DETERMINED_SHARE * abs(self.readout_time), _DETERMINED)
+
+    @property
+    def global_shutter(self) -> bool:
+        """Whether 0 lies within the error."""
+        return self.determined and abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of the blocks' values, s."""
+        values = [block.readout_time for block in self.blocks]
+        return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+    @property
+    def stabilised(self) -> bool:
+        """Whether the parts disagree as those of a camera that turns its picture do."""
+        least = max(_STABILISED * abs(self.readout_time), _DETERMINED)
+        return self.inflation > 1.0 and self.scatter > least
+
+
+def calibrate(
+    camera: Camera,
+    images: list[Observed],
+    *,
+    intrinsics: bool = False,
+    done: Callable[[], object] = lambda: None,
+) -> Calibration:
+    """Readout time, and lens, of a camera from a recording in which it moves.
+
+    Args:
+        camera: its lens, and the axis and assumed direction of its scan; not its readout time.
+        images: with at least a dozen correspondences each.
+        intrinsics: the lens is to be found; otherwise it is known to a percent or two.
+        done: called after each image.
+
+    Raises:
+        ValueError: when the recording determines nothing, saying what was found.
+    """
+    images = in_order(images)
+    if len(images) < _LEAST_IMAGES:
+        raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
+    results = localize_each(camera, images, done)
+    localized = sum(map(bool, results))
+    if localized < _LEAST_IMAGES:
+        failures = [str(result) for result in results if not result]
+        raise ValueError(
+            f"{localized} of {len(images)} images have a pose, at least {_LEAST_IMAGES} are "
+            f"needed; of the last one without, {failures[-1]}"
+        )
+    posed = collect(camera, images, results)
+    stamps = examine(posed.image_times)
+    freedom = _freedom(posed.observations, intrinsics)
+    try:
+        found = _best(camera, posed, stamps.interval, freedom)
+    except Undetermined as error:
+        raise ValueError(str(error)) from error
+    return _judged(camera, posed, stamps, found, len(images))
+
+
+def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
+    landmarks, sights = observations.landmarks, len(observations.points)
+    board = len(landmarks) <= min(_MOST_BOARD_POINTS, sights / _LEAST_SIGHTS)
+    size = float(np.linalg.norm(np.ptp(landmarks, axis=0)))
+    return Freedom(
+        lens=True,
+        lens_deviations=_UNKNOWN_LENS if intrinsics else _GIVEN_LENS,
+        landmarks=_BOARD_SHARE * size if board else 0.0,
+    )
+
+
+def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fit:
+    """Readout time first, then all that is free; then times of the images' own, and finer knots,
+    if the residuals ask for them.
+    """
+    spacing = min(LONGEST_SPACING, interval)
+    spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, 0.5 * interval)
+    seen = within(posed.observations, spline)
+    plain = fit(camera, seen, start_state(camera, seen, spline), Freedom())
+    found = fit(camera, seen, plain.state, _calm(plain.state, freedom), plain.deviation)
+    with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
+        other = _unsteady(camera, seen, found, interval, freedom)
+        delays = other.state.delays
+        if np.std(delays) > _LEAST_JITTER * interval and _cheaper(other, found, len(delays)):
+            found = other
+    with suppress(Undetermined):
+        state = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
+        finer = fit(camera, seen, state, found.freedom, found.deviation)
+        added = 6 * (len(finer.state.spline.positions) - len(found.state.spline.positions))
+        if _cheaper(finer, found, added):
+            found = finer
+    return found
+
+
+def _unsteady(
+    camera: Camera, seen: Observations, found: Fit, interval: float, freedom: Freedom
+) -> Fit:
+    """With a time of its own for each image, from tight to loose to what they turn out to be."""
+    own, other = _calm(found.state, freedom), found
+    for share in _FIRST_JITTERS:
+        own = replace(own, stamps=share * interval)
+        other = fit(camera, seen, other.state, own)
+    own = replace(own, stamps=max(float(np.std(other.state.delays)), _LEAST_STAMPS))
+    return fit(camera, seen, other.state, own, other.deviation)
+
+
+def _calm(state: State, freedom: Freedom) -> Freedom:
+    """With a prior of the accelerations that the motion itself shows."""
+    layout = state.spline.layout
+    states = state.spline.states(layout.control_times())
+    angular, linear = (
+        float(np.sqrt(np.median(np.sum(of**2, axis=1))))
+        for of in (states.angular_acceleration, states.linear_acceleration)
+    )
+    return replace(
+        freedom,
+        angular_acceleration=max(_ACCELERATIONS * angular, _LEAST_ACCELERATION),
+        linear_acceleration=max(_ACCELERATIONS * linear, _LEAST_ACCELERATION),
+    )
+
+
+def _cheaper(richer: Fit, plainer: Fit, parameters: int) -> bool:
+    """Whether more parameters are worth it, by the noise that the richer model leaves."""
+    limit = 36.0 * richer.deviation**2
+    left = [float(np.sum(found.squared_errors.clip(max=limit))) for found in (plainer, richer)]
+    return (left[0] - left[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
+
+
+def within(observations: Observations, spline: Spline) -> Observations:
+    """Those keypoints that the motion covers."""
+    return observations.subset(spline.layout.inside(observations.times))
+
+
+def _judged(camera: Camera, posed: Posed, stamps: Stamps, found: Fit, images: int) -> Calibration:
+    seen = within(posed.observations, found.state.spline)
+    opposite = cost_at(camera, seen, found, -found.state.readout_time)
+    blocks = _blocks(camera, seen, found)
+    formal = found.readout_time_deviation
+    inflation = _disagreement(blocks)
+    return Calibration(
+        readout_time=found.state.readout_time,
+        deviation=math.hypot(formal * inflation, _interval_deviation(found, stamps)),
+        formal_deviation=formal,
+        blocks=blocks,
+        inflation=inflation,
+        reversed_cost=opposite - found.cost,
+        stamps=stamps,
+        fit=found,
+        posed=posed,
+        images=images,
+    )
+
+
+def _blocks(camera: Camera, observations: Observations, found: Fit) -> tuple[Block, ...]:
+    """Parts of the recording, each with lens and landmarks as the whole has them."""
+    first, last = observations.times.min(), observations.times.max()
+    count = int(np.clip((last - first) / _BLOCK_SECONDS, 2, _MOST_BLOCKS))
+    edges = np.linspace(first, last + 1e-6, count + 1)
+    blocks = []
+    for start, end in pairwise(edges):
+        inside = (observations.times >= start) & (observations.times < end)
+        # Not only what fits the whole: a part that differs would be left out of its own estimate.
+        part = observations.subset(inside)
+        part = replace(part, landmarks=found.state.landmarks)
+        state = _cut(found.state, start, end)
+        if state is None or not np.any(part.trusted):
+            continue
+        held = replace(found.freedom, lens=False, landmarks=0.0)
+        try:
+            own = fit(found.camera, part, state, held)
+        except Undetermined:
+            continue
+        deviation = own.readout_time_deviation
+        blocks.append(Block(float(start), float(end), own.state.readout_time, deviation))
+    return tuple(blocks)
+
+
+def _cut(state: State, start: float, end: float) -> State | None:
+    """The state with the motion between two times only."""
+    layout = state.spline.layout
+    intervals = np.column_stack([layout.starts, layout.ends])
+    margin = abs(state.readout_time)
+    kept = np.clip(intervals, start - margin, end + margin)
+    kept = kept[kept[:, 1] - kept[:, 0] > layout.spacing]
+    if len(kept) == 0:
+        return None
+    return replace(state, spline=refined(state.spline, layout.spacing, kept))
+
+
+def _interval_deviation(found: Fit, stamps: Stamps) -> float:
+    """Of the readout time (s), where stamps are even and the images were not."""
+    unsaid = float(np.var(found.state.delays)) - stamps.jitter**2
+    share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
+    return _INTERVAL_SHARE * share * abs(found.state.readout_time)
+
+
+def _disagreement(blocks: tuple[Block, ...]) -> float:
+    """By how much the deviations are too small (Birge's ratio), 1 if that may be chance."""
+    if len(blocks) < 2:
+        return 1.0
+    values = np.array([block.readout_time for block in blocks])
+    weights = np.array([block.deviation for block in blocks]) ** -2.0
+    total = float(np.sum(weights))
+    mean = np.sum(weights * values) / total
+    squared = float(np.sum(weights * (values - mean) ** 2))
+    freedoms = len(blocks) - 1
+    if chi2.sf(squared, freedoms) > _DISAGREEMENT:
+        return 1.0
+    # What the blocks disagree in is not their noise: none of them is better than the others.
+    scatter = np.std(values, ddof=1) / math.sqrt(len(blocks))
+    return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))

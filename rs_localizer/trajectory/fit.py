@@ -1,0 +1,150 @@
+"""The estimator of many frames: a spline through all keypoints, and what the frames share.
+
+The noise is not given: it is the scale of the errors, measured between the rounds, and so Tukey's
+limit closes from the first guess to the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.trajectory.banded import Factored
+from rs_localizer.trajectory.lens import with_lens
+from rs_localizer.trajectory.model import Freedom, Observations, State
+from rs_localizer.trajectory.problem import LIMIT, Problem
+from rs_localizer.trajectory.spline_kernels import CONTROL
+
+# The rounds end when the noise settles to this part of it.
+_ROUNDS, _SETTLED = 8, 0.01
+_FEW_STEPS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """An estimate with what is known of its errors."""
+
+    state: State
+    camera: Camera
+    deviation: float  # px, standard deviation of the noise of u and of v
+    cost: float  # sum of the weighted squared errors in noise variances
+    squared_errors: Array  # (n,) px^2, whitened
+    inliers: BoolArray  # (n,)
+    border_covariance: Array  # (b,b): readout time, lens, landmarks as far as they are free
+    freedom: Freedom
+    factored: Factored
+    inflation: float  # of all covariances, for robust weights and used up freedoms
+
+    @property
+    def readout_time_deviation(self) -> float:
+        """Standard deviation of the readout time (s); NaN where it was given."""
+        free = len(self.border_covariance) and self.freedom.readout_time
+        return float(np.sqrt(self.border_covariance[0, 0])) if free else np.nan
+
+    def state_covariances(self, times: Array) -> Array:
+        """Covariances (m,12,12) at times (m,): turn in camera axes, position in the map, body
+        rate (rad/s), velocity in the map (m/s).
+        """
+        first, jacobians = self.state.spline.jacobians(times)
+        inner = self.inflation * self.factored.local_covariances(first)
+        covariances: Array = jacobians @ inner @ np.swapaxes(jacobians, 1, 2)
+        return covariances
+
+
+def fit(
+    camera: Camera,
+    observations: Observations,
+    start: State,
+    freedom: Freedom,
+    deviation: float | None = None,
+) -> Fit:
+    """The most likely motion and shared numbers.
+
+    Args:
+        camera: lens model, size and scan direction; its readout time and numbers do not matter.
+        observations: all keypoints; those not trusted take part once the motion is about right.
+        start: first guess; its knots stay.
+        freedom: what is estimated.
+        deviation: px, of the noise about the first guess if that is good; otherwise the trusted
+            keypoints have to lead to it.
+
+    Raises:
+        Undetermined: when the keypoints do not determine what is free.
+    """
+    problem, state = Problem(camera, observations, start, freedom), start
+    if deviation is None:
+        trusted = Problem(camera, observations.subset(observations.trusted), start, freedom)
+        state, deviation = _settle(trusted, start, trusted.noise(start, np.inf))
+    state, deviation = _settle(problem, state, deviation)
+    return _finish(problem, state, deviation)
+
+
+def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time: float) -> float:
+    """The least cost with this readout time (s), to be compared with ``found.cost``; less exactly
+    where it is far from the least of all.
+    """
+    held = replace(found.freedom, readout_time=False)
+    start = replace(found.state, readout_time=readout_time)
+    problem = Problem(camera, observations, start, held)
+    return problem.normal(problem.minimise(start, found.deviation, _FEW_STEPS), found.deviation)[0]
+
+
+def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:
+    """How fast the keypoints (n,) move in their images, px/s."""
+    speeds = []
+    for sights in Problem(camera, observations, state, Freedom()).look(state)[1]:
+        local, velocity = sights.local, sights.velocity
+        by_ray = (velocity[:, :2] - velocity[:, 2:] * local[:, :2] / local[:, 2:]) / local[:, 2:]
+        flow = np.einsum("nij,nj->ni", sights.by_ray, by_ray)
+        speeds.append(np.linalg.norm(flow, axis=1))
+    return np.concatenate(speeds)
+
+
+def _settle(problem: Problem, state: State, deviation: float) -> tuple[State, float]:
+    """State and noise when neither changes any more."""
+    for _ in range(_ROUNDS):
+        state = problem.minimise(state, deviation)
+        before, deviation = deviation, problem.noise(state, deviation)
+        if abs(deviation - before) < _SETTLED * deviation:
+            break
+    return state, deviation
+
+
+def _finish(problem: Problem, state: State, deviation: float) -> Fit:
+    """The estimate with its covariances."""
+    squared = problem.errors(state)
+    cost, normal = problem.normal(state, deviation)
+    factored = Factored(normal)
+    inliers = squared < (LIMIT * deviation) ** 2
+    frames = len(np.unique(problem.observations.frames[inliers]))
+    used = problem.border + CONTROL * min(frames, len(state.spline.positions))
+    inflation = _inflation(squared[inliers], deviation, used)
+    return Fit(
+        state=state,
+        camera=with_lens(replace(problem.camera, readout_time=abs(state.readout_time)), state.lens),
+        deviation=deviation,
+        cost=cost,
+        squared_errors=squared,
+        inliers=inliers,
+        border_covariance=inflation * factored.border_covariance(),
+        factored=factored,
+        inflation=inflation,
+        freedom=problem.freedom,
+    )
+
+
+def _inflation(squared: Array, deviation: float, used: int) -> float:
+    """How the covariance of the M-estimator differs from the inverse of its normal matrix.
+
+    Huber's formula, ``E psi^2 / (E psi')^2``, where the matrix has the mean weight instead; and
+    the freedoms that the motion used up.
+    """
+    share = squared / (LIMIT * deviation) ** 2
+    weight = (1.0 - share) ** 2
+    psi_squared = np.mean(weight**2 * squared) / (2.0 * deviation**2)
+    slope = np.mean(weight - 2.0 * share * (1.0 - share))
+    freedoms = 2.0 * len(squared) / max(2.0 * len(squared) - used, 1.0)
+    return float(psi_squared * np.mean(weight) / slope**2 * freedoms)

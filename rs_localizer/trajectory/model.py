@@ -1,0 +1,63 @@
+"""What the trajectory's estimator is given, what is free in it, and what it changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.trajectory.lens import lens_values
+from rs_localizer.trajectory.spline import Spline
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Keypoints of all frames."""
+
+    times: Array  # (n,) s, when the middle row of their frame was exposed, readout time aside
+    row_times: Array  # (n,) -0.5 at the first exposed row, 0.5 at the last
+    pixels: Array  # (n,2) raw
+    landmarks: Array  # (p,3) m, map frame
+    points: IntArray  # (n,) rows of ``landmarks``
+    frames: IntArray  # (n,) number of the image, rising
+    trusted: BoolArray  # (n,) inliers of their frame alone
+
+    def subset(self, chosen: BoolArray) -> Observations:
+        """The chosen keypoints (n,), with all landmarks."""
+        names = ("times", "row_times", "pixels", "points", "frames", "trusted")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+
+@dataclass(frozen=True, slots=True)
+class Freedom:
+    """What is estimated beside the motion."""
+
+    readout_time: bool = True
+    lens: bool = False
+    # Standard deviations of the given lens: focal lengths and centre by focal length, distortion.
+    lens_deviations: tuple[float, float] = (0.02, 0.1)
+    landmarks: float = 0.0  # m, standard deviation of their places; 0: they are known
+    stamps: float = 0.0  # s, standard deviation of each image's stamp; 0: they are right
+    angular_acceleration: float = 100.0  # rad/s^2, zero-mean prior at each control
+    linear_acceleration: float = 50.0  # m/s^2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """All that is estimated."""
+
+    spline: Spline
+    readout_time: float  # s; negative: against the scan direction of the camera
+    lens: Array  # (m,) as of lens_values
+    landmarks: Array  # (p,3) m
+    delays: Array  # (g,) s, how much later than stamped each image was exposed
+
+
+def start_state(
+    camera: Camera, observations: Observations, spline: Spline, readout_time: float = 0.0
+) -> State:
+    """A first guess with the camera's own lens and the map as it is given."""
+    delays = np.zeros(int(observations.frames.max(initial=-1)) + 1)
+    return State(spline, readout_time, lens_values(camera), observations.landmarks.copy(), delays)

@@ -1,0 +1,231 @@
+"""The cost of a trajectory, its normal equations and its minimum.
+
+Gauss and Newton with Levenberg's damping on the whitened errors of
+:mod:`rs_localizer.trajectory.normal_kernels`.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.trajectory.banded import Factored, Undetermined
+from rs_localizer.trajectory.lens import lens_values, project
+from rs_localizer.trajectory.model import Freedom, Observations, State
+from rs_localizer.trajectory.normal_kernels import (
+    Curve,
+    Normal,
+    Sights,
+    Terms,
+    accumulate,
+    look,
+    squared_errors,
+)
+from rs_localizer.trajectory.prior_kernels import add_smoothness, eliminate_stamps
+from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
+
+LIMIT = 6.0
+"""Tukey's limit in standard deviations: 97 % efficient on Gaussian noise in two dimensions."""
+# Errors beyond so many standard deviations do not count for the scale of the noise.
+_SCALE_LIMIT = 4.0
+# Median of a squared error in two dimensions, in variances.
+_MEDIAN = 2.0 * np.log(2.0)
+_LEAST_DEVIATION = 1e-4  # px; recordings without noise are simulated
+_STEPS, _MOST_DAMPINGS = 20, 6
+_LEAST_GAIN = 0.02  # of the cost; a step that brings less is the last one
+_FIRST_DAMPING = 1e-8
+# Kernels and OpenCV leave the interpreter free for each other.
+_PARTS = 2
+# What parts of a recording add to the normal equations.
+_SUMS = tuple(name for name in Normal._fields if name != "image_first")
+
+
+class Problem:
+    """The cost of a state, its normal equations and its minimum."""
+
+    def __init__(
+        self, camera: Camera, observations: Observations, start: State, freedom: Freedom
+    ) -> None:
+        self.camera, self.observations, self.freedom = camera, observations, freedom
+        self.start_lens = lens_values(camera)
+        # The parts are always the same, whatever the number of workers: so is every sum.
+        edges = np.linspace(0, len(observations.times), _PARTS + 1).astype(int)
+        self._parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
+        self._workers = ThreadPoolExecutor(_PARTS)  # of its own: threads do not survive a fork
+        self._last: tuple[State, Curve, list[Sights]] | None = None
+        self.lens_count = len(start.lens) if freedom.lens else 0
+        self.slots = np.full(len(start.landmarks), -1)
+        if freedom.landmarks > 0.0:
+            seen = np.unique(observations.points)
+            self.slots[seen] = np.arange(len(seen))
+        self.free_points = np.flatnonzero(self.slots >= 0)
+        readout = 1 if freedom.readout_time else 0
+        self.border = readout + self.lens_count + 3 * len(self.free_points)
+        self.lens_column = readout if self.lens_count else -1
+        self.point_column = readout + self.lens_count if len(self.free_points) else -1
+
+    def look(self, state: State) -> tuple[Curve, list[Sights]]:
+        """The spline, and all keypoints on it in so many parts of the recording."""
+        if self._last is None or self._last[0] is not state:
+            spline = state.spline
+            curve = Curve(
+                spline.rotations, spline.positions, *spline.steps(), float(spline.layout.spacing)
+            )
+            parts = list(
+                self._workers.map(lambda part: self._part(state, curve, part), self._parts)
+            )
+            self._last = state, curve, list(parts)
+        return self._last[1:]
+
+    def _part(self, state: State, curve: Curve, part: slice) -> Sights:
+        seen = self.observations
+        tau, points, frames = seen.row_times[part], seen.points[part], seen.frames[part]
+        times = seen.times[part] + state.delays[frames] + state.readout_time * tau
+        first, u = state.spline.layout.locate(times)
+        local, velocity = np.empty((len(first), 3)), np.empty((len(first), 3))
+        look(curve, first, u, state.landmarks[points], local, velocity)
+        ahead = np.where(local[:, 2:] > 0.0, local, (0.0, 0.0, 1.0))
+        seen_as = project(self.camera, state.lens, ahead, self.lens_column >= 0)
+        return Sights(
+            first, u, tau, local, velocity, seen_as.pixels - seen.pixels[part],
+            seen_as.by_ray, seen_as.by_lens, self.slots[points], frames,
+        )  # fmt: skip
+
+    def terms(self, state: State, deviation: float) -> Terms:
+        return Terms(
+            float(state.readout_time),
+            self.camera.row_time_gradient,
+            0 if self.freedom.readout_time else -1,
+            self.lens_column,
+            self.point_column,
+            self.freedom.stamps > 0.0,
+            deviation**2,
+            (LIMIT * deviation) ** 2,
+        )
+
+    def errors(self, state: State) -> Array:
+        """Squared whitened errors (n,), px^2."""
+        terms, found = self.terms(state, 1.0), []
+        for sights in self.look(state)[1]:
+            found.append(np.empty(len(sights.first)))
+            squared_errors(sights, terms, found[-1])
+        return np.concatenate(found)
+
+    def noise(self, state: State, deviation: float) -> float:
+        """Standard deviation of the noise, from the errors that are not far off the last one."""
+        squared = self.errors(state)
+        near = squared[squared < (_SCALE_LIMIT * deviation) ** 2]
+        if len(near) == 0:
+            raise Undetermined("no keypoint agrees with the motion of the frames")
+        return max(float(np.sqrt(np.median(near) / _MEDIAN)), _LEAST_DEVIATION)
+
+    def normal(self, state: State, deviation: float) -> tuple[float, Normal]:
+        """Cost and normal equations."""
+        curve, parts = self.look(state)
+        terms = self.terms(state, deviation)
+        normals = self._empty(len(state.spline.positions), parts, len(state.delays))
+        costs = self._workers.map(
+            lambda sights, normal: accumulate(curve, sights, terms, normal), parts, normals
+        )
+        cost, normal = sum(costs), normals[0]
+        for other in normals[1:]:
+            for field in _SUMS:
+                getattr(normal, field)[:] += getattr(other, field)
+        cost += add_smoothness(
+            curve, state.spline.layout.firsts, float(self.freedom.angular_acceleration),
+            float(self.freedom.linear_acceleration), normal,
+        )  # fmt: skip
+        cost += self._add_priors(state, normal)
+        if self.freedom.stamps > 0.0:
+            eliminate_stamps(normal)
+        return cost, normal
+
+    def _empty(self, controls: int, parts: list[Sights], images: int) -> list[Normal]:
+        """Normal equations of zeros for each part, of the same shape."""
+        free = self.freedom.stamps > 0.0
+        first, last = np.full(images, controls), np.zeros(images, np.int64)
+        for sights in parts if free else ():
+            np.minimum.at(first, sights.frames, sights.first)
+            np.maximum.at(last, sights.frames, sights.first)
+        width = LOCAL + CONTROL * int(np.max(last - first, initial=0))
+        # The last images have no more controls behind them.
+        first = np.minimum(first, max(controls - width // CONTROL, 0))
+        count, images, border = CONTROL * controls, images if free else 0, self.border
+        return [
+            Normal(
+                np.zeros((width, count)), np.zeros((count, border)), np.zeros((border, border)),
+                np.zeros(count), np.zeros(border), first[:images], np.zeros((images, width)),
+                np.zeros((images, border)), np.zeros(images), np.zeros(images),
+            )
+            for _ in parts
+        ]  # fmt: skip
+
+    def _add_priors(self, state: State, normal: Normal) -> float:
+        """What is known of lens and landmarks beforehand."""
+        cost = 0.0
+        diagonal = np.arange(self.border)
+        if self.lens_column >= 0:
+            pinhole, distortion = self.freedom.lens_deviations
+            deviations = np.full(self.lens_count, distortion)
+            deviations[:4] = pinhole * self.start_lens[:2].mean()
+            offset = (state.lens - self.start_lens) / deviations
+            at = slice(self.lens_column, self.lens_column + self.lens_count)
+            normal.border_slope[at] += offset / deviations
+            normal.corner[diagonal[at], diagonal[at]] += deviations**-2
+            cost += float(offset @ offset)
+        if self.point_column >= 0:
+            known = self.observations.landmarks[self.free_points]
+            offset = (state.landmarks[self.free_points] - known).ravel() / self.freedom.landmarks
+            at = slice(self.point_column, self.border)
+            normal.border_slope[at] += offset / self.freedom.landmarks
+            normal.corner[diagonal[at], diagonal[at]] += self.freedom.landmarks**-2
+            cost += float(offset @ offset)
+        if self.freedom.stamps > 0.0:
+            normal.image_information[:] += self.freedom.stamps**-2
+            normal.image_slope[:] += state.delays * self.freedom.stamps**-2
+            cost += float(np.sum((state.delays / self.freedom.stamps) ** 2))
+        return cost
+
+    def moved(self, state: State, normal: Normal, controls: Array, border: Array) -> State:
+        """The state after a step that these normal equations led to."""
+        readout_time, lens, landmarks = state.readout_time, state.lens, state.landmarks
+        if self.freedom.readout_time:
+            readout_time = readout_time + float(border[0])
+        if self.lens_column >= 0:
+            lens = lens + border[self.lens_column : self.lens_column + self.lens_count]
+        if self.point_column >= 0:
+            landmarks = landmarks.copy()
+            landmarks[self.free_points] += border[self.point_column :].reshape(-1, 3)
+        delays = state.delays
+        if self.freedom.stamps > 0.0:
+            width = normal.image_controls.shape[1]
+            own = controls[CONTROL * normal.image_first[:, None] + np.arange(width)]
+            pull = np.einsum("gk,gk->g", normal.image_controls, own) + normal.image_border @ border
+            delays = delays - (normal.image_slope + pull) / normal.image_information
+        return State(state.spline.moved(controls), readout_time, lens, landmarks, delays)
+
+    def minimise(self, state: State, deviation: float, steps: int = _STEPS) -> State:
+        """The state of least cost near to this one, after at most so many steps."""
+        cost, normal = self.normal(state, deviation)
+        damping = _FIRST_DAMPING
+        for _ in range(steps):
+            for _ in range(_MOST_DAMPINGS):
+                try:
+                    trial = self.moved(state, normal, *Factored(normal, damping).step())
+                    trial_cost, trial_normal = self.normal(trial, deviation)
+                except Undetermined:  # far from the minimum, rounding may cost definiteness
+                    trial_cost = np.inf
+                if trial_cost < cost + _LEAST_GAIN:  # NaN compares false
+                    break
+                damping = max(100.0 * damping, 1e-4)
+            else:
+                return state
+            gain = cost - trial_cost
+            state, cost, normal, damping = trial, trial_cost, trial_normal, 0.1 * damping
+            if gain < _LEAST_GAIN:
+                break
+        return state

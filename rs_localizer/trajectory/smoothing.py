@@ -1,0 +1,161 @@
+"""The motion of a whole recording: poses and velocities at any time, with covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
+from rs_localizer.core.types import Estimate
+from rs_localizer.trajectory.fit import Fit, fit
+from rs_localizer.trajectory.model import Freedom, State, start_state
+from rs_localizer.trajectory.observe import Observed, collect
+from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
+
+# Between images the motion is told as long as its deviations stay within so many of the usual ones.
+_MOST_UNCERTAIN = 5.0
+# A sample is bridged where the images with a pose lie farther apart than this many intervals.
+_BRIDGED = 1.5
+# Finer knots must lower the squared errors by this much per new parameter (Akaike).
+_COST_PER_PARAMETER = 2.0
+_LEAST_ACCELERATION = 0.1  # rad/s^2, m/s^2
+_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sampled:
+    """The motion at m times."""
+
+    estimates: list[Estimate]  # per readout, as of single frames; no keypoints
+    determined: BoolArray  # (m,) by the images before and after
+    bridged: BoolArray  # (m,) with images missing next to it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed:
+    """The motion through all images of a recording."""
+
+    fit: Fit
+    readout_time: float  # s
+    start_ns: int
+    times: Array  # (f,) s since then, of the images' middle rows
+
+    def sample(self, stamps_ns: IntArray) -> Sampled:
+        """The camera's motion at times (m,) in ns."""
+        times = np.array([(int(stamp) - self.start_ns) * 1e-9 for stamp in stamps_ns])
+        spline = self.fit.state.spline
+        covariances = self._in_camera(times)
+        usual = np.median(_deviations(self._in_camera(self.times)), axis=0)
+        certain = np.all(_deviations(covariances) < _MOST_UNCERTAIN * usual, axis=1)
+        return Sampled(
+            self._estimates(times, covariances),
+            spline.layout.inside(times) & certain,
+            self._apart(times) > _BRIDGED * np.median(np.diff(self.times)),
+        )
+
+    def _apart(self, times: Array) -> Array:
+        """How far apart (m,) the images before and after these times are, s."""
+        after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
+        return self.times[after] - self.times[after - 1]
+
+    def _in_camera(self, times: Array) -> Array:
+        """Covariances (m,12,12) in the order and the axes of ``Estimate.covariance``, SI."""
+        states = self.fit.state.spline.states(times)
+        back = np.swapaxes(states.rotations, 1, 2)
+        velocities = np.einsum("nij,nj->ni", back, states.linear)
+        to_camera = np.zeros((len(times), 12, 12))
+        to_camera[:, :3, :3] = to_camera[:, 6:9, 6:9] = np.eye(3)
+        to_camera[:, 3:6, 3:6] = to_camera[:, 9:, 9:] = back
+        to_camera[:, 9:, :3] = so3.hat(velocities)
+        covariances: Array = (
+            to_camera @ self.fit.state_covariances(times) @ np.swapaxes(to_camera, 1, 2)
+        )
+        return covariances
+
+    def _estimates(self, times: Array, covariances: Array) -> list[Estimate]:
+        states = self.fit.state.spline.states(times)
+        scale = np.repeat([1.0, self.readout_time], 6)
+        empty = np.zeros(0)
+        # At a moment of its own nothing asks for accelerations.
+        joint = np.zeros((len(times), PARAMETERS, PARAMETERS))
+        joint[:, :MOTION_PARAMETERS, :MOTION_PARAMETERS] = scale[:, None] * covariances * scale
+        return [
+            Estimate(
+                rotation=rotation.T,
+                translation=-rotation.T @ position,
+                angular_velocity=self.readout_time * angular,
+                linear_velocity=self.readout_time * (rotation.T @ linear),
+                inliers=empty.astype(np.bool_),
+                residuals=empty,
+                joint_covariance=covariance,
+                global_shutter_inliers=0,
+                iterations=0,
+            )
+            for rotation, position, angular, linear, covariance in zip(
+                states.rotations, states.positions, states.angular, states.linear, joint,
+                strict=True,
+            )
+        ]  # fmt: skip
+
+
+def _deviations(covariances: Array) -> Array:
+    """Standard deviations (m,2) of orientation and position."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    sums = np.column_stack([variances[:, :3].sum(axis=1), variances[:, 3:6].sum(axis=1)])
+    deviations: Array = np.sqrt(sums)
+    return deviations
+
+
+def smooth(
+    camera: Camera, images: list[Observed], estimates: list[Estimate], stamp_offset: float = 0.0
+) -> Smoothed:
+    """The motion through images with a pose, in the order of their stamps.
+
+    Args:
+        camera: with its readout time.
+        images: their inliers.
+        estimates: a first motion of each image.
+        stamp_offset: s from the stamp to the first row's exposure.
+
+    Raises:
+        ValueError: without a readout time, or when the images determine no motion.
+    """
+    readout_time = camera.readout_time
+    if not readout_time > 0.0:
+        raise ValueError("smoothing needs the readout time of the camera, which is 0 (unknown)")
+    known = [
+        replace(one, inliers=np.ones(len(image.points), dtype=np.bool_))
+        for one, image in zip(estimates, images, strict=True)
+    ]
+    delay = stamp_offset - readout_time * camera.first_row_time
+    posed = collect(camera, images, list(known), delay)
+    seen = posed.observations
+    interval = float(np.median(np.diff(posed.times))) if len(posed.times) > 1 else 1.0
+    spacing = min(LONGEST_SPACING, interval)
+    spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, readout_time)
+    seen = seen.subset(spline.layout.inside(seen.times))
+    state = start_state(camera, seen, spline, readout_time)
+    found = fit(camera, seen, state, Freedom(readout_time=False))
+    for _ in range(_ROUNDS):
+        found = fit(camera, seen, found.state, _steady(found.state), found.deviation)
+    finer = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
+    other = fit(camera, seen, finer, _steady(found.state), found.deviation)
+    added = 6 * (len(finer.spline.positions) - len(found.state.spline.positions))
+    gain = float(np.sum(found.squared_errors) - np.sum(other.squared_errors)) / other.deviation**2
+    if gain > _COST_PER_PARAMETER * added:
+        found = fit(camera, seen, other.state, _steady(other.state), other.deviation)
+    return Smoothed(found, readout_time, posed.start_ns, posed.times)
+
+
+def _steady(state: State) -> Freedom:
+    """With a prior of the accelerations as large as the motion's own."""
+    states = state.spline.states(state.spline.layout.control_times())
+    angular, linear = (
+        max(float(np.sqrt(np.mean(np.square(of)))), _LEAST_ACCELERATION)
+        for of in (states.angular_acceleration, states.linear_acceleration)
+    )
+    return Freedom(readout_time=False, angular_acceleration=angular, linear_acceleration=linear)

@@ -1,0 +1,140 @@
+"""A camera's continuous motion: stretches of a uniform cumulative cubic B-spline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.trajectory.spline_kernels import LOCAL, ORDER, jacobians, states, steps
+
+
+class States(NamedTuple):
+    """Poses and their rates at m times."""
+
+    rotations: Array  # (m,3,3) map_from_camera
+    positions: Array  # (m,3) m, of the camera centre in the map
+    angular: Array  # (m,3) rad/s, body rate
+    linear: Array  # (m,3) m/s, along the map's axes
+    angular_acceleration: Array  # (m,3) rad/s^2, in body axes
+    linear_acceleration: Array  # (m,3) m/s^2, along the map's axes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Where the knots of the stretches lie: one list of controls, cut at the gaps.
+
+    The controls ``firsts[k]`` to ``firsts[k + 1] - 1`` belong to stretch k, whose motion is
+    defined from ``starts[k]`` on for as many spacings as it has controls, less three.
+    """
+
+    spacing: float  # s
+    starts: Array  # (s,) s
+    firsts: IntArray  # (s + 1,)
+
+    @staticmethod
+    def over(intervals: Array, spacing: float) -> Layout:
+        """Knots that cover time intervals (s,2)."""
+        spans = np.ceil((intervals[:, 1] - intervals[:, 0]) / spacing - 1e-9).astype(np.int64)
+        spans = np.maximum(spans, 1)
+        middles = 0.5 * (intervals[:, 0] + intervals[:, 1])
+        firsts = np.concatenate([[0], np.cumsum(spans + ORDER - 1)])
+        return Layout(float(spacing), middles - 0.5 * spacing * spans, firsts)
+
+    @property
+    def count(self) -> int:
+        """Number of controls."""
+        return int(self.firsts[-1])
+
+    @property
+    def ends(self) -> Array:
+        """Ends (s,) of the stretches, s."""
+        ends: Array = self.starts + self.spacing * (np.diff(self.firsts) - (ORDER - 1))
+        return ends
+
+    def control_times(self) -> Array:
+        """Times (n,) at which the controls weigh most, s."""
+        parts = [
+            start + self.spacing * (np.arange(count) - 1.0)
+            for start, count in zip(self.starts, np.diff(self.firsts), strict=True)
+        ]
+        return np.concatenate(parts)
+
+    def stretches(self, times: Array) -> IntArray:
+        """The stretch (m,) of each time; that nearest to it where it lies in none."""
+        after = np.clip(np.searchsorted(self.starts, times, side="right"), 1, len(self.starts))
+        index = after - 1
+        following = np.minimum(after, len(self.starts) - 1)
+        nearer = self.starts[following] - times < times - self.ends[index]
+        return np.where(nearer & (times > self.ends[index]), following, index)
+
+    def inside(self, times: Array) -> BoolArray:
+        """Which times (m,) a stretch covers."""
+        index = self.stretches(times)
+        return (times >= self.starts[index]) & (times <= self.ends[index])
+
+    def locate(self, times: Array) -> tuple[IntArray, Array]:
+        """First of the four controls (m,) that act at times (m,), and the place (m,) ``u``.
+
+        Times outside of the stretches are taken for the nearest covered one.
+        """
+        times = np.asarray(times, float)
+        index = self.stretches(times)
+        place = (times - self.starts[index]) / self.spacing
+        spans = np.diff(self.firsts)[index] - (ORDER - 1)
+        place = np.clip(place, 0.0, spans)
+        whole = np.minimum(place.astype(np.int64), spans - 1)
+        return self.firsts[index] + whole, place - whole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spline:
+    """A motion: knots and controls."""
+
+    layout: Layout
+    rotations: Array  # (n,3,3) map_from_camera
+    positions: Array  # (n,3) m
+
+    def moved(self, step: Array) -> Spline:
+        """With the controls changed by a step (6 n,)."""
+        step = step.reshape(-1, 6)
+        rotations = self.rotations @ so3.exp_many(step[:, :3])
+        return Spline(self.layout, rotations, self.positions + step[:, 3:])
+
+    def steps(self) -> tuple[Array, Array]:
+        """Rotation vectors (n,3) from control to control, and inverse right Jacobians (n,3,3)."""
+        vectors, inverses = np.zeros((len(self.rotations), 3)), np.zeros_like(self.rotations)
+        steps(self.rotations, vectors, inverses)
+        return vectors, inverses
+
+    def states(self, times: Array) -> States:
+        """Pose, velocities and accelerations at times (m,), s."""
+        first, u = self.layout.locate(times)
+        vectors, _ = self.steps()
+        m = len(first)
+        rotations, positions, change = np.empty((m, 3, 3)), np.empty((m, 3)), np.empty((m, 4, 3))
+        states(
+            self.rotations, self.positions, vectors, first, u, self.layout.spacing,
+            rotations, positions, change,
+        )  # fmt: skip
+        angular, linear, angular_acceleration, linear_acceleration = np.moveaxis(change, 1, 0)
+        return States(
+            rotations, positions, angular, linear, angular_acceleration, linear_acceleration
+        )
+
+    def jacobians(self, times: Array) -> tuple[IntArray, Array]:
+        """First controls (m,), and derivatives (m,12,24) by four controls of the state at times.
+
+        The rows: turn of the camera in its own axes, position in the map, body rate (rad/s),
+        velocity in the map (m/s).
+        """
+        first, u = self.layout.locate(times)
+        vectors, inverses = self.steps()
+        out = np.zeros((len(first), 12, LOCAL))
+        jacobians(
+            self.rotations, self.positions, vectors, inverses, first, u, self.layout.spacing, out
+        )
+        return first, out

@@ -1,0 +1,95 @@
+"""The cumulative B-spline: laws of its values and derivatives, against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.trajectory.spline import Layout, Spline
+
+H = 1e-6
+
+
+def random_spline(rng: np.random.Generator, turn: float, count: int = 9) -> Spline:
+    rotations = np.empty((count, 3, 3))
+    rotations[0] = so3.exp(rng.normal(size=3))
+    for k in range(1, count):
+        rotations[k] = rotations[k - 1] @ so3.exp(turn * rng.normal(size=3))
+    layout = Layout.over(np.array([[1.0, 1.0 + 0.05 * (count - 3)]]), 0.05)
+    assert layout.count == count
+    return Spline(layout, rotations, rng.normal(size=(count, 3)))
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-6, 0.2, 1.0])
+def test_rates_are_derivatives_of_the_pose(turn: float) -> None:
+    rng = np.random.default_rng(1)
+    spline = random_spline(rng, turn)
+    t = rng.uniform(1.01, 1.28, 20)
+    before, now, after = (spline.states(t + d) for d in (-H, 0.0, H))
+    turned = np.array([
+        so3.log(np.ascontiguousarray(a.T @ b))
+        for a, b in zip(before.rotations, after.rotations, strict=True)
+    ])  # fmt: skip
+    np.testing.assert_allclose(now.angular, turned / (2 * H), atol=1e-6 + 1e-6 * turn)
+    np.testing.assert_allclose(
+        now.linear, (after.positions - before.positions) / (2 * H), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        now.angular_acceleration, (after.angular - before.angular) / (2 * H), atol=1e-4, rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        now.linear_acceleration, (after.linear - before.linear) / (2 * H), atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-6, 0.2, 1.0])
+def test_jacobians_are_finite_differences(turn: float) -> None:
+    rng = np.random.default_rng(2)
+    spline = random_spline(rng, turn)
+    t = np.array([1.0, 1.013, 1.05, 1.171, 1.3])
+    first, analytic = spline.jacobians(t)
+    for k in range(6 * len(spline.positions)):
+        step = np.zeros(6 * len(spline.positions))
+        step[k] = H
+        plus, minus = spline.moved(step).states(t), spline.moved(-step).states(t)
+        numeric = np.column_stack([
+            [so3.log(np.ascontiguousarray(a.T @ b))
+             for a, b in zip(minus.rotations, plus.rotations, strict=True)],
+            plus.positions - minus.positions,
+            plus.angular - minus.angular,
+            plus.linear - minus.linear,
+        ]) / (2 * H)  # fmt: skip
+        for m in range(len(t)):
+            local = k - 6 * first[m]
+            expected = analytic[m, :, local] if 0 <= local < 24 else np.zeros(12)
+            np.testing.assert_allclose(numeric[m], expected, atol=2e-6, rtol=1e-6)
+
+
+def test_a_constant_turn_and_a_straight_line_are_kept() -> None:
+    rate, velocity = np.array([0.3, -2.0, 1.0]), np.array([1.0, 0.2, -0.5])
+    layout = Layout.over(np.array([[0.0, 1.0]]), 0.05)
+    times = layout.control_times()
+    spline = Spline(layout, so3.exp_many(times[:, None] * rate), times[:, None] * velocity)
+    t = np.linspace(0.0, 1.0, 7)
+    states = spline.states(t)
+    np.testing.assert_allclose(states.rotations, so3.exp_many(t[:, None] * rate), atol=1e-12)
+    np.testing.assert_allclose(states.positions, t[:, None] * velocity, atol=1e-12)
+    np.testing.assert_allclose(states.angular, np.tile(rate, (7, 1)), atol=1e-12)
+    np.testing.assert_allclose(states.angular_acceleration, 0.0, atol=1e-9)
+
+
+def test_pose_velocity_and_acceleration_are_continuous_at_the_knots() -> None:
+    spline = random_spline(np.random.default_rng(3), 0.3)
+    knots = 1.0 + 0.05 * np.arange(1, 6)
+    for before, after in zip(spline.states(knots - 1e-9), spline.states(knots + 1e-9), strict=True):
+        np.testing.assert_allclose(before, after, atol=1e-4)
+
+
+def test_stretches_do_not_share_controls() -> None:
+    layout = Layout.over(np.array([[0.0, 1.0], [2.0, 2.11]]), 0.05)
+    first, u = layout.locate(np.array([-1.0, 0.0, 0.999, 1.2, 1.9, 2.05, 5.0]))
+    assert np.all(first[:4] + 4 <= layout.firsts[1])
+    assert np.all(first[4:] >= layout.firsts[1])
+    assert np.all((u >= 0.0) & (u <= 1.0))
+    assert layout.inside(np.array([0.5, 1.5, 2.1])).tolist() == [True, False, True]
