@@ -35,7 +35,7 @@ from rs_localizer.io.transform_tree import TransformTree
 from rs_localizer.io.transforms import NotYetError, TransformError, Transforms
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
-from rs_localizer.moments import pose_at, twist_at
+from rs_localizer.moments import pose_at, twist_at, with_timing
 from rs_localizer.mounting import base_pose, base_twist, find_mounting
 from rs_localizer.oddities import oddities
 from rs_localizer.readout_watch import ReadoutWatch
@@ -377,13 +377,20 @@ class FrameLocalizer:
             if readout_time > 0.0:
                 tau -= self._config.stamp_offset / readout_time
         moving = readout_time > 0.0 and find_solver(self._config.solver).rolling_shutter
+        pose = pose_at(estimate, tau)
+        twist = twist_at(estimate, tau, readout_time) if moving else None
+        deviation = self._config.readout_time_deviation
+        if twist is not None and deviation > 0.0:
+            # The middle row comes later where the readout takes longer; the first one does not.
+            delay = deviation * first_row_time if tau == 0.0 else 0.0
+            pose, twist = with_timing(pose, twist, deviation / readout_time, delay)
         return Frame(
             input_stamp_ns=cloud.stamp_ns,
             stamp_ns=stamp_ns,
             map_frame=cloud.frame,
             body_frame=body_frame,
-            pose=pose_at(estimate, tau),
-            twist=twist_at(estimate, tau, readout_time) if moving else None,
+            pose=pose,
+            twist=twist,
             inliers=select_inliers(cloud.table, estimate.inliers, estimate.residuals),
             dropped=cloud.dropped,
             estimate=estimate,

@@ -24,6 +24,8 @@ behind the motion in the estimate's covariance, and its turn and rate are linear
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rs_localizer.core import so3
@@ -90,6 +92,22 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
         linear=linear / readout_time,
         angular=angular / readout_time,
         covariance=_propagate(jacobian / readout_time, estimate.joint_covariance),
+    )
+
+
+def with_timing(pose: Pose, twist: Twist, deviation: float, delay: float) -> tuple[Pose, Twist]:
+    """The covariances with what is not known of the readout time.
+
+    Args:
+        pose, twist: of the camera at one moment.
+        deviation: of the readout time, as a part of it: velocities are inverse to it.
+        delay: s by which the moment itself is uncertain.
+    """
+    velocity = np.concatenate([twist.linear, twist.angular])
+    in_map = np.concatenate([pose.rotation @ twist.linear, pose.rotation @ twist.angular])
+    return (
+        replace(pose, covariance=pose.covariance + delay**2 * np.outer(in_map, in_map)),
+        replace(twist, covariance=twist.covariance + deviation**2 * np.outer(velocity, velocity)),
     )
 
 

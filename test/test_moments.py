@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.types import Estimate
-from rs_localizer.moments import pose_at, twist_at
+from rs_localizer.moments import pose_at, twist_at, with_timing
 
 READOUT_TIME = 0.03
 TAUS = [-0.5, 0.0, 0.3, -7.0]
@@ -205,3 +205,27 @@ def test_covariances_are_symmetric(tau: float) -> None:
     ):
         assert np.array_equal(covariance, covariance.T)
         assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
+
+
+def test_an_uncertain_readout_time_enters_both_covariances():
+    motion = estimate(0.5, acceleration=0.1)
+    deviation = 0.001
+    pose, twist = pose_at(motion, 0.0), twist_at(motion, 0.0, READOUT_TIME)
+    later = twist_at(motion, 0.0, READOUT_TIME + 1e-7)
+    by_time = np.concatenate([later.linear - twist.linear, later.angular - twist.angular]) / 1e-7
+    doubted_pose, doubted_twist = with_timing(
+        pose, twist, deviation / READOUT_TIME, 0.5 * deviation
+    )
+    np.testing.assert_allclose(
+        doubted_twist.covariance - twist.covariance,
+        deviation**2 * np.outer(by_time, by_time), rtol=1e-4, atol=1e-12,
+    )  # fmt: skip
+    # The middle row comes half of the doubt later: the camera has moved on by then.
+    soon = 1e-5  # readouts
+    ahead = pose_at(motion, soon)
+    turn = Rotation.from_matrix(ahead.rotation @ pose.rotation.T).as_rotvec()
+    way = np.concatenate([ahead.position - pose.position, turn]) / (soon * READOUT_TIME)
+    np.testing.assert_allclose(
+        doubted_pose.covariance - pose.covariance,
+        (0.5 * deviation) ** 2 * np.outer(way, way), rtol=1e-3, atol=1e-9,
+    )  # fmt: skip
