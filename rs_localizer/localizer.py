@@ -12,7 +12,7 @@ from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.acceptance import refusal
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.inputs import checked, distinct, median_point
+from rs_localizer.core.inputs import checked, distinct, median_point, near_image, unfit
 from rs_localizer.core.observations import Observations
 from rs_localizer.core.posterior import Posterior
 from rs_localizer.core.prior import (
@@ -119,13 +119,11 @@ class Localizer:
         centre = median_point(points, seen)
         with np.errstate(over="ignore"):
             within = np.abs(points - centre).max(axis=1, initial=0.0) < _FARTHEST_POINT
-        usable = distinct(points, pixels, np.flatnonzero(seen & within))
-        if len(usable) < self.config.min_inliers:
-            return Failure(
-                Reason.TOO_FEW_POINTS,
-                f"{len(usable)} usable points of {len(points)}, "
-                f"{self.config.min_inliers} are needed",
-            )
+        shown = near_image(self.camera, pixels)
+        usable = distinct(points, pixels, np.flatnonzero(seen & within & shown))
+        failure = unfit(self.camera, pixels, usable, shown, self.config.min_inliers)
+        if failure is not None:
+            return failure
         frame = self._frame(points, pixels, rays, by_ray, usable, centre, scores, prior)
         if prior is not None and prior.motion is not None:
             tracked = self._track(frame, prior, expected_share)

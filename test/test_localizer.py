@@ -343,3 +343,27 @@ def test_copies_of_points_are_no_further_evidence(distinct):
     if once and copied:
         np.testing.assert_allclose(copied.covariance, once.covariance, rtol=1e-9)
         assert np.array_equal(copied.inliers[::10], once.inliers)
+
+
+def test_normalized_coordinates_are_not_taken_for_pixels():
+    rng = np.random.default_rng(0)
+    camera = rsl.Camera(width=640, height=480, K=np.diag([500.0, 500.0, 1.0]))
+    points = rng.uniform((-1.0, -1.0, 3.0), (1.0, 1.0, 5.0), (200, 3))
+    failure = rsl.Localizer(camera).localize(points, points[:, :2] / points[:, 2:])
+    assert not failure
+    assert failure.reason == rsl.Reason.DEGENERATE
+    assert "normalized coordinates" in failure.detail
+
+
+def test_pixels_outside_the_image_are_not_used():
+    rng = np.random.default_rng(0)
+    K = np.array([[500.0, 0.0, 479.5], [0.0, 500.0, 639.5], [0.0, 0.0, 1.0]])
+    points = rng.uniform((-1.0, -1.0, 1.5), (1.0, 1.0, 3.5), (200, 3))
+    upright = points @ K.T
+    pixels = upright[:, :2] / upright[:, 2:]
+    far = pixels[(pixels[:, 1] > 800.0)]  # of an image of 960 x 1280 called 1280 x 960
+    assert len(far) > 20
+    turned = rsl.Camera(width=1280, height=600, K=K)
+    failure = rsl.Localizer(turned).localize(points[pixels[:, 1] > 800.0], far)
+    assert failure.reason == rsl.Reason.TOO_FEW_POINTS
+    assert f"{len(far)} lie outside the image of 1280 x 600 pixels" in failure.detail

@@ -84,12 +84,14 @@ def _quality(frames: Sequence[Frame], config: NodeConfig) -> list[tuple[str, str
         return []
     estimates = [frame.estimate for frame in frames]
     residual = np.median([estimate.residual_rms for estimate in estimates])
+    model_error = np.median([estimate.model_error for estimate in estimates])
     inliers = np.median([np.count_nonzero(estimate.inliers) for estimate in estimates])
     still = np.median([estimate.global_shutter_inliers for estimate in estimates])
     points = np.median([len(estimate.inliers) for estimate in estimates])
     tracked = np.mean([estimate.tracked for estimate in estimates])
     rows = [
         ("residual of the inliers (px rms, median)", f"{residual:.3f}"),
+        ("error of map and lens (px rms, median)", f"{model_error:.3f}"),
         ("points of a frame (median)", f"{points:.0f}"),
     ]
     if find_solver(config.solver).rolling_shutter:

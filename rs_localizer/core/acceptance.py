@@ -18,7 +18,8 @@ _MOST_TURN = 1.5
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 # Errors that neighbouring rows share although the motion follows vibration, in standard deviations.
 _MOST_AGREEMENT = 3.0
-_NOISE_FREE = 0.01  # px; less is rounding errors
+# Less than this, in inlier thresholds, makes the covariance larger and refuses nothing.
+_LEAST_MODEL_ERROR = 0.05
 # Errors of map and lens, root mean square, in inlier thresholds.
 _MOST_MODEL_ERROR = 0.4
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
@@ -73,7 +74,8 @@ def refusal(
             f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
             "too small for the noise",
         )
-    if rolling and posterior.agreement > _MOST_AGREEMENT and posterior.noise > _NOISE_FREE:
+    shared = rolling and posterior.agreement > _MOST_AGREEMENT
+    if shared and posterior.noise > _LEAST_MODEL_ERROR * threshold:
         return Failure(
             Reason.MODEL_ERROR,
             f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "

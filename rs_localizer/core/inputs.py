@@ -8,6 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.types import Failure, Reason
+
+# Pixels may lie outside the image by this part of it: noise, and features at its border.
+_MARGIN = 0.05
+# Points that lie closer together than this (px) show no perspective.
+_LEAST_EXTENT = 5.0
 
 
 def checked(
@@ -58,3 +65,40 @@ def distinct(points: Array, pixels: Array, chosen: IntArray) -> IntArray:
     pairs = np.hstack([points[chosen], pixels[chosen]])
     first = np.unique(pairs, axis=0, return_index=True)[1]
     return chosen[np.sort(first)]
+
+
+def near_image(camera: Camera, pixels: Array) -> BoolArray:
+    """Which pixels (n,2) lie in the image, or as far outside as noise may have put them."""
+    size = np.array(camera.size)
+    margin = _MARGIN * size
+    near: BoolArray = np.all((pixels > -margin) & (pixels < size + margin), axis=1)
+    return near
+
+
+def unfit(
+    camera: Camera, pixels: Array, usable: IntArray, shown: BoolArray, needed: int
+) -> Failure | None:
+    """Why points cannot carry a pose whatever the motion, or None.
+
+    Args:
+        pixels: (n,2) of all points.
+        usable: indices of those that can be used.
+        shown: (n,) which lie in the image.
+        needed: fewest points of a pose.
+    """
+    if len(usable) < needed:
+        outside = int(np.count_nonzero(~shown))
+        width, height = camera.size
+        hint = f"; {outside} lie outside the image of {width} x {height} pixels" if outside else ""
+        return Failure(
+            Reason.TOO_FEW_POINTS,
+            f"{len(usable)} usable points of {len(pixels)}, {needed} are needed{hint}",
+        )
+    extent = float(np.ptp(pixels[usable], axis=0).max())
+    if extent < _LEAST_EXTENT:
+        return Failure(
+            Reason.DEGENERATE,
+            f"all {len(usable)} points lie within {extent:.2g} pixels; are these normalized "
+            "coordinates? Pixels of the raw image are needed",
+        )
+    return None

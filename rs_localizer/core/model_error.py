@@ -31,6 +31,10 @@ _FIELD_TERMS = (_FIELD_DEGREE + 1) * (_FIELD_DEGREE + 2) // 2
 # Size of each degree: fields of lenses and maps are smooth, and no lens and no paper shears an
 # image.
 _FIELD_DEGREE_SIZES = (1.0, 0.2, 0.5, 0.25)
+# Probability of no field above which none is looked for among neighbours.
+_NO_FIELD = 0.5
+# Points nearer than this part of the image that the points fill are neighbours in it.
+_FAR_APART = 0.15
 # Correlations below so many standard deviations are chance.
 _CHANCE = 1.5
 _MOST_SHARED = 0.9
@@ -460,22 +464,37 @@ def with_model_error(
 
 
 @kernel
-def neighbours_agree(errors: Array, tau: Array, inliers: BoolArray) -> float:
-    """How much the errors of points in neighbouring rows agree: standard normal if they do not."""
+def neighbours_agree(errors: Array, tau: Array, rays: Array, inliers: BoolArray) -> float:
+    """How much the errors of points in neighbouring rows agree: standard normal if they do not.
+
+    Neighbours in the image do not count: corners of one marker share errors whatever the camera
+    does.
+    """
     order = np.argsort(tau)
-    agreement, squared, count = 0.0, 0.0, 0
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    squared, count = 0.0, 0
+    for i in order:
+        if inliers[i]:
+            squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
+            count += 1
+            for k in range(2):
+                low[k], high[k] = min(low[k], rays[i, k]), max(high[k], rays[i, k])
+    if count < 2 or not squared > 0.0:
+        return 0.0
+    far = _FAR_APART * max(high[0] - low[0], high[1] - low[1])
+    agreement, pairs = 0.0, 0
     previous = -1
     for i in order:
         if not inliers[i]:
             continue
         if previous >= 0:
-            agreement += errors[previous, 0] * errors[i, 0] + errors[previous, 1] * errors[i, 1]
-        squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
-        count += 1
+            x, y = rays[i, 0] - rays[previous, 0], rays[i, 1] - rays[previous, 1]
+            if x * x + y * y > far * far:
+                pairs += 1
+                agreement += errors[previous, 0] * errors[i, 0] + errors[previous, 1] * errors[i, 1]
         previous = i
-    if count < 2 or not squared > 0.0:
-        return 0.0
-    normalized: float = agreement / (squared / np.sqrt(2.0 * count))
+    # Each of the two products of a pair has the square of the mean square as its variance.
+    normalized: float = agreement / (0.5 * squared / count * np.sqrt(2.0 * max(pairs, 1)))
     return normalized
 
 
@@ -544,7 +563,8 @@ def examine(
         columns, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
     )  # fmt: skip
     step, covariance = with_model_error(columns, sizes.noise, sizes.shake, sizes.field)
-    agreement = neighbours_agree(errors, measured_tau, inliers)
-    shared = shared_errors(errors, rays, inliers)
+    agreement = neighbours_agree(errors, measured_tau, rays, inliers)
+    # Where no field is seen, nor is what neighbours share; and most frames have none.
+    shared = shared_errors(errors, rays, inliers) if sizes.no_field < _NO_FIELD else 0.0
     determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
     return Examined(step, covariance, sizes, agreement, shared, determined)

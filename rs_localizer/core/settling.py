@@ -30,9 +30,11 @@ from rs_localizer.core.state import PARAMETERS, VELOCITIES
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
-# Odds by which motion must explain the points better than rest, to count in the estimate: what
-# explains little is often a slightly wrong map or lens. The covariance allows for it at even odds.
-_ODDS_AGAINST_MOTION = 1e9
+# Odds by which motion must explain the points better than rest, to count in the estimate. Where a
+# map or a lens is seen to be wrong, what looks like motion mostly is more of that, and the odds
+# grow by the second factor. The covariance allows for motion at even odds.
+_ODDS_AGAINST_MOTION = 100.0
+_DISTRUST = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
@@ -57,6 +59,7 @@ _NEAREST = 1e-6
 _FAR_LESS_PROBABLE = 7.0
 # A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
 _CLEARLY_WORSE = 9.2
+_MOST_SHARED = 0.9  # correlation of neighbours
 # The covariance speaks for poses within so many standard deviations of the orientation.
 _COVERED = 4.0
 
@@ -114,6 +117,7 @@ class _Frame:
         self.freedom = max(2.0 * count - 6.0, 1.0)
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
+        self.odds = math.log(_ODDS_AGAINST_MOTION)  # logarithm
         self.shake_prior = _more_probable(_SHAKE_PRIOR, assumed.of_shake_sizes)
         self.field_prior = _more_probable(_FIELD_PRIOR, assumed.of_field_sizes)
 
@@ -191,7 +195,8 @@ def settle(
         shaken = _followed(frame, best, sizes, threshold)
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
             return shaken
-    frame.worth = (1.0 - examined.shared) / (1.0 + examined.shared)
+    frame.worth = _worth(examined.shared)
+    frame.odds += (1.0 - sizes.no_field) * math.log(_DISTRUST)
     found = replace(
         best,
         state=apply_step(best.state, examined.step[:PARAMETERS]),
@@ -215,7 +220,7 @@ def _rather_rests(frame: _Frame, best: Posterior, examined: Examined) -> bool:
     still = np.concatenate([best.state[:12], np.zeros(12)])
     rest = frame.mode(still, held_beside(frame.terms), 0.0)
     moving = examined.sizes.evidence + _volume(frame.terms, examined)
-    return rest.evidence + math.log(_ODDS_AGAINST_MOTION) > moving
+    return rest.evidence + frame.odds > moving
 
 
 def _volume(terms: PriorTerms, examined: Examined) -> float:
@@ -235,10 +240,12 @@ def _followed(
     )  # fmt: skip
     if shaken is None:
         return None
+    correlation = max(shaken.agreement, 0.0) / math.sqrt(2.0 * max(shaken.inliers.sum(), 1))
+    worth = _worth(min(correlation, _MOST_SHARED))
     return replace(
         best,
         state=shaken.state,
-        covariance=best.inflation * shaken.covariance,
+        covariance=best.inflation / worth * shaken.covariance,
         noise=shaken.noise,
         squared_errors=shaken.squared_errors,
         inliers=shaken.inliers,
@@ -267,7 +274,7 @@ def _weighed(frame: _Frame, found: Posterior, planar: bool) -> Posterior:
     evidence = np.array([mode.evidence for mode in modes])
     at_rest = np.array([mode.speed == 0.0 for mode in modes])
     possible = _normalized(evidence - _GENEROSITY * np.array([mode.volume for mode in modes]))
-    counting = _normalized(evidence + math.log(_ODDS_AGAINST_MOTION) * at_rest)
+    counting = _normalized(evidence + frame.odds * at_rest)
     best = int(np.argmax(counting))
     steps = np.array([step_between(modes[best].state, mode.state) for mode in modes])
     mean = counting @ steps
@@ -314,6 +321,11 @@ def _modes(frame: _Frame, found: Posterior, planar: bool) -> list[_Mode]:
         ):
             break  # what moves faster explains even less
     return modes
+
+
+def _worth(correlation: float) -> float:
+    """What a point is worth whose error is correlated with its neighbour's (first order)."""
+    return (1.0 - correlation) / (1.0 + correlation)
 
 
 def _more_probable(prior: Array, odds: Array) -> Array:

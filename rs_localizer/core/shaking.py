@@ -150,7 +150,7 @@ def _fit(
     gate = np.sqrt(squared[inliers].max(initial=0.0))
     near = squared < (_NEAR * gate) ** 2
     clipped = errors * np.minimum(1.0, gate / np.sqrt(np.maximum(squared, 1e-300)))[:, None]
-    agreement = neighbours_agree(clipped, observations.tau, near)
+    agreement = neighbours_agree(clipped, observations.tau, observations.rays, near)
     return Shaken(state, coefficients, covariance, noise, agreement, squared, inliers)
 
 

@@ -176,6 +176,7 @@ def _values(condition: Condition, summary: Summary) -> dict[str, str]:
             "Inliers with rolling shutter": str(summary.last.inliers),
             "Inliers with global shutter": str(summary.last.global_shutter_inliers),
             "Residual RMS (px)": f"{summary.last.residual:.3f}",
+            "Model error (px)": f"{summary.last.model_error:.3f}",
             "Iterations": str(summary.last.iterations),
         }
     if condition.readout is not None:

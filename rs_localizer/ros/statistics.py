@@ -36,6 +36,7 @@ class Answer:
     inliers: int
     global_shutter_inliers: int  # what a pose without motion would have explained
     residual: float  # px, root mean square of the inliers
+    model_error: float  # px, root mean square of what map, lens and motion leave beside the noise
     iterations: int
     tracked: bool
 
@@ -136,6 +137,7 @@ class Statistics:
             inliers=len(residuals),
             global_shutter_inliers=estimate.global_shutter_inliers,
             residual=float(np.sqrt(residuals @ residuals / max(len(residuals), 1))),
+            model_error=estimate.model_error,
             iterations=estimate.iterations,
             tracked=estimate.tracked,
         )

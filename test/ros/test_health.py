@@ -31,6 +31,7 @@ def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
         residuals=np.array([3.0, 4.0, 100.0, 0.0]),
         global_shutter_inliers=2,
         iterations=64,
+        model_error=0.0,
         tracked=tracked,
     )
     return SimpleNamespace(input_stamp_ns=round(stamp * 1e9), estimate=estimate)
@@ -89,6 +90,7 @@ def test_numbers_of_a_working_node(world: World) -> None:
         "Inliers with rolling shutter": "3",
         "Inliers with global shutter": "2",
         "Residual RMS (px)": f"{np.sqrt(25.0 / 3.0):.3f}",
+        "Model error (px)": "0.000",
         "Iterations": "64",
         "Frames received": "100",
         "Poses published": "100",
