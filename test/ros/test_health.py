@@ -31,6 +31,7 @@ def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
         residuals=np.array([3.0, 4.0, 100.0, 0.0]),
         global_shutter_inliers=2,
         iterations=64,
+        model_error=0.0,
         tracked=tracked,
     )
     return SimpleNamespace(input_stamp_ns=round(stamp * 1e9), estimate=estimate)
