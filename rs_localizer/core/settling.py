@@ -196,7 +196,9 @@ def settle(
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
             return shaken
     frame.worth = _worth(examined.shared)
-    frame.odds += (1.0 - sizes.no_field) * math.log(_DISTRUST)
+    # What the frame says of it: where it says nothing, the probability is the one assumed.
+    seen = max(1.0 - sizes.no_field / _FIELD_PRIOR[0], 0.0)
+    frame.odds += seen * math.log(_DISTRUST)
     found = replace(
         best,
         state=apply_step(best.state, examined.step[:PARAMETERS]),
