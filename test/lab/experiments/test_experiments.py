@@ -61,7 +61,6 @@ HELD = {
     "planes.tilted",
     "tracking.few",
     "tracking.wall",
-    "tracking.rich",
     "tracking.one_start",
     "tracking.gap",
     "robustness.uniform_70",
@@ -94,6 +93,9 @@ NOT_HELD = {
     "augmented-reality.r9p_published",
 }
 OPEN = {
+    # Where the camera hardly moves, a single frame is taken for one at rest, whose velocity is zero:
+    # a tracked one knows better that it is not, and errs by what it does not know.
+    "tracking.rich",
     *(f"honesty.{case}_pose" for case in ("rest", "hand", "drone", "stop", "rendered")),
     *(f"honesty.{case}_twist" for case in ("rest", "hand", "drone", "stop", "rendered")),
     "honesty.five_sigma",
