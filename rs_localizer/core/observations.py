@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.residuals import pack, row_paces, squared_errors
+from rs_localizer.core.residuals import pack, row_paces, squared_errors, thin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +28,15 @@ class Observations:
         """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2)."""
         packed = pack(points, rays, tau, by_ray)
         return cls(points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed)
+
+    def thinned(self, every: int) -> Observations:
+        """Every so many points."""
+        chosen = np.arange(0, len(self), every)
+        packed = thin(self.packed, chosen)
+        return Observations(
+            self.points[chosen], self.rays[chosen], self.tau[chosen], self.row_range,
+            self.row_time_gradient, packed,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.points)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.jit import kernel
 from rs_localizer.core.simd import LANES, Lanes, Vector, traced, traced_sums
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
@@ -123,6 +123,22 @@ def pack(points: Array, rays: Array, tau: Array, by_ray: Array) -> Array:
                 row[(6 + k) * LANES + lane] = by_ray[i, k // 2, k % 2]
             row[10 * LANES + lane] = 1.0 if block * LANES + lane < count else 0.0
     return data
+
+
+@kernel
+def thin(data: Array, chosen: IntArray) -> Array:
+    """Only the chosen ones of the packed points, packed anew."""
+    count = len(chosen)
+    blocks = (count + LANES - 1) // LANES
+    thinned = np.empty((blocks, POINT_SIZE * LANES))
+    for place in range(blocks * LANES):
+        i = chosen[min(place, count - 1)]
+        for k in range(POINT_SIZE):
+            value = data[i // LANES, k * LANES + i % LANES]
+            if k == POINT_SIZE - 1 and place >= count:
+                value = 0.0
+            thinned[place // LANES, k * LANES + place % LANES] = value
+    return thinned
 
 
 @kernel

@@ -53,6 +53,8 @@ _FIELD_SIZES = 10.0 ** np.arange(0.0, 2.1, 0.5)
 # Lenses and maps are never better than this, px: a hundredth; whose errors are a pixel, are rare.
 _LEAST_FIELD = 0.01
 _FIELD_PRIOR = np.array([0.5, 0.25, 0.2, 0.048, 0.002])
+# More points than this only take time.
+_MOST_POINTS = 2500
 # Points nearer than this (m) would make any map useless.
 _NEAREST = 1e-6
 # Logarithm of the odds of a typical speed beside a better one, beyond which none is tried.
@@ -162,12 +164,30 @@ def settle(
 ) -> Posterior:
     """What the points leave possible, near a first motion.
 
+    Of very many points a part is enough, evenly taken.
+
     Args:
         start: state (24,).
         terms: what is known of the motion beside the points.
         threshold: px, of inliers.
         assumed: of the camera.
     """
+    every = -(-len(observations) // _MOST_POINTS)
+    if every <= 1:
+        return _settled(observations, start, terms, threshold, assumed)
+    found = _settled(observations.thinned(every), start, terms, threshold, assumed)
+    gate = np.sqrt(found.squared_errors[found.inliers].max(initial=0.0))
+    errors = observations.squared_errors(found.state)
+    return replace(found, squared_errors=errors, inliers=errors <= gate**2)
+
+
+def _settled(
+    observations: Observations,
+    start: Array,
+    terms: PriorTerms,
+    threshold: float,
+    assumed: Assumed,
+) -> Posterior:
     best = maximum_a_posteriori(observations, start, terms, threshold)
     if not best.determined:
         return best

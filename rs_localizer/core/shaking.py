@@ -147,9 +147,10 @@ def _fit(
     errors[behind] = 1e150
     squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
     # Points beyond the gate count, too: where rows swing out of it, they do so together.
-    gate = np.sqrt(squared[inliers].max(initial=0.0))
+    gate = np.sqrt(squared[inliers & ~behind].max(initial=0.0))
     near = squared < (_NEAR * gate) ** 2
-    clipped = errors * np.minimum(1.0, gate / np.sqrt(np.maximum(squared, 1e-300)))[:, None]
+    lengths = np.sqrt(np.where(near, np.maximum(squared, 1e-300), 1.0))
+    clipped = errors * np.minimum(1.0, gate / lengths)[:, None]
     agreement = neighbours_agree(clipped, observations.tau, observations.rays, near)
     return Shaken(state, coefficients, covariance, noise, agreement, squared, inliers)
 
