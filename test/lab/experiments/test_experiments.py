@@ -93,8 +93,8 @@ NOT_HELD = {
     "augmented-reality.r9p_published",
 }
 OPEN = {
-    # Where the camera hardly moves, a single frame is taken for one at rest, whose velocity is zero:
-    # a tracked one knows better that it is not, and errs by what it does not know.
+    # Where the camera hardly moves, a single frame is taken for one at rest, with no velocity; a
+    # tracked one knows better that it is not, and errs by what it does not know.
     "tracking.rich",
     *(f"honesty.{case}_pose" for case in ("rest", "hand", "drone", "stop", "rendered")),
     *(f"honesty.{case}_twist" for case in ("rest", "hand", "drone", "stop", "rendered")),
