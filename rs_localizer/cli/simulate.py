@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.arguments import integer, number
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.simulated_camera import (
     add_camera_arguments,
@@ -21,11 +20,14 @@ from rs_localizer.cli.simulated_camera import (
 )
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import STORAGES, BagWriter
-from rs_localizer.io.map_files import write_map_file
+from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.whole import whole
-from rs_localizer.lab.image_sequence import FORMATS, Encoding, rendered_frames
-from rs_localizer.lab.landmarks import described, keypoint_rows
-from rs_localizer.lab.recording import (
+from rs_localizer.lab.rendering.image_sequence import FORMATS, Encoding, rendered_frames
+from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
+from rs_localizer.lab.rendering.walls import SCENES
+from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.landmarks import described, keypoint_rows
+from rs_localizer.lab.simulation.recording import (
     MAP,
     MAP_FRAME,
     MARKER_MAP,
@@ -34,12 +36,10 @@ from rs_localizer.lab.recording import (
     write_rendered,
     write_simulated,
 )
-from rs_localizer.lab.rendering import ImageSettings, Renderer
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import FrameSettings, simulate_frames
-from rs_localizer.lab.true_motion import TrueMotion, sampled_way
-from rs_localizer.lab.walls import SCENES
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import TrueMotion, sampled_way
 from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.process.arguments import integer, number
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")

@@ -18,8 +18,8 @@ from rclpy.context import Context
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.lab.recording import PARAMETERS, write_parameters
-from rs_localizer.ros.feed import Feed
+from rs_localizer.lab.simulation.recording import PARAMETERS, write_parameters
+from rs_localizer.ros.localizer.feed import Feed
 from rs_localizer.settings import NODE_NAME, build, load_params_file, settings
 
 ROOT = Path(__file__).parents[2]
