@@ -24,7 +24,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "io": {"core"},
     "settings": {"config", "io"},
     "readout": {"data"},
-    "matching": {"core", "io"},
+    "matching": {"core", "config", "estimation", "io"},
     "markers": {"core", "io"},
     "pipeline": {*METHOD, "io", "markers", "matching", "trajectory"},
     "offline": {*METHOD, "io", "markers", "matching", "trajectory", "pipeline", "settings"},

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from rs_localizer import data
 from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.recording import write_frame
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.io.video import Image
 from rs_localizer.lab.experiments.cube_clip import (
@@ -22,7 +23,7 @@ from rs_localizer.lab.experiments.cube_clip import (
 )
 from rs_localizer.lab.experiments.marker_frames import CAMERA, MarkerWalls
 from rs_localizer.lab.measures.comparison import Recording, Result
-from rs_localizer.lab.simulation.recording import write_frame, write_truth
+from rs_localizer.lab.simulation.recording import write_truth
 
 CUBE = "cube.gif"
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
+from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
 from rs_localizer.lab.measures.alignment import aligned
 from rs_localizer.lab.measures.metrics import (
@@ -26,7 +27,6 @@ from rs_localizer.lab.measures.time_offset import (
     interpolated_twists,
     shifted,
 )
-from rs_localizer.lab.simulation.recording import CORRESPONDENCES_TOPIC
 from rs_localizer.process.arguments import number
 
 _AUTO = "auto"

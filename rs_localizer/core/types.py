@@ -10,9 +10,9 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.shake import shake_at
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS
-from rs_localizer.estimation.model_error import shake_at
 
 
 class Reason(StrEnum):

@@ -11,20 +11,17 @@ is averaged.
 
 from __future__ import annotations
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.shake import FIRST_DEGREE, legendre, shake_basis
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.residuals import linearized
 
-# Polynomials of the row time, from the second degree: the motion has a constant and a linear part.
-_FIRST_DEGREE = 2
-_WHOLE_SIZE = 3.0  # the degree that counts as it is
 # Coefficients of the field: polynomials of the image up to the third degree, in two directions.
 _FIELD_DEGREE = 3
 _FIELD_TERMS = (_FIELD_DEGREE + 1) * (_FIELD_DEGREE + 2) // 2
@@ -43,71 +40,6 @@ _LEAST_VARIANCE = 1e-8
 # Where neither shaking nor field explains more than this (logarithm of the likelihood), there is
 # nothing that both could explain.
 _NOTHING_TO_SHARE = 1.0
-
-
-@kernel
-def _legendre(x: float, values: Array) -> None:
-    """Fill in the Legendre polynomials of degree 0, 1, ... at x."""
-    values[0] = 1.0
-    values[1] = x
-    for k in range(2, len(values)):
-        values[k] = ((2 * k - 1) * x * values[k - 1] - (k - 1) * values[k - 2]) / k
-
-
-@kernel
-def shake_basis(tau: float, degrees: int, values: Array, rates: Array) -> None:
-    """Fill in the polynomials of the shaking at a row time, and their rates.
-
-    Legendre polynomials of ``2 tau`` of degree 2 to ``degrees``, less their value and slope at the
-    middle row: there, pose and velocities are the motion's own. They are the smaller the faster
-    they change, because what is slow swings farther.
-    """
-    at, middle = np.empty(degrees + 1), np.empty(degrees + 1)
-    _legendre(2.0 * tau, at)
-    _legendre(0.0, middle)
-    slope = np.empty(degrees + 1)
-    slope_at = np.empty(degrees + 1)
-    slope[0], slope[1], slope_at[0], slope_at[1] = 0.0, 1.0, 0.0, 1.0
-    for k in range(2, degrees + 1):
-        slope[k] = k * middle[k - 1]
-        slope_at[k] = k * at[k - 1] + 2.0 * tau * slope_at[k - 1]
-        size = (_WHOLE_SIZE / k) ** 2
-        values[k - _FIRST_DEGREE] = size * (at[k] - middle[k] - 2.0 * slope[k] * tau)
-        rates[k - _FIRST_DEGREE] = size * 2.0 * (slope_at[k] - slope[k])
-
-
-@kernel
-def shake_at(tau: Array, coefficients: Array) -> Array:
-    """Turn of the camera beside its motion, and its rate, (n,6) at row times (n,)."""
-    count = len(coefficients)
-    values, rates = np.empty(count), np.empty(count)
-    shake = np.zeros((len(tau), 6))
-    if count == 0:
-        return shake
-    for i in range(len(tau)):
-        shake_basis(tau[i], count + _FIRST_DEGREE - 1, values, rates)
-        for k in range(count):
-            for axis in range(3):
-                shake[i, axis] += values[k] * coefficients[k, axis]
-                shake[i, 3 + axis] += rates[k] * coefficients[k, axis]
-    return shake
-
-
-def basis_sizes(degrees: int) -> Array:
-    """Sizes (degrees - 1,) of the polynomials of :func:`shake_basis`."""
-    sizes: Array = (_WHOLE_SIZE / np.arange(_FIRST_DEGREE, degrees + 1)) ** 2
-    return sizes
-
-
-@cache
-def shake_in_the_middle(count: int) -> tuple[Array, Array]:
-    """Values and slopes (count,) at the middle row that :func:`shake_basis` takes away."""
-    degrees = np.arange(_FIRST_DEGREE, count + _FIRST_DEGREE)
-    polynomials = [np.polynomial.Legendre.basis(k) for k in degrees]
-    sizes = basis_sizes(count + _FIRST_DEGREE - 1)
-    values = sizes * np.array([p(0.0) for p in polynomials])
-    slopes = sizes * np.array([2.0 * p.deriv()(0.0) for p in polynomials])
-    return values, slopes
 
 
 class Columns(NamedTuple):
@@ -143,7 +75,7 @@ def columns_of(
         if inliers[i]:
             for k in range(2):
                 low[k], high[k] = min(low[k], rays[i, k]), max(high[k], rays[i, k])
-    polynomials = max(degrees - _FIRST_DEGREE + 1, 0)
+    polynomials = max(degrees - FIRST_DEGREE + 1, 0)
     shake = 3 * polynomials
     size = PARAMETERS + shake + (2 * _FIELD_TERMS if field else 0)
     products, with_errors, squared = np.zeros((size, size)), np.zeros(size), 0.0
@@ -156,8 +88,8 @@ def columns_of(
         if polynomials > 0:
             shake_basis(tau[i], degrees, values, rates)
         if field:
-            _legendre((2.0 * rays[i, 0] - low[0] - high[0]) / max(high[0] - low[0], 1e-12), x)
-            _legendre((2.0 * rays[i, 1] - low[1] - high[1]) / max(high[1] - low[1], 1e-12), y)
+            legendre((2.0 * rays[i, 0] - low[0] - high[0]) / max(high[0] - low[0], 1e-12), x)
+            legendre((2.0 * rays[i, 1] - low[1] - high[1]) / max(high[1] - low[1], 1e-12), y)
             _field_terms(x, y, terms)
         for line in range(2):
             for k in range(PARAMETERS):

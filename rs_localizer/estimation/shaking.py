@@ -15,8 +15,9 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.shake import basis_sizes, shake_at
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.model_error import basis_sizes, columns_of, neighbours_agree, shake_at
+from rs_localizer.estimation.model_error import columns_of, neighbours_agree
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, add_prior
@@ -43,7 +44,7 @@ class Shaken:
     """The motion and the shaking of a frame."""
 
     state: Array  # (24,)
-    coefficients: Array  # (k,3) rad, of :func:`rs_localizer.estimation.model_error.shake_basis`
+    coefficients: Array  # (k,3) rad, of :func:`rs_localizer.core.shake.shake_basis`
     covariance: Array  # (18 + 3 k, 18 + 3 k)
     noise: float  # px
     agreement: float  # of what is left, see :func:`neighbours_agree`

@@ -16,12 +16,8 @@ from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import MessageError
+from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, IMAGE_TOPIC
 from rs_localizer.io.whole import whole
-from rs_localizer.lab.simulation.recording import (
-    CAMERA_INFO_TOPIC,
-    CORRESPONDENCES_TOPIC,
-    IMAGE_TOPIC,
-)
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.displaced import LeaveOneOut, Predict
 from rs_localizer.markers.maps import MarkerMap

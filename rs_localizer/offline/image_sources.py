@@ -15,8 +15,8 @@ from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import make_header, stamp_ns
+from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.video import read_video
-from rs_localizer.lab.simulation.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
 from rs_localizer.pipeline.frames import Refusal
 from rs_localizer.pipeline.images import read

@@ -30,6 +30,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.shake import shake_basis
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,
@@ -40,7 +41,6 @@ from rs_localizer.core.state import (
     TURN,
 )
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.model_error import shake_basis
 from rs_localizer.io.outputs import Pose, Twist
 
 # Blocks of the published covariances.

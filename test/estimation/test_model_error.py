@@ -7,15 +7,13 @@ import pytest
 from numpy.polynomial import legendre
 from scipy.linalg import null_space
 
+from rs_localizer.core.shake import shake_at, shake_basis, shake_in_the_middle
 from rs_localizer.estimation.model_error import (
     columns_of,
     evidence_of_sizes,
     neighbours_agree,
     possible,
     project_out,
-    shake_at,
-    shake_basis,
-    shake_in_the_middle,
     sizes_of,
     with_model_error,
     with_prior,

@@ -14,9 +14,9 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message, open_bag
 from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.recording import make_camera_info
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
 from rs_localizer.offline.replay import find_topics, replay

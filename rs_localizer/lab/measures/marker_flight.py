@@ -28,17 +28,16 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.estimates import Motions, read_motions
-from rs_localizer.lab.experiments.marker_frames import visible
-from rs_localizer.lab.simulation.frames import middle_stamp
-from rs_localizer.lab.simulation.recording import (
+from rs_localizer.io.recording import (
     CAMERA_INFO_TOPIC,
     CORRESPONDENCES_TOPIC,
     MARKER_MAP,
     PARAMETERS,
     RAW_IMAGE_TOPIC,
-    TRUE_POSE_TOPIC,
-    TRUE_TWIST_TOPIC,
 )
+from rs_localizer.lab.experiments.marker_frames import visible
+from rs_localizer.lab.simulation.frames import middle_stamp
+from rs_localizer.lab.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import build, load_params_file
 

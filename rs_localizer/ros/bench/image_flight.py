@@ -37,7 +37,7 @@ from tqdm import tqdm
 
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.lab.simulation.recording import (
+from rs_localizer.io.recording import (
     CAMERA_INFO_TOPIC,
     CORRESPONDENCES_TOPIC,
     MARKER_MAP,

@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.lab.simulation.recording import make_camera_info
+from rs_localizer.io.recording import make_camera_info
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall

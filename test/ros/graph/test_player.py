@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
-from rs_localizer.lab.simulation.recording import make_camera_info, write_frame, write_image
+from rs_localizer.io.recording import make_camera_info, write_frame, write_image
 
 FRAMES = 8
 PERIOD_NS = 100_000_000

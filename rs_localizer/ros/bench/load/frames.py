@@ -13,13 +13,10 @@ from rclpy.serialization import serialize_message
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.recording import (
-    CAMERA_INFO_TOPIC,
-    CORRESPONDENCES_TOPIC,
-    write_simulated,
-)
+from rs_localizer.lab.simulation.recording import write_simulated
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
 from rs_localizer.ros.node.conversion import copy_message
