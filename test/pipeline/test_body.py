@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rs_localizer.frames
+import rs_localizer.pipeline.frames
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 

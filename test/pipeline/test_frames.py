@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rs_localizer.frames
+import rs_localizer.pipeline.frames
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
