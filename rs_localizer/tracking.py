@@ -222,9 +222,7 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         acceleration = self.localizer.config.acceleration
         motion, covariance, swing = unshaken(track.estimate)
-        motion, covariance = predict(
-            motion, covariance, dt / readout_time, _FADING / readout_time
-        )
+        motion, covariance = predict(motion, covariance, dt / readout_time, _FADING / readout_time)
         covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
         covariance += swing
         return Prior(

@@ -66,8 +66,6 @@ _MOST_SHARED = 0.9  # correlation of neighbours
 _COVERED = 4.0
 
 
-
-
 SHAKE_SIZES, FIELD_SIZES = len(_SHAKE_SIZES), len(_FIELD_SIZES)
 
 
@@ -251,9 +249,7 @@ def _volume(terms: PriorTerms, examined: Examined) -> float:
     return float(0.5 * (np.log(known[known > 0.0]).sum() - examined.determined))
 
 
-def _followed(
-    frame: _Frame, best: Posterior, sizes: Sizes, threshold: float
-) -> Posterior | None:
+def _followed(frame: _Frame, best: Posterior, sizes: Sizes, threshold: float) -> Posterior | None:
     """The posterior of a camera that shakes; None if it cannot be followed."""
     observations = frame.observations
     shaken = follow(
@@ -360,9 +356,7 @@ def _normalized(evidence: Array) -> Array:
     return normalized
 
 
-def _mirror(
-    modes: list[_Mode], evidence: Array, steps: Array, covariance: Array
-) -> Mirror | None:
+def _mirror(modes: list[_Mode], evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
     """The farthest pose that is not out of the question: neither unlikely nor of a bad fit."""
     costs = np.array([mode.cost for mode in modes])
     best = int(np.argmax(evidence))

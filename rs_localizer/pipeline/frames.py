@@ -426,8 +426,6 @@ def _build(
     camera = calibration.camera(config.readout_time, config.scan_direction)
     localizer = Localizer(camera, config)
     follows = (
-        config.tracking
-        and config.readout_time > 0.0
-        and find_solver(config.solver).rolling_shutter
+        config.tracking and config.readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     )
     return camera, localizer, Tracker(localizer) if follows else None

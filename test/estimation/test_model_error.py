@@ -294,9 +294,7 @@ def test_neighbours_agree_where_errors_are_shared_and_not_where_they_are_noise()
     strewn = np.where(np.arange(60)[:, None] % 3, shared, 100.0 * rng.normal(size=(60, 2)))
     counting = np.arange(60) % 3 > 0
     assert neighbours_agree(strewn, tau, rays, counting) == pytest.approx(
-        neighbours_agree(
-            strewn[counting], tau[counting], rays[counting], everything[counting]
-        )
+        neighbours_agree(strewn[counting], tau[counting], rays[counting], everything[counting])
     )
     assert neighbours_agree(shared, tau, rays, ~everything) == 0.0
     # Nor do those that stand together in the image.

@@ -143,9 +143,7 @@ def test_a_map_that_is_missing_and_comes_late(
     assert notices == []
 
 
-def test_correspondences_need_no_map(
-    frames: list[SimulatedFrame], make_camera_info: Any
-) -> None:
+def test_correspondences_need_no_map(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     node = localizer(make_camera_info)
     assert refused(node.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_map"
     assert node.missing == ("a map",)

@@ -31,7 +31,11 @@ def observe(camera: Camera, points: Array, pixels: Array) -> Observations:
 
 
 def best_of_samples(
-    observations: Observations, method: Method, rotation: Array, samples: int, threshold: float,
+    observations: Observations,
+    method: Method,
+    rotation: Array,
+    samples: int,
+    threshold: float,
     seed: int,
 ) -> tuple[Array, int]:
     """State (24,) of the best minimal model and its number of inliers.
