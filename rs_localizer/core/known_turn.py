@@ -188,7 +188,9 @@ def _turn(cubic: Array, time: float) -> Array:
 @kernel
 def _place(time: float, times: Array) -> int:
     """The interval that a time lies in; the first or the last of times outside."""
-    place: int = np.searchsorted(times[1:-1], time)
+    place: int = 0
+    while place < len(times) - 2 and times[place + 1] < time:
+        place += 1
     return place
 
 

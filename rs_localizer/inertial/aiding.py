@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,21 +10,26 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import PARAMETERS
+from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.refine import step_between
 from rs_localizer.inertial import turning
-from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
+from rs_localizer.inertial.filter import GyroscopeFilter, Predicted
 from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
-from rs_localizer.inertial.turning import TurnWithin
+from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
+SEEN = np.r_[TURN, ANGULAR]
+"""Of a step: what a gyroscope contradicts."""
 # Points that fit without the gyroscope, beyond those that fit with it, that speak against it.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
+
+
+Found = tuple[Estimate | Failure, Prior | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +41,8 @@ class Before:
     covariance: Array  # (18,18)
     added: Array  # (18,18) that the prediction gets, but for the rotation
     fading: float  # of accelerations, in readouts
+    of_shake_sizes: Array  # as of the fields of a :class:`Prior`
+    of_field_sizes: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,21 +80,43 @@ class GyroscopeAid:
         self._watch.reset()
         self._last_ns = None
 
-    def foresee(
-        self, samples: ImuSamples | None, middle_ns: int, before: Before | None, prior: Prior | None
-    ) -> Foreseen | None:
-        """What is known of a frame before its points; None: the camera has to go alone.
+    def localize(
+        self,
+        samples: ImuSamples | None,
+        middle_ns: int,
+        before: Callable[[], Before | None],
+        localized: Callable[[Foreseen | None], Found],
+    ) -> Found:
+        """Localize a frame with the gyroscope, or without it where that is better.
 
         Args:
             middle_ns: exposure of its middle row.
-            before: the last frame; None: there is no track.
-            prior: what the camera alone foresees.
+            before: gives the last frame; None: there is no track.
+            localized: localizes the frame with what is foreseen, or with the camera alone; and the
+                prior that it did so with.
         """
         if self._last_ns is not None and middle_ns > self._last_ns:
             self.filter.walk(1e-9 * (middle_ns - self._last_ns))
         self._last_ns = middle_ns
-        if before is None:
+        foreseen = self._foreseen(samples, middle_ns, before)
+        if foreseen is None:
             self.filter.forget_motion()
+            alone = localized(None)
+            self._compare(middle_ns, alone[0])
+            return alone
+        found = localized(foreseen)
+        if not self._doubtful(foreseen, found[0]):
+            self._learn(foreseen, found[0])
+            return found
+        alone = localized(None)
+        better = found if _better(found[0], alone[0]) else alone
+        self._learn(foreseen, better[0])
+        return better
+
+    def _foreseen(
+        self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
+    ) -> Foreseen | None:
+        """What is known of a frame before its points; None: the camera has to go alone."""
         if samples is None or len(samples) == 0:
             self._alone(Alone.NO_SAMPLES)
             return None
@@ -98,14 +128,16 @@ class GyroscopeAid:
         if turn is None:
             self._alone(Alone.NOT_COVERED)
             return None
-        if before is None or prior is None:
-            return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
-        predicted = self._predicted(samples, middle_ns, before, prior, turn)
-        prior = replace(prior, motion=predicted.motion, covariance=predicted.covariance)
-        return Foreseen(middle_ns, turn, prior, predicted)
+        last = before()
+        if last is not None:
+            errors = self.filter.errors
+            between = turning.turn_between(samples, last.middle_ns, middle_ns, errors)
+            if between is not None:
+                return self._predicted(last, between, turn, middle_ns)
+        self.filter.forget_motion()
+        return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
 
     def _alone(self, why: Alone) -> None:
-        self.filter.forget_motion()
         self.status = self._watch.status(why)
 
     def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
@@ -116,38 +148,22 @@ class GyroscopeAid:
         return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
 
     def _predicted(
-        self, samples: ImuSamples, middle_ns: int, before: Before, prior: Prior, turn: TurnWithin
-    ) -> Predicted:
-        errors = self.filter.errors
-        between = turning.turn_between(samples, before.middle_ns, middle_ns, errors)
-        if between is None:
-            return self._predicted_by_camera(prior, turn)
+        self, last: Before, between: TurnBetween, within: TurnWithin, middle_ns: int
+    ) -> Foreseen:
+        readouts = 1e-9 * (middle_ns - last.middle_ns) / self._readout_time
         predicted = self.filter.predict(
-            before.motion,
-            before.covariance,
-            between,
-            turn,
-            1e-9 * (middle_ns - before.middle_ns) / self._readout_time,
-            before.fading,
+            last.motion, last.covariance, between, within, readouts, last.fading
         )
-        return replace(predicted, covariance=predicted.covariance + before.added)
-
-    def _predicted_by_camera(self, prior: Prior, turn: TurnWithin) -> Predicted:
-        """The camera's prediction, beside the turn within the frame."""
-        assert prior.motion is not None
-        assert prior.covariance is not None
-        motion = replace(
-            prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3)
+        predicted = replace(predicted, covariance=predicted.covariance + last.added)
+        prior = Prior(
+            motion=predicted.motion,
+            covariance=predicted.covariance,
+            of_shake_sizes=last.of_shake_sizes,
+            of_field_sizes=last.of_field_sizes,
         )
-        covariance = prior.covariance.copy()
-        covariance[RATE] = 0.0
-        covariance[:, RATE] = 0.0
-        covariance[np.ix_(RATE, RATE)] = turn.known.error
-        with_parameters = np.zeros((PARAMETERS, turning.PARAMETERS))
-        with_parameters[RATE] = turn.by_parameters @ self.filter.errors.covariance
-        return Predicted(motion, covariance, with_parameters)
+        return Foreseen(middle_ns, within, prior, predicted)
 
-    def doubtful(self, foreseen: Foreseen, found: Estimate | Failure) -> bool:
+    def _doubtful(self, foreseen: Foreseen, found: Estimate | Failure) -> bool:
         """Whether a frame should be tried without the gyroscope."""
         if not found or (foreseen.predicted is not None and not found.tracked):
             return True
@@ -155,62 +171,54 @@ class GyroscopeAid:
 
     def _contradicts(self, foreseen: Foreseen, found: Estimate) -> bool:
         if foreseen.predicted is None:
-            covariance = np.eye(PARAMETERS)
-            covariance[np.ix_(RATE, RATE)] = foreseen.turn.error
-            step = np.zeros(PARAMETERS)
-            step[RATE] = _left(found)
-            return contradicts(step, covariance)
-        return contradicts(_step(foreseen.predicted, found), foreseen.predicted.covariance)
+            error = foreseen.turn.error
+            return contradicts(_left(found)[:3], error[:3, :3])
+        covariance = foreseen.predicted.covariance
+        step = _step(foreseen.predicted, found)
+        return contradicts(step[SEEN], covariance[np.ix_(SEEN, SEEN)])
 
-    def learn(
-        self, foreseen: Foreseen, found: Estimate | Failure, alone: Estimate | Failure | None
-    ) -> Estimate | Failure:
-        """Take in a frame; the better of its results, with the gyroscope and without.
-
-        Args:
-            alone: without the gyroscope; None where there was no doubt.
-        """
-        better = _better(found, alone)
-        if not better:
+    def _learn(self, foreseen: Foreseen, found: Estimate | Failure) -> None:
+        """Take in the better result of a frame that was tried with the gyroscope."""
+        if not found:
             self.filter.forget_motion()
             self.status = self._watch.status(Alone.NONE)
-            return better
-        if better.turn is None:
+            return
+        if found.turn is None:
             self.filter.forget_motion()
-            self._watch.judge(True, _believed(foreseen.middle_ns, better))
+            self._watch.judge(True, _believed(foreseen.middle_ns, found))
             dropped = self._watch.dropped
             self.status = self._watch.status(Alone.DOUBTED if dropped is Alone.NONE else dropped)
-            return better
-        contradicted = self._contradicts(foreseen, better)
+            return
+        contradicted = self._contradicts(foreseen, found)
         self._watch.judge(contradicted, None)
-        posterior = better.joint_covariance[:PARAMETERS, :PARAMETERS]
-        delay, variance = better.delay
         if contradicted:
             self.filter.forget_motion()
-        elif foreseen.predicted is not None and better.tracked:
-            step = _step(foreseen.predicted, better)
+        else:
+            self._update(foreseen, found)
+        self.status = self._watch.status(Alone.NONE)
+
+    def _update(self, foreseen: Foreseen, found: Estimate) -> None:
+        posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
+        if foreseen.predicted is not None and found.tracked:
+            step = _step(foreseen.predicted, found)
             self.filter.update(foreseen.predicted, step, posterior)
         else:
-            self.filter.begin(foreseen.within, _left(better), posterior)
-        if not contradicted:
-            readout_time = self._readout_time
-            self.filter.hear_delay(readout_time * delay, readout_time**2 * variance)
-        self.status = self._watch.status(Alone.NONE)
-        return better
+            self.filter.begin(foreseen.within, _left(found), posterior)
+        (delay, variance), unit = found.delay, self._readout_time
+        self.filter.hear_delay(unit * delay, unit**2 * variance)
 
-    def compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
+    def _compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
         """Compare a gyroscope that was dropped with what the camera sees without it."""
         if alone and self._watch.dropped is not Alone.NONE:
             self._watch.judge(False, _believed(middle_ns, alone))
 
 
-def _better(found: Estimate | Failure, alone: Estimate | Failure | None) -> Estimate | Failure:
-    if not alone:  # Also where it was not asked for.
-        return found
-    if not found:
-        return alone
+def _better(found: Estimate | Failure, alone: Estimate | Failure) -> bool:
+    """Whether a result with the gyroscope is the better one."""
+    if not alone or not found:
+        return bool(found) or not alone
     most = _BETTER_SHARE * np.count_nonzero(found.inliers) + _BETTER_COUNT
-    return alone if np.count_nonzero(alone.inliers) > most else found
+    return bool(np.count_nonzero(alone.inliers) <= most)
 
 
 def _believed(middle_ns: int, found: Estimate) -> Believed:

@@ -9,7 +9,6 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import ANGULAR, TURN
 from rs_localizer.inertial.filter import GyroscopeFilter
 from rs_localizer.inertial.mounting import fit_mounting
 from rs_localizer.inertial.offset import CameraTurn, fit_offset
@@ -149,12 +148,5 @@ class GyroscopeWatch:
 
 
 def contradicts(step: Array, covariance: Array) -> bool:
-    """Whether a frame moved rotation and turn rate by more than a prediction allows for.
-
-    Args:
-        step: (18,) from the prediction to the estimate.
-        covariance: (18,18) of the prediction.
-    """
-    chosen = np.r_[TURN, ANGULAR]
-    moved, expected = step[chosen], covariance[np.ix_(chosen, chosen)]
-    return bool(moved @ np.linalg.solve(expected, moved) > _MOST_SURPRISE)
+    """Whether a frame moved rotation and turn rate (k,) by more than their prediction allows."""
+    return bool(step @ np.linalg.solve(covariance, step) > _MOST_SURPRISE)
