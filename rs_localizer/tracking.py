@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -146,6 +147,17 @@ def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time:
     return covariance
 
 
+@cache
+def _without_shaking(coefficients: int) -> Array:
+    """Derivatives (18,18 + 3 k) of a motion without its shaking by motion and coefficients."""
+    jacobian = np.eye(PARAMETERS, PARAMETERS + 3 * coefficients)
+    if coefficients:
+        values, slopes = shake_in_the_middle(coefficients)
+        jacobian[TURN, PARAMETERS:] = -np.kron(values[None], np.eye(3))
+        jacobian[ANGULAR, PARAMETERS:] = -np.kron(slopes[None], np.eye(3))
+    return jacobian
+
+
 def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
     """The motion without its shaking, its covariance (18,18), and that of the shaking.
 
@@ -165,13 +177,7 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
         angular_acceleration=beside.angular_acceleration,
         linear_acceleration=beside.linear_acceleration,
     )
-    count = len(estimate.joint_covariance)
-    jacobian = np.eye(PARAMETERS, count)
-    coefficients = (count - PARAMETERS) // 3
-    if coefficients:
-        values, slopes = shake_in_the_middle(coefficients)
-        jacobian[TURN, PARAMETERS:] = -np.kron(values[None], np.eye(3))
-        jacobian[ANGULAR, PARAMETERS:] = -np.kron(slopes[None], np.eye(3))
+    jacobian = _without_shaking((len(estimate.joint_covariance) - PARAMETERS) // 3)
     swing = np.zeros((PARAMETERS, PARAMETERS))
     squares = np.mean(estimate.shake**2, axis=1)
     if len(squares):

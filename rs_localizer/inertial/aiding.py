@@ -10,12 +10,12 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.refine import step_between
 from rs_localizer.inertial import turning
-from rs_localizer.inertial.filter import GyroscopeFilter, Predicted
+from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
 from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -72,7 +72,12 @@ class GyroscopeAid:
         self.filter = GyroscopeFilter(settings)
         self._watch = GyroscopeWatch(settings, self.filter)
         self._last_ns: int | None = None
-        self.status = InertialStatus(Alone.NO_SAMPLES)
+        self._state = Alone.NO_SAMPLES
+
+    @property
+    def status(self) -> InertialStatus:
+        """What became of the gyroscope in the last frame."""
+        return self._watch.status(self._state)
 
     def reset(self) -> None:
         """Forget all frames."""
@@ -105,28 +110,31 @@ class GyroscopeAid:
             self._compare(middle_ns, alone[0])
             return alone
         found = localized(foreseen)
-        if not self._doubtful(foreseen, found[0]):
-            self._learn(foreseen, found[0])
+        step = _step(foreseen, found[0])
+        if step is not None and not _contradicts(foreseen, step):
+            self._learn(foreseen, found[0], step)
             return found
         alone = localized(None)
-        better = found if _better(found[0], alone[0]) else alone
-        self._learn(foreseen, better[0])
-        return better
+        if _better(found[0], alone[0]):
+            self._contradicted(middle_ns, None, step is not None)
+            return found
+        self._contradicted(middle_ns, alone[0], True)
+        return alone
 
     def _foreseen(
         self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
     ) -> Foreseen | None:
         """What is known of a frame before its points; None: the camera has to go alone."""
         if samples is None or len(samples) == 0:
-            self._alone(Alone.NO_SAMPLES)
+            self._state = Alone.NO_SAMPLES
             return None
         self._watch.hear(samples)
         if self._watch.dropped is not Alone.NONE:
-            self._alone(self._watch.dropped)
+            self._state = self._watch.dropped
             return None
         turn = turning.turn_within(samples, middle_ns, self._readout_time, self.filter.errors)
         if turn is None:
-            self._alone(Alone.NOT_COVERED)
+            self._state = Alone.NOT_COVERED
             return None
         last = before()
         if last is not None:
@@ -136,9 +144,6 @@ class GyroscopeAid:
                 return self._predicted(last, between, turn, middle_ns)
         self.filter.forget_motion()
         return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
-
-    def _alone(self, why: Alone) -> None:
-        self.status = self._watch.status(why)
 
     def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
         up = self._settings.gravity_in_map
@@ -163,49 +168,29 @@ class GyroscopeAid:
         )
         return Foreseen(middle_ns, within, prior, predicted)
 
-    def _doubtful(self, foreseen: Foreseen, found: Estimate | Failure) -> bool:
-        """Whether a frame should be tried without the gyroscope."""
-        if not found or (foreseen.predicted is not None and not found.tracked):
-            return True
-        return self._contradicts(foreseen, found)
-
-    def _contradicts(self, foreseen: Foreseen, found: Estimate) -> bool:
-        if foreseen.predicted is None:
-            error = foreseen.turn.error
-            return contradicts(_left(found)[:3], error[:3, :3])
-        covariance = foreseen.predicted.covariance
-        step = _step(foreseen.predicted, found)
-        return contradicts(step[SEEN], covariance[np.ix_(SEEN, SEEN)])
-
-    def _learn(self, foreseen: Foreseen, found: Estimate | Failure) -> None:
-        """Take in the better result of a frame that was tried with the gyroscope."""
-        if not found:
-            self.filter.forget_motion()
-            self.status = self._watch.status(Alone.NONE)
-            return
-        if found.turn is None:
-            self.filter.forget_motion()
-            self._watch.judge(True, _believed(foreseen.middle_ns, found))
-            dropped = self._watch.dropped
-            self.status = self._watch.status(Alone.DOUBTED if dropped is Alone.NONE else dropped)
-            return
-        contradicted = self._contradicts(foreseen, found)
-        self._watch.judge(contradicted, None)
-        if contradicted:
-            self.filter.forget_motion()
-        else:
-            self._update(foreseen, found)
-        self.status = self._watch.status(Alone.NONE)
-
-    def _update(self, foreseen: Foreseen, found: Estimate) -> None:
+    def _learn(self, foreseen: Foreseen, found: Estimate | Failure, step: Array) -> None:
+        """Take in a frame that agrees with the gyroscope."""
+        assert found
+        self._state = Alone.NONE
+        self._watch.judge(False, None)
         posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
-        if foreseen.predicted is not None and found.tracked:
-            step = _step(foreseen.predicted, found)
+        if foreseen.predicted is not None:
             self.filter.update(foreseen.predicted, step, posterior)
         else:
-            self.filter.begin(foreseen.within, _left(found), posterior)
+            self.filter.begin(foreseen.within, step[RATE], posterior)
         (delay, variance), unit = found.delay, self._readout_time
         self.filter.hear_delay(unit * delay, unit**2 * variance)
+
+    def _contradicted(
+        self, middle_ns: int, alone: Estimate | Failure | None, by_points: bool
+    ) -> None:
+        """Take in a frame that does not agree, with the result of the camera alone if it counts."""
+        self.filter.forget_motion()
+        self._watch.judge(by_points, _believed(middle_ns, alone) if alone else None)
+        self._state = Alone.NONE
+        if alone:
+            dropped = self._watch.dropped
+            self._state = Alone.DOUBTED if dropped is Alone.NONE else dropped
 
     def _compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
         """Compare a gyroscope that was dropped with what the camera sees without it."""
@@ -225,13 +210,26 @@ def _believed(middle_ns: int, found: Estimate) -> Believed:
     return Believed(middle_ns, found.rotation, found.covariance[:3, :3])
 
 
-def _step(predicted: Predicted, found: Estimate) -> Array:
-    """The step (18,) from a prediction to an estimate, both beside the known turn."""
-    origin = np.zeros(3)
-    return step_between(state_in(predicted.motion, origin), state_in(found.beside_turn(), origin))
+def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
+    """The step (18,) from what was foreseen to an estimate, beside the known turn.
+
+    None where there is no estimate, or none near the prediction. Without a prediction only what the
+    gyroscope leaves counts.
+    """
+    if not found:
+        return None
+    motion, origin = found.beside_turn(), np.zeros(3)
+    if foreseen.predicted is None:
+        step = np.zeros(PARAMETERS)
+        step[ANGULAR] = motion.angular_velocity
+        step[ANGULAR_ACCELERATION] = motion.angular_acceleration
+        return step
+    if not found.tracked:
+        return None
+    return step_between(state_in(foreseen.predicted.motion, origin), state_in(motion, origin))
 
 
-def _left(found: Estimate) -> Array:
-    """Rate and its change (6,) that the points left beside the known turn."""
-    motion = found.beside_turn()
-    return np.concatenate([motion.angular_velocity, motion.angular_acceleration])
+def _contradicts(foreseen: Foreseen, step: Array) -> bool:
+    if foreseen.predicted is None:
+        return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3])
+    return contradicts(step[SEEN], foreseen.predicted.covariance[np.ix_(SEEN, SEEN)])
