@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 
 # What each part may import besides itself; every part has a row.
-METHOD = {"core", "config", "solvers", "estimation", "localizer", "tracking"}
+METHOD = {"core", "config", "solvers", "estimation", "inertial", "localizer", "tracking"}
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
     "data": set(),
@@ -18,7 +18,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config": {"core", "solvers"},
     "solvers": {"core"},
     "estimation": {"core", "config", "solvers"},
-    "localizer": METHOD - {"localizer", "tracking"},
+    "inertial": {"core", "estimation"},
+    "localizer": METHOD - {"inertial", "localizer", "tracking"},
     "tracking": METHOD - {"tracking"},
     "trajectory": METHOD,
     "io": {"core"},

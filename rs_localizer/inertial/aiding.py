@@ -1,0 +1,232 @@
+"""A gyroscope beside a tracker: it foresees each frame, and learns from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.refine import step_between
+from rs_localizer.inertial import turning
+from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
+from rs_localizer.inertial.gravity import gravity_seen
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.inertial.turning import TurnBetween, TurnWithin
+from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
+
+SEEN = np.r_[TURN, ANGULAR]
+"""Of a step: what a gyroscope contradicts."""
+# Points that fit with the gyroscope, beyond those that fit without it, that speak for it although
+# it contradicts what the camera sees.
+_BETTER_SHARE, _BETTER_COUNT = 1.05, 1
+
+
+Found = tuple[Estimate | Failure, Prior | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Before:
+    """The last frame with a pose, for a prediction."""
+
+    middle_ns: int
+    motion: Motion  # beside its known turn
+    covariance: Array  # (18,18)
+    added: Array  # (18,18) that the prediction gets, but for the rotation
+    fading: float  # of accelerations, in readouts
+    of_shake_sizes: Array  # as of the fields of a :class:`Prior`
+    of_field_sizes: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Foreseen:
+    """What the gyroscope says of a frame."""
+
+    middle_ns: int
+    within: TurnWithin
+    prior: Prior | None  # of the motion beside the turn
+    predicted: Predicted | None  # the same with the gyroscope's parameters
+
+    @property
+    def turn(self) -> KnownTurn:
+        return self.within.known
+
+
+class GyroscopeAid:
+    """The gyroscope of one camera.
+
+    Args:
+        settings: what is known of it.
+        readout_time: s, of the camera.
+    """
+
+    def __init__(self, settings: InertialSettings, readout_time: float) -> None:
+        self._settings, self._readout_time = settings, readout_time
+        self.filter = GyroscopeFilter(settings)
+        self._watch = GyroscopeWatch(settings, self.filter)
+        self._last_ns: int | None = None
+        self._state = Alone.NO_SAMPLES
+
+    @property
+    def status(self) -> InertialStatus:
+        """What became of the gyroscope in the last frame."""
+        return self._watch.status(self._state)
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self.filter.reset()
+        self._watch.reset()
+        self._last_ns = None
+
+    def localize(
+        self,
+        samples: ImuSamples | None,
+        middle_ns: int,
+        before: Callable[[], Before | None],
+        localized: Callable[[Foreseen | None], Found],
+    ) -> Found:
+        """Localize a frame with the gyroscope, or without it where that is better.
+
+        Args:
+            middle_ns: exposure of its middle row.
+            before: gives the last frame; None: there is no track.
+            localized: localizes the frame with what is foreseen, or with the camera alone; and the
+                prior that it did so with.
+        """
+        if self._last_ns is not None and middle_ns > self._last_ns:
+            self.filter.walk(1e-9 * (middle_ns - self._last_ns))
+        self._last_ns = middle_ns
+        foreseen = self._foreseen(samples, middle_ns, before)
+        if foreseen is None:
+            self.filter.forget_motion()
+            alone = localized(None)
+            self._compare(middle_ns, alone[0])
+            return alone
+        found = localized(foreseen)
+        step = _step(foreseen, found[0])
+        if step is not None and not (_contradicts(foreseen, step) or self.filter.strange):
+            self._learn(foreseen, found[0], step)
+            return found
+        alone = localized(None)
+        better = _better(found[0], alone[0])
+        self._contradicted(middle_ns, None if better else alone[0])
+        return found if better else alone
+
+    def _foreseen(
+        self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
+    ) -> Foreseen | None:
+        """What is known of a frame before its points; None: the camera has to go alone."""
+        if samples is None or len(samples) == 0:
+            self._state = Alone.NO_SAMPLES
+            return None
+        self._watch.hear(samples)
+        if self._watch.dropped is not Alone.NONE:
+            self._state = self._watch.dropped
+            return None
+        turn = turning.turn_within(samples, middle_ns, self._readout_time, self.filter.errors)
+        if turn is None:
+            self._state = Alone.NOT_COVERED
+            return None
+        last = before()
+        if last is not None:
+            errors = self.filter.errors
+            between = turning.turn_between(samples, last.middle_ns, middle_ns, errors)
+            if between is not None:
+                return self._predicted(last, between, turn, middle_ns)
+        self.filter.forget_motion()
+        return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
+
+    def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
+        up = self._settings.gravity_in_map
+        seen = None if up is None else gravity_seen(samples, middle_ns, self.filter.errors)
+        if up is None or seen is None:
+            return None
+        return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
+
+    def _predicted(
+        self, last: Before, between: TurnBetween, within: TurnWithin, middle_ns: int
+    ) -> Foreseen:
+        readouts = 1e-9 * (middle_ns - last.middle_ns) / self._readout_time
+        predicted = self.filter.predict(
+            last.motion, last.covariance, between, within, readouts, last.fading
+        )
+        predicted = replace(predicted, covariance=predicted.covariance + last.added)
+        prior = Prior(
+            motion=predicted.motion,
+            covariance=predicted.covariance,
+            of_shake_sizes=last.of_shake_sizes,
+            of_field_sizes=last.of_field_sizes,
+        )
+        return Foreseen(middle_ns, within, prior, predicted)
+
+    def _learn(self, foreseen: Foreseen, found: Estimate | Failure, step: Array) -> None:
+        """Take in a frame that agrees with the gyroscope."""
+        assert found
+        self._state = Alone.NONE
+        self._watch.judge(False, None)
+        posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
+        if foreseen.predicted is not None:
+            self.filter.update(foreseen.predicted, step, posterior)
+        else:
+            self.filter.begin(foreseen.within, step[RATE], posterior)
+        (delay, variance), unit = found.delay, self._readout_time
+        self.filter.hear_delay(unit * delay, unit**2 * variance)
+
+    def _contradicted(self, middle_ns: int, alone: Estimate | Failure | None) -> None:
+        """Take in a frame that does not agree, with the result of the camera alone if it counts."""
+        self.filter.forget_motion()
+        self._watch.judge(bool(alone), _believed(middle_ns, alone) if alone else None)
+        self._state = Alone.NONE
+        if alone:
+            dropped = self._watch.dropped
+            self._state = Alone.DOUBTED if dropped is Alone.NONE else dropped
+
+    def _compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
+        """Compare a gyroscope that was dropped with what the camera sees without it."""
+        if alone and self._watch.dropped is not Alone.NONE:
+            self._watch.judge(False, _believed(middle_ns, alone))
+
+
+def _better(found: Estimate | Failure, alone: Estimate | Failure) -> bool:
+    """Whether a result with a gyroscope that contradicts the camera is the better one."""
+    if not alone or not found:
+        return bool(found) or not alone
+    fewer = _BETTER_SHARE * np.count_nonzero(alone.inliers) + _BETTER_COUNT
+    return bool(np.count_nonzero(found.inliers) > fewer)
+
+
+def _believed(middle_ns: int, found: Estimate) -> Believed:
+    return Believed(middle_ns, found.rotation, found.covariance[:3, :3])
+
+
+def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
+    """The step (18,) from what was foreseen to an estimate, beside the known turn.
+
+    None where there is no estimate, or none near the prediction. Without a prediction only what the
+    gyroscope leaves counts.
+    """
+    if not found:
+        return None
+    motion, origin = found.beside_turn(), np.zeros(3)
+    if foreseen.predicted is None:
+        step = np.zeros(PARAMETERS)
+        step[ANGULAR] = motion.angular_velocity
+        step[ANGULAR_ACCELERATION] = motion.angular_acceleration
+        return step
+    if not found.tracked:
+        return None
+    return step_between(state_in(foreseen.predicted.motion, origin), state_in(motion, origin))
+
+
+def _contradicts(foreseen: Foreseen, step: Array) -> bool:
+    if foreseen.predicted is None:
+        return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3])
+    return contradicts(step[SEEN], foreseen.predicted.covariance[np.ix_(SEEN, SEEN)])

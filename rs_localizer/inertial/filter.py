@@ -1,0 +1,262 @@
+"""What the frames say of the gyroscope: bias and time offset, tracked beside the camera's motion.
+
+The gyroscope's parameters are a part of the state of the tracker's Kalman filter that no image
+shows; they are correlated with what is predicted, because they made the prediction. An image that
+moves the motion from ``x`` (covariance ``P``) to ``x'`` (``P'``) therefore moves the parameters,
+whose covariance with ``x`` is ``C``, by ``K (x' - x)`` with ``K = C^T P^-1``, takes
+``K (P - P') K^T`` from their covariance, and leaves ``P' K^T`` as theirs with ``x'``. This is the
+update of the whole filter: given the motion, the image says nothing more of the parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import (
+    ANGULAR,
+    ANGULAR_ACCELERATION,
+    PARAMETERS,
+)
+from rs_localizer.inertial import turning
+from rs_localizer.inertial.settings import (
+    BIAS_DEVIATION,
+    OFFSET_DEVIATION,
+    OFFSET_WALK,
+    InertialSettings,
+)
+from rs_localizer.inertial.turning import BIAS, OFFSET, GyroscopeErrors, TurnBetween, TurnWithin
+
+# An offset that is not estimated is known to this, s.
+_GIVEN_OFFSET_DEVIATION = 1e-4
+# Biases beyond so many deviations are none.
+_MOST_BIAS = 5.0
+# Of the information that a frame adds at most, so that rounding leaves some variance.
+_MOST_GAIN = 0.9999
+
+RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
+"""Of a step: what the gyroscope leaves to the points."""
+_TURNS = np.arange(3)
+# What the rows say of the time offset is never better than this (s), and not believed beyond chance
+# (squared, in variances).
+_LEAST_DELAY, _MOST_DELAY = 1e-5, 16.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predicted:
+    """A motion beside the known turn, before its image."""
+
+    motion: Motion
+    covariance: Array  # (18,18)
+    with_parameters: Array  # (18,4) covariance with the gyroscope's parameters
+
+
+class GyroscopeFilter:
+    """Bias and time offset of a gyroscope, with the covariance that ties them to the motion."""
+
+    def __init__(self, settings: InertialSettings) -> None:
+        self._settings = settings
+        self.reset()
+
+    def reset(self, time_offset: float = 0.0, deviation: float | None = None) -> None:
+        """Forget what the frames said; begin with a time offset (s) and how well it is known."""
+        estimated = self._settings.estimate_time_offset
+        if deviation is None:
+            deviation = OFFSET_DEVIATION if estimated else _GIVEN_OFFSET_DEVIATION
+        deviations = [*3 * [BIAS_DEVIATION], deviation]
+        self._set(np.array([0.0, 0.0, 0.0, time_offset]), np.diag(np.square(deviations)))
+        self.forget_motion()
+
+    @property
+    def strange(self) -> bool:
+        """Whether no gyroscope has such a bias."""
+        return float(np.abs(self.errors.bias).max()) > _MOST_BIAS * BIAS_DEVIATION
+
+    def forget_motion(self) -> None:
+        """The next frame does not follow the last one."""
+        self._with_motion = np.zeros((PARAMETERS, turning.PARAMETERS))
+
+    def _set(self, parameters: Array, covariance: Array) -> None:
+        bias, time_offset = parameters[BIAS], float(parameters[OFFSET])
+        noise = self._settings.gyroscope_noise
+        self.errors = GyroscopeErrors(bias, time_offset, covariance, noise)
+
+    def walk(self, seconds: float) -> None:
+        """Let time pass."""
+        covariance = self.errors.covariance.copy()
+        covariance[BIAS, BIAS] += self._settings.gyroscope_bias_walk**2 * seconds * np.eye(3)
+        if self._settings.estimate_time_offset:
+            covariance[OFFSET, OFFSET] += OFFSET_WALK**2 * seconds
+        self._set(np.append(self.errors.bias, self.errors.time_offset), covariance)
+
+    def predict(
+        self,
+        motion: Motion,
+        covariance: Array,
+        between: TurnBetween,
+        within: TurnWithin,
+        readouts: float,
+        fading: float,
+    ) -> Predicted:
+        """The motion some readout times later, beside the turn that the gyroscope knows.
+
+        As :func:`rs_localizer.tracking.predict`, but for the rotation: the camera turns as the
+        gyroscope says, and what it leaves has no memory but in the parameters.
+
+        Args:
+            motion, covariance: of the last frame, beside its known turn; (18,18).
+            between, within: turns from the last middle row to this one, and within this frame.
+            readouts: from middle row to middle row.
+            fading: of accelerations, in readouts.
+        """
+        left = math.exp(-readouts / fading)
+        faster = fading * (1.0 - left)
+        farther = fading * (readouts - faster)
+        back = between.rotation
+        way = readouts * motion.linear_velocity + farther * motion.linear_acceleration
+        velocity = back @ (motion.linear_velocity + faster * motion.linear_acceleration)
+        later = Motion(
+            back @ motion.rotation,
+            back @ (motion.translation - way),
+            np.zeros(3),
+            velocity,
+            linear_acceleration=left * back @ motion.linear_acceleration,
+        )
+        predicted, with_parameters = _carried(
+            covariance, self._with_motion, self.errors.covariance, back,
+            between.by_parameters, within.by_parameters, way, velocity,
+            np.array([readouts, farther, faster, left]),
+        )  # fmt: skip
+        predicted[_TURNS, _TURNS] += between.variances
+        predicted[RATE, RATE] += within.variances
+        return Predicted(later, predicted, with_parameters)
+
+    def update(self, predicted: Predicted, step: Array, posterior: Array) -> None:
+        """Take in a frame that was found near its prediction.
+
+        Args:
+            step: (18,) from the prediction to the estimate.
+            posterior: (18,18) covariance of the estimate.
+        """
+        everything = np.arange(PARAMETERS)
+        self._update(everything, predicted.covariance, predicted.with_parameters, step, posterior)
+
+    def begin(self, within: TurnWithin, left: Array, posterior: Array) -> None:
+        """Take in a frame of which nothing was known but its turn.
+
+        Args:
+            left: (6,) rate and its change that the points left beside the known turn.
+            posterior: (18,18) covariance of the estimate.
+        """
+        with_parameters = within.by_parameters @ self.errors.covariance
+        self._update(RATE, within.known.error, with_parameters, left, posterior)
+
+    def hear_delay(self, delay: float, variance: float) -> None:
+        """Take in what the rows of a frame say of the time offset: to be later by ``delay`` (s).
+
+        Their motion stays what it is, so that this is not the best filter, but a consistent one.
+        """
+        covariance = self.errors.covariance
+        known = float(covariance[OFFSET, OFFSET])
+        total = known + variance + _LEAST_DELAY**2
+        if not self._settings.estimate_time_offset or delay * delay > _MOST_DELAY * total:
+            return
+        gain = covariance[:, OFFSET] / total
+        parameters = np.append(self.errors.bias, self.errors.time_offset) + gain * delay
+        self._with_motion = self._with_motion - np.outer(self._with_motion[:, OFFSET], gain)
+        self._set(parameters, covariance - np.outer(gain, covariance[OFFSET]))
+
+    def _update(
+        self, known: IntArray, before: Array, with_parameters: Array, step: Array, posterior: Array
+    ) -> None:
+        """``known``: places of a step that the prediction ``before`` was of."""
+        after = np.ascontiguousarray(posterior[np.ix_(known, known)])
+        gain, gained, left = _gain(before, after, np.ascontiguousarray(with_parameters))
+        covariance = self.errors.covariance - gained
+        parameters = np.append(self.errors.bias, self.errors.time_offset) + gain @ step
+        tied = left @ gain.T
+        if len(known) < PARAMETERS:
+            tied = posterior[:, known] @ np.linalg.solve(after, tied)
+        self._with_motion = np.ascontiguousarray(tied)
+        self._set(parameters, 0.5 * (covariance + covariance.T))
+
+
+@kernel
+def _carried(
+    covariance: Array, with_motion: Array, of_parameters: Array, back: Array,
+    turn_by_parameters: Array, rate_by_parameters: Array, way: Array, velocity: Array,
+    times: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Covariance (18,18) of a motion, and with the parameters (18,4), after a turn.
+
+    Args:
+        times: readouts, and what a unit of acceleration adds to way and velocity, and what is
+            left of it.
+    """
+    readouts, farther, faster, left = times
+    transport = np.zeros((PARAMETERS, PARAMETERS))
+    by_parameters = np.zeros((PARAMETERS, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for column in range(3):
+            b = back[i, column]
+            transport[i, column] = b
+            transport[3 + i, 3 + column] = b
+            transport[3 + i, 9 + column] = readouts * b
+            transport[3 + i, 15 + column] = farther * b
+            transport[9 + i, 9 + column] = b
+            transport[9 + i, 15 + column] = faster * b
+            transport[15 + i, 15 + column] = left * b
+            # -back hat(way), column by column
+            after, before = (column + 1) % 3, (column + 2) % 3
+            transport[3 + i, column] = back[i, before] * way[after] - back[i, after] * way[before]
+        for column in range(4):
+            by_parameters[i, column] = turn_by_parameters[i, column]
+            by_parameters[6 + i, column] = rate_by_parameters[i, column]
+            by_parameters[12 + i, column] = rate_by_parameters[3 + i, column]
+            by_parameters[9 + i, column] = (
+                velocity[j] * turn_by_parameters[k, column]
+                - velocity[k] * turn_by_parameters[j, column]
+            )
+    moved = transport @ with_motion
+    crossed = moved @ by_parameters.T
+    predicted = transport @ covariance @ transport.T + crossed + crossed.T
+    predicted += by_parameters @ of_parameters @ by_parameters.T
+    return predicted, moved + by_parameters @ of_parameters
+
+
+@kernel
+def _gain(before: Array, after: Array, with_parameters: Array) -> tuple[Array, Array, Array]:
+    """Gain (4,k), what it takes from the covariance (4,4), and the covariance (k,k) after.
+
+    What shaking and model error make of an estimate's covariance may exceed the prediction's. Such
+    a frame says nothing of the parameters, but does not make them worse.
+    """
+    size = len(before)
+    deviations = np.sqrt(np.diag(before))
+    scaled = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            scaled[i, j] = before[i, j] / (deviations[i] * deviations[j])
+    factor = np.linalg.cholesky(scaled)
+    inverse = np.linalg.inv(factor)  # of the factor of what is not scaled
+    for i in range(size):
+        for j in range(size):
+            inverse[i, j] /= deviations[j]
+    half = inverse @ with_parameters
+    values, vectors = np.linalg.eigh(inverse @ after @ inverse.T)
+    outer, along = factor @ vectors, vectors.T @ half
+    lost, kept = along.copy(), outer.copy()
+    for k in range(size):
+        value = min(max(values[k], 1.0 - _MOST_GAIN), 1.0)
+        for i in range(size):
+            outer[i, k] *= deviations[i]
+            kept[i, k] = outer[i, k] * value
+        for i in range(4):
+            lost[k, i] *= 1.0 - value
+    return half.T @ inverse, along.T @ lost, kept @ outer.T

@@ -1,0 +1,224 @@
+"""Turns of the camera by the gyroscope: within a frame, and from one to the next.
+
+How they depend on the time offset is seen by shifting the samples to and fro by its standard
+deviation (the unscented transform: Julier, Uhlmann, "Unscented filtering and nonlinear estimation",
+2004). While the offset is hardly known, the derivative of a vibration would say nothing of what a
+shift makes of it; what is no line within the deviation counts as noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.known_turn import (
+    KnownTurn,
+    multiplied,
+    rotations_at_knots,
+    spline,
+    turn_of,
+    turns_at,
+)
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.so3 import coefficients, log
+from rs_localizer.inertial.band import densified
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import SCALE_DEVIATION
+
+PARAMETERS = 4
+"""Of a gyroscope: its bias (3, rad/s), and the time offset of its stamps (s)."""
+BIAS, OFFSET = slice(0, 3), 3
+
+# The integral of white noise is a random walk. The least-squares parabola of one over an interval
+# of length 1 has a slope and a curvature of these variances (by its Legendre coefficients).
+_WALK_SLOPE, _WALK_CURVATURE = 6.0 / 5.0, 120.0 / 7.0
+# Of the samples, s or readouts.
+_LEAST_SHIFT = 1e-4
+# A vibration of more than this (rad per readout) of whose phase nothing is known, because the
+# offset is not known this well (s), says nothing of bias and offset: one that is in step with the
+# frames is the same in all of them, as a bias is.
+_MOST_ROUGH, _NEAR = 2e-3, 5e-4
+_WAVE_SLOPE = 60.0  # squared slope of a line through a wave, to its mean square; at most
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GyroscopeErrors:
+    """What is known of a gyroscope's errors."""
+
+    bias: Array  # (3,) rad/s, to be taken from its rates
+    time_offset: float  # s, to be added to its times
+    covariance: Array  # (4,4) of bias and time offset
+    noise: float  # rad/s/sqrt(Hz)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnBetween:
+    """The turn from one moment to another, and how it depends on what is not known."""
+
+    rotation: Array  # (3,3) camera_then_from_camera_now
+    # (3,4) of a turn of the camera then, in its own axes, by the gyroscope's parameters
+    by_parameters: Array
+    variances: Array  # (3,) rad^2, by noise and scale
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnWithin:
+    """The turn during a frame, and how what it leaves depends on what is not known.
+
+    That is the rate and its change (6), per readout, along the axes of the middle row.
+    """
+
+    known: KnownTurn
+    by_parameters: Array  # (6,4)
+    variances: Array  # (6,) by noise and scale
+
+
+def turn_within(
+    samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors
+) -> TurnWithin | None:
+    """How the camera turns during a frame; None if the samples do not cover it.
+
+    Args:
+        middle_ns: exposure of the middle row.
+        readout_time: s.
+    """
+    spanning = _spanning(samples, middle_ns, 0.5 * readout_time, 0.5 * readout_time, errors)
+    if spanning is None:
+        return None
+    times, rates = spanning
+    turn, error, by_parameters, variances = _within(
+        times, rates, readout_time, errors.noise, errors.covariance
+    )
+    period = (times[-1] - times[0]) / (len(times) - 1)
+    rate_noise = errors.noise * readout_time / math.sqrt(period)
+    delay = math.sqrt(errors.covariance[OFFSET, OFFSET]) / readout_time
+    return TurnWithin(KnownTurn(*turn, error, rate_noise, delay), by_parameters, variances)
+
+
+def turn_between(
+    samples: ImuSamples, from_ns: int, to_ns: int, errors: GyroscopeErrors
+) -> TurnBetween | None:
+    """How the camera turns from one moment to a later one; None if the samples do not cover it."""
+    length = 1e-9 * (to_ns - from_ns)
+    spanning = _spanning(samples, to_ns, length, 0.0, errors)
+    if spanning is None:
+        return None
+    deviation = math.sqrt(errors.covariance[OFFSET, OFFSET])
+    return TurnBetween(*_between(*spanning, length, errors.noise, deviation))
+
+
+@kernel
+def _within(
+    times: Array, rates: Array, readout_time: float, noise: float, of_parameters: Array
+) -> tuple[tuple[Array, Array, Array, Array, Array, Array, float], Array, Array, Array]:
+    """The turn of a :class:`KnownTurn`, its error, and the other fields of :class:`TurnWithin`."""
+    dense, found = densified(times, rates)
+    tau = dense / readout_time
+    cubics, rotations, rate, change, parabola, rough = turn_of(tau, found * readout_time)
+    deviation = np.sqrt(of_parameters[OFFSET, OFFSET])
+    shift = _shift(deviation / readout_time, tau[0] + 0.5, tau[-1] - 0.5)
+    wanted = np.array([-0.5, 0.0, 0.5])
+    early = _halves(turns_at(wanted - shift, tau, cubics, rotations)[0])
+    middle = _halves(turns_at(wanted, tau, cubics, rotations)[0])
+    late = _halves(turns_at(wanted + shift, tau, cubics, rotations)[0])
+    by_parameters, variances = np.zeros((6, PARAMETERS)), np.empty(6)
+    turned, changed = 0.0, 0.0
+    for k in range(3):
+        by_parameters[k, k] = -readout_time
+        turned += middle[k] * middle[k]
+        changed += middle[3 + k] * middle[3 + k]
+    walk, scale = noise * noise * readout_time, SCALE_DEVIATION * SCALE_DEVIATION
+    for k in range(6):
+        # Samples of later times: each row has the rate of a little earlier.
+        by_parameters[k, OFFSET] = -0.5 * (late[k] - early[k]) / (shift * readout_time)
+        variances[k] = (0.5 * (late[k] + early[k]) - middle[k]) ** 2
+        if k < 3:
+            variances[k] += _WALK_SLOPE * walk + scale * turned
+        else:
+            variances[k] += _WALK_CURVATURE * walk + scale * changed
+    if rough * min(deviation / _NEAR, 1.0) > _MOST_ROUGH:
+        for k in range(6):
+            variances[k] += rough * rough * (2.0 if k < 3 else 2.0 * _WAVE_SLOPE)
+            for column in range(PARAMETERS):
+                own = by_parameters[k, column]
+                variances[k] += own * own * of_parameters[column, column]
+        by_parameters[:] = 0.0
+    error = by_parameters @ of_parameters @ by_parameters.T
+    for k in range(6):
+        error[k, k] += variances[k]
+    turn = (tau, cubics, rotations, rate, change, parabola, rough)
+    return turn, error, by_parameters, variances
+
+
+@kernel
+def _shift(deviation: float, before: float, after: float) -> float:
+    """As far as the deviation and the samples reach; never so little that rounding decides."""
+    shift: float = max(min(deviation, -before, after), _LEAST_SHIFT)
+    return shift
+
+
+@kernel
+def _halves(rotations: Array) -> Array:
+    """Mean rate and its change (6,) of a turn (3,3,3) over an interval of length 1."""
+    first = log(multiplied(rotations[0], rotations[1].T.copy()))
+    second = log(multiplied(rotations[1], rotations[2].T.copy()))
+    found = np.empty(6)
+    for k in range(3):
+        found[k] = first[k] + second[k]
+        found[3 + k] = 4.0 * (second[k] - first[k])
+    return found
+
+
+@kernel
+def _between(
+    times: Array, rates: Array, length: float, noise: float, deviation: float
+) -> tuple[Array, Array, Array]:
+    """The fields of a :class:`TurnBetween`; it ends at time 0."""
+    dense, found = densified(times, rates)
+    cubics = spline(dense, found)
+    rotations = rotations_at_knots(dense, cubics)  # from the camera then
+    shift = _shift(deviation, dense[0] + length, dense[-1])
+    wanted = np.array([-length, 0.0, -length - shift, -shift, shift - length, shift])
+    turned, _ = turns_at(wanted, dense, cubics, rotations)
+    rotation = multiplied(turned[1], turned[0].T.copy())
+    angle = log(rotation.T.copy())
+    x, y, z = angle[0], angle[1], angle[2]
+    squared = x * x + y * y + z * z
+    _, c, d = coefficients(squared)
+    by_parameters = np.empty((3, PARAMETERS))
+    # A constant rate in the camera's axes of each moment, seen in those of then: the right
+    # Jacobian of the exponential.
+    by_parameters[0, 0] = -length * (1.0 - d * (y * y + z * z))
+    by_parameters[1, 1] = -length * (1.0 - d * (x * x + z * z))
+    by_parameters[2, 2] = -length * (1.0 - d * (x * x + y * y))
+    by_parameters[0, 1] = -length * (c * z + d * x * y)
+    by_parameters[1, 0] = -length * (-c * z + d * x * y)
+    by_parameters[0, 2] = -length * (-c * y + d * x * z)
+    by_parameters[2, 0] = -length * (c * y + d * x * z)
+    by_parameters[1, 2] = -length * (c * x + d * y * z)
+    by_parameters[2, 1] = -length * (-c * x + d * y * z)
+    # By how much more the camera turns if the samples come later, or earlier.
+    back = rotation.T.copy()
+    late = log(multiplied(multiplied(turned[3], turned[2].T.copy()), back))
+    early = log(multiplied(multiplied(turned[5], turned[4].T.copy()), back))
+    variances = np.empty(3)
+    for k in range(3):
+        by_parameters[k, OFFSET] = -0.5 * (late[k] - early[k]) / shift
+        variances[k] = (0.5 * (late[k] + early[k])) ** 2
+        variances[k] += noise * noise * length + SCALE_DEVIATION * SCALE_DEVIATION * squared
+    return rotation, by_parameters, variances
+
+
+def _spanning(
+    samples: ImuSamples, at_ns: int, before: float, after: float, errors: GyroscopeErrors
+) -> tuple[Array, Array] | None:
+    """Times (k,) in s since a moment and rates (k,3) without the bias that span what is around."""
+    here_ns = at_ns - round(1e9 * errors.time_offset)  # by the clock of the samples
+    part = samples.around(here_ns - round(1e9 * before), here_ns + round(1e9 * after))
+    if part is None:
+        return None
+    times = np.asarray(1e-9 * (samples.times_ns[part] - here_ns), np.float64)
+    return times, samples.angular_velocity[part] - errors.bias
