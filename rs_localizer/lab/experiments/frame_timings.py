@@ -7,6 +7,7 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.ransac import NOTHING, Hypotheses, search
 from rs_localizer.estimation.sampling import Pool, generator
@@ -14,7 +15,7 @@ from rs_localizer.lab.experiments.competitors import robust_subjects
 from rs_localizer.lab.experiments.plain_ransac import observe
 from rs_localizer.lab.experiments.stopwatch import Subject
 from rs_localizer.lab.experiments.trials import Setting, camera, draw_trials
-from rs_localizer.localizer import Localizer, assumptions
+from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
 
 FRAME = Setting(angular=17.0, linear=0.3, noise=0.5, points=200)

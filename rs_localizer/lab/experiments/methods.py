@@ -15,10 +15,10 @@ import numpy as np
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
+from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.lab.experiments.errors import angles
 from rs_localizer.lab.experiments.kernels import best_solutions, refine_frames
 from rs_localizer.lab.experiments.trials import POINTS, Motions, Trials, camera
-from rs_localizer.localizer import assumptions
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import SOLVERS, find_solver
 

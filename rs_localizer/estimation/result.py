@@ -1,0 +1,45 @@
+"""From a posterior to what users get."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.delay import delay_of
+from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.estimation.searching import Frame
+
+
+def estimate_of(frame: Frame, posterior: Posterior, still: int, samples: int) -> Estimate:
+    """The estimate of an accepted posterior, in the map frame and for all given points.
+
+    Args:
+        still: how many points a global shutter would explain.
+        samples: minimal samples drawn.
+    """
+    state, turn = posterior.state, frame.turn
+    rotation = state[:9].reshape(3, 3)
+    residuals = np.full(frame.count, np.nan)
+    residuals[frame.usable] = np.sqrt(posterior.squared_errors)
+    inliers = np.zeros(frame.count, dtype=np.bool_)
+    inliers[frame.usable] = posterior.inliers
+    found = Estimate(
+        rotation=rotation,
+        translation=state[9:12] - rotation @ frame.centre,
+        angular_velocity=state[12:15],
+        linear_velocity=state[15:18],
+        angular_acceleration=state[18:21],
+        linear_acceleration=state[21:24],
+        inliers=inliers,
+        residuals=residuals,
+        joint_covariance=posterior.covariance,
+        shake=posterior.shake,
+        model_error=posterior.model_error,
+        of_shake_sizes=posterior.of_shake_sizes,
+        of_field_sizes=posterior.of_field_sizes,
+        global_shutter_inliers=still,
+        iterations=samples,
+    )
+    if turn is None:
+        return found
+    return found.turned(turn, delay_of(frame.observations, posterior, turn))
