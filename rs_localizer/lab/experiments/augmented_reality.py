@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rs_localizer.config import SOLVER_NAMES
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
@@ -68,7 +68,9 @@ def run(context: Context) -> Result:
         taken=len(frames),
         speeds=np.array([frame.speed for frame in shown]),
         plain=plain,
+        plain_owners=_owners(deep),
         products=products,
+        owners=_owners(shown),
         positions={solver: e.positions for solver, e in estimates.items()},
         seconds={solver: e.seconds for solver, e in estimates.items()},
         cube=clip.errors,
@@ -82,8 +84,8 @@ def run(context: Context) -> Result:
         "is that of all their corners, each predicted at its own row's pose; a frame without a "
         f"pose has infinite errors. Left: the best of {_SAMPLES} minimal models, as in the paper, "
         f"on the {len(deep)} frames that show more than one wall (six points of a plane are no "
-        f"sample for R6P). Right: the Localizer with at most {_SAMPLES} samples, all frames, each "
-        "for itself.",
+        f"sample for R6P); R9P by its own model. Right: the Localizer with at most "
+        f"{_SAMPLES} samples, all frames, each for itself.",
         claims(found),
         {
             "augmented_reality": _quantile_table(plain, products),
@@ -96,6 +98,11 @@ def run(context: Context) -> Result:
         {"augmented_reality": _figure(plain, products)},
         files={"cube.gif": clip.animation},
     )
+
+
+def _owners(frames: Sequence[MarkerFrame]) -> IntArray:
+    """The frame of each corner."""
+    return np.repeat(np.arange(len(frames)), [len(frame.points) for frame in frames])
 
 
 def _errors(
