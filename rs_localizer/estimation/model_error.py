@@ -20,6 +20,7 @@ from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import FIRST_DEGREE, legendre, shake_basis
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.prior import PriorTerms, add_prior
+from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
 
 # Coefficients of the field: polynomials of the image up to the third degree, in two directions.
@@ -37,6 +38,8 @@ _CHANCE = 1.5
 _MOST_SHARED = 0.9
 # Of the noise, px^2: noise-free data leave rounding errors.
 _LEAST_VARIANCE = 1e-8
+# Of the diagonal: what nothing determines has an inverse.
+RIDGE = 1.0 + 1e-14
 # Where neither shaking nor field explains more than this (logarithm of the likelihood), there is
 # nothing that both could explain.
 _NOTHING_TO_SHARE = 1.0
@@ -365,17 +368,9 @@ def with_model_error(
     matrix = columns.products[:kept, :kept].copy()
     for k in range(PARAMETERS, kept):
         matrix[k, k] += noise * noise / (shake_size * shake_size)
-    scale = np.empty(kept)
-    for i in range(kept):
-        scale[i] = 1.0 / np.sqrt(matrix[i, i])
-    for i in range(kept):
-        for j in range(kept):
-            matrix[i, j] *= scale[i] * scale[j]
-        matrix[i, i] += 1e-14
-    inverse = np.linalg.inv(matrix)
-    for i in range(kept):
-        for j in range(kept):
-            inverse[i, j] *= scale[i] * scale[j]
+    for k in range(kept):
+        matrix[k, k] *= RIDGE
+    inverse = inverted(matrix)
     step = np.zeros(kept)
     covariance = np.empty((kept, kept))
     for i in range(kept):
