@@ -9,7 +9,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.shaking import _share, follow
 from rs_localizer.localizer import assumptions
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 from .projection import (
     STILL,

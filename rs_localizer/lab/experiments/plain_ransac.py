@@ -18,7 +18,7 @@ from rs_localizer.estimation.scoring import best_models
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.methods import Method
 from rs_localizer.lab.experiments.own_model import best_free_motion, solve_all
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 
 def observe(camera: Camera, points: Array, pixels: Array) -> Observations:

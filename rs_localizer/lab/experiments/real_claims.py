@@ -82,9 +82,7 @@ def _equal_to_r6p(found: Mapping[str, Inliers]) -> Claim:
     )
     if m.R6P.name not in found[_HARDEST]:
         return not_tested(*said, "r6p is not part of this version")
-    ratios = [
-        _ratio(found[name], m.VCWT.name, m.R6P.name, len(_SIMULATED)) for name in _SIMULATED
-    ]
+    ratios = [_ratio(found[name], m.VCWT.name, m.R6P.name, len(_SIMULATED)) for name in _SIMULATED]
     return judge_intervals(*said, _listed(found, m.VCWT, m.R6P), ratios, _EQUAL)
 
 
