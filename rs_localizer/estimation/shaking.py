@@ -189,9 +189,10 @@ def _sizes_and_step(
             matrix[i, i] *= RIDGE
         covariance = inverted(matrix)
         for i in range(count):
-            step[i] = 0.0
+            along = 0.0
             for j in range(count):
-                step[i] += covariance[i, j] * right[j]
+                along += covariance[i, j] * right[j]
+            step[i] = along
         if round_ == _SIZE_ROUNDS - 1:
             break
         # Expected squares of the coefficients, and of the errors.
