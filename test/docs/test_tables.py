@@ -60,9 +60,9 @@ def test_the_table_of_solvers() -> None:
     assert said == {name: (it.sample_size, it.solutions) for name, it in solvers.items()}
 
 
-def test_every_solver_has_its_figures() -> None:
+def test_figures_are_of_solvers_that_exist() -> None:
     (table,) = [t for t in pages.all_tables("`solver`", "µs") if t.page == "docs/benchmarks.md"]
-    assert {name for row in table.rows for name in pages.names_in(row[0])} == set(SOLVERS)
+    assert {name for row in table.rows for name in pages.names_in(row[0])} <= set(SOLVERS)
 
 
 def test_the_topics_of_the_localizer() -> None:
