@@ -63,10 +63,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
         "compressed images, or a folder of .jpg or .png files",
     )
+    markers = parser.add_argument_group("what to look for")
+    markers.add_argument("--map", type=Path, metavar="FILE", help="marker map")
+    markers.add_argument(
+        "--board",
+        metavar="6x4",
+        help="instead: a board, inner corners (or circles) along a row x rows",
+    )
+    markers.add_argument(
+        "--pattern",
+        choices=_PATTERNS,
+        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
+    )
     above = number(0.0, above=True)
-    parser.add_argument("--map", type=Path, metavar="FILE", help="marker map")
-    add_board_arguments(parser)
-    parser.add_argument(
+    markers.add_argument(
+        "--square",
+        type=above,
+        metavar="M",
+        help="side of its squares in metres, or distance of its rows of circles",
+    )
+    markers.add_argument(
         "--min-side",
         type=number(0.0),
         default=DetectorConfig().min_side,
@@ -118,25 +134,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--storage", choices=list(STORAGES), default="mcap")
     parser.add_argument(
         "--timing", action="store_true", help="say how long it took, and how much of it OpenCV did"
-    )
-
-
-def add_board_arguments(parser: argparse.ArgumentParser) -> None:
-    """What :func:`find_map` reads beside ``--map``."""
-    board = parser.add_argument_group("a board instead of a map")
-    board.add_argument(
-        "--board", metavar="6x4", help="inner corners (or circles) along a row x rows"
-    )
-    board.add_argument(
-        "--pattern",
-        choices=_PATTERNS,
-        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
-    )
-    board.add_argument(
-        "--square",
-        type=number(0.0, above=True),
-        metavar="M",
-        help="side of its squares in metres, or distance of its rows of circles",
     )
 
 

@@ -48,16 +48,6 @@ def test_a_simulated_flight_against_the_assumed_direction(flight: Path, tmp_path
     assert abs(values["readout_time"] - 0.02) < 4.0 * values["readout_time_deviation"]
 
 
-def test_images_of_markers(tmp_path: Path) -> None:
-    walls, out = tmp_path / "walls", tmp_path / "camera.yaml"
-    words = "--images --trajectory tum_vi_room5 --duration 1.2 --width 320 --height 240 --focal 250"
-    assert main(["simulate", str(walls), *words.split(), "--readout-time", "0.02"]) == 0
-    marker_map = ["--map", str(walls / "marker_map.yaml")]
-    assert main(["calibrate", str(walls), *marker_map, "--out", str(out)]) == 0
-    assert load_params_file(out)["readout_time"] == pytest.approx(0.02, rel=0.05)
-    assert main(["calibrate", str(walls), "--board", "5x4", "--square", "0.1"]) == 1  # none there
-
-
 def test_faults(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", str(tmp_path / "nothing")]) == 1
     assert main(["calibrate", str(flight), "--out", str(tmp_path / "x.txt")]) == 2
