@@ -24,8 +24,8 @@ from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.recognition import recognized
 from rs_localizer.markers.still import rms, still_errors, still_pose
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.frames import Refusal
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
+from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6

@@ -12,7 +12,8 @@ from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transforms.rigid import TransformError
 from rs_localizer.io.transforms.tree import TransformTree
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
 
 _INPUTS = {
     "correspondences": "sensor_msgs/msg/PointCloud2",

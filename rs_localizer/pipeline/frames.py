@@ -7,9 +7,9 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.oddities import oddities
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.solvers import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -61,34 +62,6 @@ _STILL = Estimate(
 )
 
 _NO_TRANSFORM = "no_transform"
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """A frame without a pose; false in a condition.
-
-    Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud``, ``bad_cloud``
-    (a message that cannot be read) and ``no_transform`` (from the camera to ``base_frame``); of
-    keypoints ``no_map``, ``bad_keypoints`` (that cannot be read, or not be compared with the map)
-    and ``no_matches``.
-    """
-
-    reason: str
-    detail: str  # one sentence that says what was found
-
-    def __bool__(self) -> Literal[False]:
-        return False
-
-
-@dataclass(frozen=True, slots=True)
-class Waiting(Refusal):
-    """A localized frame whose mounting is known for earlier times only.
-
-    It is refused, unless somebody asks for it again.
-    """
-
-    again: Callable[[], Frame | Refusal]
-    patience: float  # s, for which this makes sense
 
 
 class FrameLocalizer:

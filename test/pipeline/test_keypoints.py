@@ -23,7 +23,8 @@ from rs_localizer.lab.simulation.landmarks import keypoint_rows, map_rows, rando
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.matching import Matcher
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
 
 READOUT_TIME = 0.03
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=4000)

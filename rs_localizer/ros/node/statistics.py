@@ -13,7 +13,7 @@ import numpy as np
 
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Frame
-from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.gaps import missing
 from rs_localizer.ros.node.refusals import Refusals
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rs_localizer.io.outputs import Frame
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal, Waiting
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.errors import describe
 from rs_localizer.ros.node.mailbox import Mailbox, Update, Work
 from rs_localizer.ros.node.statistics import Statistics

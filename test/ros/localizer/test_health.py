@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.localizer.health import Condition, Level, diagnose, of_interest
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.refusals import Refusals

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sensor_msgs.msg import Image
 
-from rs_localizer.pipeline.frames import Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
 from rs_localizer.ros.node.worker import Worker, wait_for_workers
