@@ -31,6 +31,7 @@ from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
+from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError, Transforms
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.localizer import Localizer
@@ -128,9 +129,9 @@ class FrameLocalizer:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What has to come before a frame can be localized, in words of users."""
-        camera = ("camera_info",) if self._calibration is None else ()
-        return (*camera, "a map") if self._lacks_map else camera
+        """The inputs that have to come before a frame can be localized."""
+        camera = (CAMERA_INFO,) if self._calibration is None else ()
+        return (*camera, MAP_POINTS) if self._lacks_map else camera
 
     @property
     def map(self) -> Map | None:

@@ -134,7 +134,7 @@ def test_a_map_that_is_missing_and_comes_late(
     assert (reason, detail) == (
         "no_map", "no usable map has come yet, on map_points or as map_file"
     )  # fmt: skip
-    assert node.missing == ("a map",)
+    assert node.missing == ("map_points",)
     assert node.map is None
     node.take_map(map_cloud(LANDMARKS))
     assert node.missing == ()
@@ -147,7 +147,7 @@ def test_a_map_that_is_missing_and_comes_late(
 def test_correspondences_need_no_map(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     node = localizer(make_camera_info)
     assert refused(node.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_map"
-    assert node.missing == ("a map",)
+    assert node.missing == ("map_points",)
     rows = np.empty(len(frames[1].points), [(name, "<f8") for name in "xyzuv"])
     for name, column in zip("xyzuv", [*frames[1].points.T, *frames[1].pixels.T], strict=True):
         rows[name] = column

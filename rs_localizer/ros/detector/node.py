@@ -22,6 +22,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from rs_localizer.config import DetectorConfig, ImageTransport
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
+from rs_localizer.io.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, POSE
 from rs_localizer.pipeline.images import Detected, FrameDetector
 from rs_localizer.ros.detector.debug import DebugPictures
 from rs_localizer.ros.detector.health import Condition, Sight, diagnose
@@ -36,8 +37,8 @@ from rs_localizer.ros.node.statistics import WINDOW, Statistics
 from rs_localizer.ros.node.worker import Worker
 from rs_localizer.settings import DETECTOR_NAME, NODE_NAME
 
-RAW, COMPRESSED = "image", "image/compressed"
-_IMAGES = {RAW: Image, COMPRESSED: CompressedImage}
+_IMAGES = {IMAGE: Image, COMPRESSED_IMAGE: CompressedImage}
+_POSE, _ODOMETRY = f"{NODE_NAME}/{POSE}", f"{NODE_NAME}/{ODOMETRY}"
 # How often the node looks whether somebody listens, in s.
 _LOOK_PERIOD = 0.2
 
@@ -193,18 +194,18 @@ class MarkerDetectorNode(RobustLifecycleNode):
         if not debug and not self._outputs.clouds_wanted():
             self._listen(())
             return
-        others = ("camera_info", f"{NODE_NAME}/pose", f"{NODE_NAME}/odometry") if debug else ()
+        others = (CAMERA_INFO, _POSE, _ODOMETRY) if debug else ()
         self._listen((*others, self._image_topic()))
 
     def _image_topic(self) -> str:
         """The topic of the images; where none has a publisher, the one so far."""
         transport = self.get_parameter("transport").value
         if transport != ImageTransport.AUTO:
-            return RAW if transport == ImageTransport.RAW else COMPRESSED
-        for topic in (RAW, COMPRESSED):
+            return IMAGE if transport == ImageTransport.RAW else COMPRESSED_IMAGE
+        for topic in _IMAGES:
             if self.count_publishers(self.resolve_topic_name(topic)):
                 return topic
-        return self._listening[-1] if self._listening else RAW
+        return self._listening[-1] if self._listening else IMAGE
 
     def _listen(self, topics: tuple[str, ...]) -> None:
         if topics == self._listening:
@@ -220,9 +221,9 @@ class MarkerDetectorNode(RobustLifecycleNode):
     def _topics(self) -> dict[str, Topic]:
         images = {name: Topic(kind, self._images(name)) for name, kind in _IMAGES.items()}
         return images | {
-            "camera_info": Topic(CameraInfo, self._take_camera_info, LATCHED),
-            f"{NODE_NAME}/pose": Topic(PoseStamped, self._take_pose),
-            f"{NODE_NAME}/odometry": Topic(Odometry, self._take_odometry),
+            CAMERA_INFO: Topic(CameraInfo, self._take_camera_info, LATCHED),
+            _POSE: Topic(PoseStamped, self._take_pose),
+            _ODOMETRY: Topic(Odometry, self._take_odometry),
         }
 
     # -- inputs, in their thread -------------------------------------------------------------
@@ -239,7 +240,7 @@ class MarkerDetectorNode(RobustLifecycleNode):
         except MessageError as error:
             self.refusals.notice("bad_camera_info", str(error))
             return
-        self._worker.update("camera_info", lambda work: work.debug.take_camera_info(calibration))
+        self._worker.update(CAMERA_INFO, lambda work: work.debug.take_camera_info(calibration))
 
     def _take_pose(self, message: PoseStamped) -> None:
         self._worker.update("pose", lambda work: work.debug.take_pose(message))

@@ -10,6 +10,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
+from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.lab.measures.comparison import Answer
 
@@ -38,9 +39,9 @@ class Listener:
 
     def subscribe(self, node: Any, prefix: str) -> None:
         for message_type, name, callback in (
-            (PoseStamped, "pose", self._take_pose),
-            (TwistStamped, "twist", self._take_twist),
-            (PointCloud2, "inliers", self._take_inliers),
+            (PoseStamped, topics.POSE, self._take_pose),
+            (TwistStamped, topics.TWIST, self._take_twist),
+            (PointCloud2, topics.INLIERS, self._take_inliers),
         ):
             node.create_subscription(message_type, f"{prefix}/{name}", callback, _QOS)
 

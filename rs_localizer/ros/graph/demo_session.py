@@ -19,6 +19,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from rs_localizer.config import PoseTime
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES
 from rs_localizer.lab.measures.comparison import Answer, Recording
 from rs_localizer.process.stopping import StopSignals
 from rs_localizer.ros.graph.demo_listener import Listener
@@ -121,7 +122,7 @@ class Session:
     ) -> None:
         remappings = [f"__ns:={self.namespace}/{name}"]
         remappings += [
-            f"{topic}:={self.namespace}/{topic}" for topic in ("correspondences", "camera_info")
+            f"{topic}:={self.namespace}/{topic}" for topic in (CORRESPONDENCES, CAMERA_INFO)
         ]
         words = [word for remapping in remappings for word in ("-r", remapping)]
         for key, value in parameters.items():
@@ -154,8 +155,8 @@ class _Player:
     ) -> None:
         self._executor = executor
         self._listeners = listeners
-        self._camera_info = node.create_publisher(CameraInfo, "camera_info", _QOS)
-        self._correspondences = node.create_publisher(PointCloud2, "correspondences", _QOS)
+        self._camera_info = node.create_publisher(CameraInfo, CAMERA_INFO, _QOS)
+        self._correspondences = node.create_publisher(PointCloud2, CORRESPONDENCES, _QOS)
 
     def wait_for_nodes(self, recording: Recording, check: Callable[[], None]) -> None:
         """Until all nodes listen, and their answers to a first frame arrive."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from rs_localizer.pipeline.inputs import INPUTS, Role
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import WINDOW, Percentiles, Summary
 from rs_localizer.trajectory.online import MeasuredReadout
@@ -16,8 +17,6 @@ _LOST = 5
 _SOME = 0.05
 # What a node that is not active needs, by the label of its state.
 _STEPS = {"unconfigured": "configure and activate it", "finalized": "start it again"}
-# Refusals of what a frame cannot be localized without.
-_UNUSABLE = {"camera_info": "bad_camera_info", "a map": "bad_map"}
 # A frame that is worked on for longer (s) holds up the others.
 _LONG_WORK = 1.0
 
@@ -37,8 +36,7 @@ class Condition:
 
     life_cycle: str  # label of the state
     changing: bool  # new settings compile kernels
-    missing: Sequence[str]  # what no frame can be localized without: camera_info, a map
-    frame_topics: Sequence[str]  # of the inputs, those with frames
+    missing: Sequence[str]  # inputs without which no frame can be localized
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
     readout: MeasuredReadout | None = None  # as the camera's motion shows it
@@ -54,23 +52,25 @@ class Health:
     values: dict[str, str]
 
 
-def of_interest(
-    silence: Mapping[str, Silence], frame_topics: Sequence[str], missing: Sequence[str]
-) -> dict[str, Silence]:
-    """Without the topics that nobody publishes and nothing waits for.
+def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[str, Silence]:
+    """Without the inputs that nobody publishes and nothing waits for.
 
     Frames come as correspondences or as keypoints; only keypoints need a map.
     """
-    coming = any(silence[name].heard for name in frame_topics if name in silence)
+    coming = any(item.heard for item in _of_frames(silence))
 
     def counts(name: str, item: Silence) -> bool:
         if item.heard or item.mismatch:
             return True
-        if name in frame_topics:
+        if INPUTS[name].role == Role.FRAMES:
             return not coming
-        return name != "map_points" or "a map" in missing
+        return INPUTS[name].necessary or name in missing
 
     return {name: item for name, item in silence.items() if counts(name, item)}
+
+
+def _of_frames(silence: Mapping[str, Silence]) -> list[Silence]:
+    return [item for name, item in silence.items() if INPUTS[name].role == Role.FRAMES]
 
 
 def diagnose(condition: Condition, summary: Summary) -> Health:
@@ -98,9 +98,9 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
     silent = _silent_frames(condition)
     if condition.missing:
         level = Level.WARN if silent else Level.ERROR
-        what = " and ".join(condition.missing)
+        what = " and ".join(INPUTS[name].said for name in condition.missing)
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
-        for reason in (_UNUSABLE[name] for name in condition.missing if name in _UNUSABLE):
+        for reason in (INPUTS[name].refused for name in condition.missing):
             if count := summary.refusals.get(reason):
                 causes.append(f"{count} came and cannot be used: {reason} in the log says why")
         if any(item.mismatch for item in condition.silence.values()):
@@ -113,7 +113,7 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
 
 def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
     """What to say where no frames come; None where they do."""
-    silences = [item for name in condition.frame_topics if (item := condition.silence.get(name))]
+    silences = _of_frames(condition.silence)
     if not silences or any(item.heard and not item.cause for item in silences):
         return None
     causes = [f"{item.topic}: {item.cause}" for item in silences if item.cause]

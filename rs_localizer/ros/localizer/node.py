@@ -20,7 +20,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.localizer.broadcaster import Broadcaster
-from rs_localizer.ros.localizer.feed import FRAME_TOPICS, Feed, described, warm_up
+from rs_localizer.ros.localizer.feed import Feed, described, warm_up
 from rs_localizer.ros.localizer.health import Condition, Health, diagnose, of_interest
 from rs_localizer.ros.localizer.outputs import Outputs
 from rs_localizer.ros.node import parameters, transforms
@@ -190,8 +190,7 @@ class LocalizerNode(RobustLifecycleNode):
             life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,
             missing=missing,
-            frame_topics=FRAME_TOPICS,
-            silence=of_interest(silence, FRAME_TOPICS, missing),
+            silence=of_interest(silence, missing),
             oddities=self.refusals.recent(_ODD, WINDOW)
             | self._broadcaster.fault()
             | ({"readout_time": watch.fault} if watch and watch.fault else {}),

@@ -8,6 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from rs_localizer.io.topics import DIAGNOSTICS
 from rs_localizer.ros.localizer.health import Health, Level
 
 _PERIOD = 1.0  # s
@@ -43,7 +44,7 @@ class Diagnostics:
         self._periods = 0
         # As diagnostic_updater in C++: with the namespace and without the first slash.
         self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {task}"
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 1)
+        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
         self._timer = node.create_timer(
             _PERIOD, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )

@@ -19,9 +19,7 @@ from rs_localizer.trajectory.online import MeasuredReadout
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")
-GOOD = Condition(
-    "active", False, (), ("correspondences",), {"camera_info": COMES, "correspondences": FRAMES}
-)
+GOOD = Condition("active", False, (), {"camera_info": COMES, "correspondences": FRAMES})
 
 
 def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
@@ -222,7 +220,7 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
         ),
         (
             {
-                "missing": ("camera_info", "a map"),
+                "missing": ("camera_info", "map_points"),
                 "silence": {"camera_info": COMES, "correspondences": silent("/c", "")},
             },
             Level.WARN,
@@ -250,7 +248,6 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
         # One of two frame topics is enough.
         (
             {
-                "frame_topics": ("correspondences", "keypoints"),
                 "silence": {"correspondences": FRAMES, "keypoints": silent("/k", "no publisher")},
             },
             Level.OK,
@@ -293,10 +290,10 @@ def test_topics_that_nothing_waits_for_are_left_out() -> None:
     kinds = ("correspondences", "keypoints")
 
     def names(missing: tuple[str, ...] = (), **silence: Silence) -> set[str]:
-        return set(of_interest(silence, kinds, missing))
+        return set(of_interest(silence, missing))
 
     assert names(correspondences=nobody, keypoints=nobody) == set(kinds)
     assert names(correspondences=COMES, keypoints=nobody) == {"correspondences"}
     assert names(correspondences=COMES, keypoints=deaf) == set(kinds)
     assert names(keypoints=COMES, map_points=nobody) == {"keypoints"}
-    assert names(("a map",), keypoints=COMES, map_points=nobody) == {"keypoints", "map_points"}
+    assert names(("map_points",), keypoints=COMES, map_points=nobody) == {"keypoints", "map_points"}
