@@ -41,9 +41,8 @@ def test_the_launch_file_has_every_input() -> None:
 def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name: str) -> None:
     item = INPUTS[name]
     nameless = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
-    broken = SimpleNamespace(
-        header=nameless, fields=[], height=1, width=1, point_step=0, row_step=0
-    )
+    sizes = dict.fromkeys(("height", "width", "point_step", "row_step", "is_bigendian"), 1)
+    broken = SimpleNamespace(header=nameless, fields=[], data=b"", **sizes)
     refusal = item.take(FrameLocalizer(NodeConfig()), broken)
     assert isinstance(refusal, Refusal)
     assert refusal.reason == item.refused
