@@ -16,8 +16,10 @@ from rclpy.serialization import deserialize_message
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Frame
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.conversion import message_class
 from rs_localizer.ros.node.inputs import LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.refusals import Refusals
@@ -41,7 +43,7 @@ class Feed:
 
     def __init__(
         self,
-        worker: Worker,
+        worker: Worker[FrameLocalizer, Frame],
         frames: FrameLocalizer,
         refusals: Refusals,
         say: Callable[[str], Any],
@@ -71,9 +73,15 @@ class Feed:
 
     def _frames_topic(self, item: Input) -> Topic:
         """A topic whose messages the worker localizes."""
+
+        def localize(frames: FrameLocalizer, message: Any) -> Frame | Refusal:
+            result = item.take(frames, message)
+            assert result is not None  # a frame has one
+            return result
+
         return Topic(
             message_class(item.type),
-            lambda message: self._worker.localize(item.topic, message, item.take),
+            lambda message: self._worker.process(item.topic, message, localize),
         )
 
     def _state_topic(self, item: Input) -> Topic:

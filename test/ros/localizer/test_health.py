@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.localizer.health import Condition, Level, diagnose, of_interest
+from rs_localizer.ros.localizer.answers import tell
+from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest
+from rs_localizer.ros.node.health import Level
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
@@ -41,7 +43,9 @@ class World:
     def __init__(self) -> None:
         self.now = 1000.0
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Statistics(self.refusals, lambda: round(self.now * 1e9), lambda: self.now)
+        self.statistics = Statistics(
+            self.refusals, tell, lambda: round(self.now * 1e9), lambda: self.now
+        )
 
     def receive(self) -> None:
         seconds, nanoseconds = divmod(round(self.now * 1e9), 1_000_000_000)
@@ -159,7 +163,7 @@ def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
 
 
 def test_the_readout_time_that_the_motion_shows() -> None:
-    summary, name = Statistics(Refusals(print)).summary(), "Readout time seen (ms)"
+    summary, name = Statistics(Refusals(print), tell).summary(), "Readout time seen (ms)"
     assert name not in diagnose(GOOD, summary).values
     seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100))
     assert diagnose(seen, summary).values[name] == "-20.04 +- 0.12"
