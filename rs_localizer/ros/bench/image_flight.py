@@ -207,8 +207,7 @@ class _Flight:
             _START_TIMEOUT,
             "the nodes do not listen",
         )
-        end = time.monotonic() + _ACQUAINTANCE
-        self._wait(lambda: time.monotonic() > end, _START_TIMEOUT, "")
+        self._wait_until(time.monotonic() + _ACQUAINTANCE)
 
     def send(self, images: Path, offline: Mapping[str, Mapping[int, Any]]) -> int:
         """All images of a bag; the answers that replay has are waited for."""
@@ -251,12 +250,15 @@ class _Flight:
                 self._infos.publish(message)
                 continue
             due = start + len(sent) / rate
-            self._wait(lambda due=due: time.monotonic() >= due, _ANSWER_TIMEOUT, "")
+            self._wait_until(due)
             sent[stamp_ns(message)] = time.monotonic()
             self._images.publish(message)
-        end = time.monotonic() + _LAST_ANSWERS
-        self._wait(lambda: time.monotonic() > end, _ANSWER_TIMEOUT, "")
+        self._wait_until(time.monotonic() + _LAST_ANSWERS)
         return sent
+
+    def _wait_until(self, due: float) -> None:
+        """Hear what comes until then (time.monotonic())."""
+        self._wait(lambda: time.monotonic() >= due, _START_TIMEOUT, "")
 
     def _answered(self, image: int, pose: int | None, topics: list[str]) -> bool:
         return image in self._detected and all(pose in self.heard[topic] for topic in topics)
