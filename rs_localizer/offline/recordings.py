@@ -28,7 +28,6 @@ class Recorded:
 
     calibration: Calibration
     clouds: tuple[Correspondences, ...]
-    unreadable: Counter[str]  # messages that could not be used, by what was wrong
 
     @property
     def map_frame(self) -> str:
@@ -75,4 +74,4 @@ def read_recording(
     if not clouds:
         why = f"; {faults.most_common(1)[0][0]}" if faults else ""
         raise RecordingError(f"{bag.path} has no usable correspondences{why}")
-    return Recorded(calibration, tuple(clouds), faults)
+    return Recorded(calibration, tuple(clouds))
