@@ -65,19 +65,22 @@ def with_model_error(
     for i in range(kept):
         for j in range(kept):
             inverse[i, j] *= scale[i] * scale[j]
-    step = np.zeros(kept)
+    step = np.empty(kept)
     covariance = np.empty((kept, kept))
     for i in range(kept):
+        total = 0.0
         for k in range(kept):
-            step[i] += inverse[i, k] * columns.with_errors[k]
+            total += inverse[i, k] * columns.with_errors[k]
+        step[i] = total
         for j in range(kept):
             covariance[i, j] = noise * noise * inverse[i, j]
     for column in range(kept, size):
-        pulled = np.zeros(kept)
+        pulled = np.empty(kept)
         for i in range(kept):
+            total = 0.0
             for k in range(kept):
-                pulled[i] += inverse[i, k] * columns.products[k, column]
-            pulled[i] *= field_size
+                total += inverse[i, k] * columns.products[k, column]
+            pulled[i] = total * field_size
         for i in range(kept):
             for j in range(kept):
                 covariance[i, j] += pulled[i] * pulled[j]

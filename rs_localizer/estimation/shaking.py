@@ -194,10 +194,12 @@ def _sizes_and_step(
             scaled[i, i] += 1e-14
         inverse = np.linalg.inv(scaled)
         for i in range(count):
-            step[i] = 0.0
             for j in range(count):
                 covariance[i, j] = scale[i] * scale[j] * inverse[i, j]
-                step[i] += covariance[i, j] * right[j]
+            along = 0.0
+            for j in range(count):
+                along += covariance[i, j] * right[j]
+            step[i] = along
         if round_ == _SIZE_ROUNDS - 1:
             break
         # Expected squares of the coefficients, and of the errors.
