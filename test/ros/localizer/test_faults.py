@@ -769,7 +769,7 @@ def replaced_within_a_frame(world: World) -> str:
     before = len(world.peer.poses)
     world.wait(lambda: world.send(keypoints(world)) or started.wait(0.1))
     world.send(map_message(world, frame="hall"))
-    world.wait(lambda: "map" in world.node.worker._mailbox._updates)
+    world.wait(lambda: "map_points" in world.node.worker._mailbox._updates)
     go_on.set()
     world.wait(lambda: len(world.peer.poses) > before)
     assert world.peer.poses[before].header.frame_id == "map"
