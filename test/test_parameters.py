@@ -21,7 +21,6 @@ TOO_MANY = {
     "estimation/shaking.py: follow",
     "lab/experiments/results.py: judge",
     "lab/experiments/results.py: judge_intervals",
-    "localizer.py: _frame",
 }
 
 
