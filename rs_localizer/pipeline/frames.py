@@ -39,7 +39,7 @@ from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.oddities import oddities
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
 
 # Stands in until the first CameraInfo: kernels are compiled and settings checked before it comes.
@@ -426,8 +426,6 @@ def _build(
     camera = calibration.camera(config.readout_time, config.scan_direction)
     localizer = Localizer(camera, config)
     follows = (
-        config.tracking
-        and config.readout_time > 0.0
-        and find_solver(config.solver).rolling_shutter
+        config.tracking and config.readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     )
     return camera, localizer, Tracker(localizer) if follows else None
