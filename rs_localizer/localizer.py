@@ -20,7 +20,7 @@ from rs_localizer.estimation.assumptions import (
     with_experience,
 )
 from rs_localizer.estimation.inputs import checked, unfit
-from rs_localizer.estimation.observing import find_usable, packed
+from rs_localizer.estimation.observing import Observed, find_usable, packed
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import (
     Prior,
@@ -32,7 +32,7 @@ from rs_localizer.estimation.ransac import Candidate
 from rs_localizer.estimation.refine import step_between
 from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.sampling import generator
-from rs_localizer.estimation.searching import Frame, MotionSearch
+from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.estimation.settling import settle
 from rs_localizer.solvers.table import find_solver
 
@@ -95,7 +95,7 @@ class Localizer:
         expected_share: float = 0.5,
         turn: KnownTurn | None = None,
     ) -> Estimate | Failure:
-        """Estimate pose and velocities from one frame.
+        """Estimate pose and velocities from one image.
 
         Args:
             points: (n,3) in the map frame, metres.
@@ -124,7 +124,7 @@ class Localizer:
         failure = unfit(self.camera, pixels, usable.indices, usable.shown, self.config.min_inliers)
         if failure is not None:
             return failure
-        frame = Frame(
+        observed = Observed(
             packed(self.camera, points, pixels, usable),
             usable.indices,
             len(points),
@@ -137,54 +137,55 @@ class Localizer:
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
         if prior is not None and prior.motion is not None:
-            tracked = self._track(frame, prior, expected_share)
+            tracked = self._track(observed, prior, expected_share)
             if tracked:
                 return replace(tracked, tracked=True)
         # 3. A global-shutter start, then hypotheses of the solver (LO-RANSAC).
-        start, best = self._search.find(frame)
+        start, best = self._search.find(observed)
         if not start.found:
             return Failure(Reason.NO_HYPOTHESIS, "no three points gave a pose")
         # 4. Maximum a posteriori on the inliers; rest or motion; the mirrored pose of a plane.
-        posterior = self._settle(frame, best, frame.terms)
+        posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
-        return self._accept(frame, start, best, posterior)
+        return self._accept(observed, start, best, posterior)
 
-    def _track(self, frame: Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
+    def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
         assert prior.motion is not None
         threshold = self.config.inlier_threshold
-        predicted = state_in(prior.motion, frame.centre)
-        terms = with_motion(frame.terms, prior, frame.centre, frame.turn is not None)
-        best = self._search.optimize(frame, predicted, _PREDICTION_SCALE * threshold, terms)
+        predicted = state_in(prior.motion, observed.centre)
+        terms = with_motion(observed.terms, prior, observed.centre, observed.turn is not None)
+        best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
         start = Candidate(predicted, best.cost)
-        posterior = self._settle(frame, best, terms)
+        posterior = self._settle(observed, best, terms)
         innovation = step_between(predicted, posterior.state)
         if innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION:
-            posterior = self._settle(frame, best, frame.terms)  # a jump: the points know better
-        result = self._accept(frame, start, best, posterior)
+            # A jump: the points know better.
+            posterior = self._settle(observed, best, observed.terms)
+        result = self._accept(observed, start, best, posterior)
         if result and np.count_nonzero(result.inliers) < (
-            _STILL_TRACKED * expected_share * len(frame.usable)
+            _STILL_TRACKED * expected_share * len(observed.usable)
         ):
             return Failure(
                 Reason.TOO_FEW_INLIERS,
                 f"{np.count_nonzero(result.inliers)} inliers near the prior motion, "
-                f"{expected_share:.0%} of {len(frame.usable)} were expected",
+                f"{expected_share:.0%} of {len(observed.usable)} were expected",
             )
         return result
 
-    def _settle(self, frame: Frame, best: Candidate, terms: PriorTerms) -> Posterior:
+    def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.
         may_rest = self._assumed.may_rest and len(terms.informations) == 1
-        assumed = replace(frame.assumed, may_rest=may_rest)
+        assumed = replace(observed.assumed, may_rest=may_rest)
         threshold = self.config.inlier_threshold
-        return settle(frame.observations, best.state, terms, threshold, assumed)
+        return settle(observed.observations, best.state, terms, threshold, assumed)
 
     def _accept(
-        self, frame: Frame, start: Candidate, best: Candidate, posterior: Posterior
+        self, observed: Observed, start: Candidate, best: Candidate, posterior: Posterior
     ) -> Estimate | Failure:
         """Accept the motion or say what is wrong with it."""
         failure = refusal(
-            frame.observations,
+            observed.observations,
             posterior,
             best.samples,
             min_inliers=self.config.min_inliers,
@@ -193,5 +194,5 @@ class Localizer:
         )
         if failure is not None:
             return failure
-        still = self._search.global_shutter_inliers(frame, start)
-        return estimate_of(frame, posterior, still, best.samples)
+        still = self._search.global_shutter_inliers(observed, start)
+        return estimate_of(observed, posterior, still, best.samples)

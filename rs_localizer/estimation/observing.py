@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,27 @@ from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.steadied import steadied
 from rs_localizer.estimation.inputs import distinct, median_point, near_image
 from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.sampling import Random
+from rs_localizer.estimation.settling import Assumed
 
 # Points farther away than this (m) are faults, and their squares would be infinite.
 _FARTHEST_POINT = 1e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """The points of one image on their way through the steps, and what is known beside them."""
+
+    observations: Observations
+    usable: IntArray  # which of the given points are observed
+    count: int  # of the given points
+    centre: Array  # (3,) map frame: origin of the observed points
+    ranking: IntArray | None  # observed points from the best to the worst
+    terms: PriorTerms  # velocity prior and whatever else is known but the pose
+    random: Random
+    assumed: Assumed
+    turn: KnownTurn | None  # what the observations are steadied by
 
 
 class Usable(NamedTuple):

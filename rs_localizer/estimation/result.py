@@ -6,26 +6,26 @@ import numpy as np
 
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.delay import delay_of
+from rs_localizer.estimation.observing import Observed
 from rs_localizer.estimation.posterior import Posterior
-from rs_localizer.estimation.searching import Frame
 
 
-def estimate_of(frame: Frame, posterior: Posterior, still: int, samples: int) -> Estimate:
+def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: int) -> Estimate:
     """The estimate of an accepted posterior, in the map frame and for all given points.
 
     Args:
         still: how many points a global shutter would explain.
         samples: minimal samples drawn.
     """
-    state, turn = posterior.state, frame.turn
+    state, turn = posterior.state, observed.turn
     rotation = state[:9].reshape(3, 3)
-    residuals = np.full(frame.count, np.nan)
-    residuals[frame.usable] = np.sqrt(posterior.squared_errors)
-    inliers = np.zeros(frame.count, dtype=np.bool_)
-    inliers[frame.usable] = posterior.inliers
+    residuals = np.full(observed.count, np.nan)
+    residuals[observed.usable] = np.sqrt(posterior.squared_errors)
+    inliers = np.zeros(observed.count, dtype=np.bool_)
+    inliers[observed.usable] = posterior.inliers
     found = Estimate(
         rotation=rotation,
-        translation=state[9:12] - rotation @ frame.centre,
+        translation=state[9:12] - rotation @ observed.centre,
         angular_velocity=state[12:15],
         linear_velocity=state[15:18],
         angular_acceleration=state[18:21],
@@ -42,4 +42,4 @@ def estimate_of(frame: Frame, posterior: Posterior, still: int, samples: int) ->
     )
     if turn is None:
         return found
-    return found.turned(turn, delay_of(frame.observations, posterior, turn))
+    return found.turned(turn, delay_of(observed.observations, posterior, turn))

@@ -1,22 +1,18 @@
-"""The search for the motion of a frame: a global-shutter start, then the solver's hypotheses."""
+"""The search for the motion of an image: a global-shutter start, then the solver's hypotheses."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.observing import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.ransac import NOTHING, Candidate, Hypotheses, search
-from rs_localizer.estimation.sampling import Pool, Random
+from rs_localizer.estimation.sampling import Pool
 from rs_localizer.estimation.scoring import optimize
-from rs_localizer.estimation.settling import Assumed
 from rs_localizer.solvers.table import Solver, find_solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -37,21 +33,6 @@ _SAME_GROUP = 0.5
 _SECOND_LOOK_SAMPLES = 96
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """One frame on its way through the steps."""
-
-    observations: Observations
-    usable: IntArray  # which of the given points are observed
-    count: int  # of the given points
-    centre: Array  # (3,) map frame: origin of the observed points
-    ranking: IntArray | None  # observed points from the best to the worst
-    terms: PriorTerms  # velocity prior and whatever else is known but the pose
-    random: Random
-    assumed: Assumed
-    turn: KnownTurn | None  # what the observations are steadied by
-
-
 class MotionSearch:
     """Finds the motion that most points of a frame agree on."""
 
@@ -60,38 +41,38 @@ class MotionSearch:
         self._solver = solver
         self._focal_length = camera.focal_length
 
-    def find(self, frame: Frame) -> tuple[Candidate, Candidate]:
+    def find(self, observed: Observed) -> tuple[Candidate, Candidate]:
         """The global-shutter start and the motion found from it; the start may not be found."""
-        everything = np.arange(len(frame.observations))
+        everything = np.arange(len(observed.observations))
         most = self._config.max_iterations
         first = min(_FIRST_SAMPLES, most) if self._solver.rolling_shutter else most
-        start = self._global_shutter(frame, everything, first)
-        best = self._motion(frame, start, first)
+        start = self._global_shutter(observed, everything, first)
+        best = self._motion(observed, start, first)
         if first < most:
-            start, best = self._go_on(frame, start, best)
-        return self._largest_group(frame, start, best)
+            start, best = self._go_on(observed, start, best)
+        return self._largest_group(observed, start, best)
 
     def _go_on(
-        self, frame: Frame, start: Candidate, best: Candidate
+        self, observed: Observed, start: Candidate, best: Candidate
     ) -> tuple[Candidate, Candidate]:
         """The start and the motion after more samples, where the first ones may not be enough."""
-        most, inliers = self._config.max_iterations, self._inliers(frame, best)
+        most, inliers = self._config.max_iterations, self._inliers(observed, best)
         if start.samples >= _FIRST_SAMPLES and self._missed(inliers, start.samples):
-            later = self._global_shutter(frame, np.arange(len(inliers)), most, start)
-            if not np.any(inliers) or np.mean(self._near(frame, later)[inliers]) < _SAME_GROUP:
-                rival = self._motion(frame, later, most)
+            later = self._global_shutter(observed, np.arange(len(inliers)), most, start)
+            if not np.any(inliers) or np.mean(self._near(observed, later)[inliers]) < _SAME_GROUP:
+                rival = self._motion(observed, later, most)
                 if rival.cost < best.cost:
                     return later, rival
             elif later.cost < start.cost:
                 start = later
         if best.samples >= _FIRST_SAMPLES:
-            best = self._motion(frame, start, most, best)
+            best = self._motion(observed, start, most, best)
         return start, best
 
-    def _inliers(self, frame: Frame, best: Candidate) -> BoolArray:
+    def _inliers(self, observed: Observed, best: Candidate) -> BoolArray:
         if not best.found:
-            return np.zeros(len(frame.observations), dtype=np.bool_)
-        errors = frame.observations.squared_errors(best.state)
+            return np.zeros(len(observed.observations), dtype=np.bool_)
+        errors = observed.observations.squared_errors(best.state)
         inliers: BoolArray = errors < self._config.inlier_threshold**2
         return inliers
 
@@ -106,7 +87,7 @@ class MotionSearch:
         return chance > 1.0 - self._config.confidence
 
     def _largest_group(
-        self, frame: Frame, start: Candidate, best: Candidate
+        self, observed: Observed, start: Candidate, best: Candidate
     ) -> tuple[Candidate, Candidate]:
         """The start and the motion of another group of points, if it is the larger one.
 
@@ -115,28 +96,28 @@ class MotionSearch:
         """
         if not best.found:
             return start, best
-        others = np.flatnonzero(~self._near(frame, start))
+        others = np.flatnonzero(~self._near(observed, start))
         # At the widest gate of the final estimate, so that noise hides none of them.
         gate = WIDEST_GATE * self._config.inlier_threshold
-        inliers = frame.observations.squared_errors(best.state) < gate**2
+        inliers = observed.observations.squared_errors(best.state) < gate**2
         if not self._solver.rolling_shutter or len(others) <= np.count_nonzero(inliers):
             return start, best
-        second = self._global_shutter(frame, others, _SECOND_LOOK_SAMPLES)
+        second = self._global_shutter(observed, others, _SECOND_LOOK_SAMPLES)
         if not second.found or (
-            np.count_nonzero(self._near(frame, second)[others]) <= np.count_nonzero(inliers)
+            np.count_nonzero(self._near(observed, second)[others]) <= np.count_nonzero(inliers)
         ):
             return start, best
-        rival = self._motion(frame, second, self._config.max_iterations)
+        rival = self._motion(observed, second, self._config.max_iterations)
         return (second, rival) if rival.cost < best.cost else (start, best)
 
-    def _near(self, frame: Frame, start: Candidate) -> BoolArray:
+    def _near(self, observed: Observed, start: Candidate) -> BoolArray:
         """Which points may belong to a motion whose global-shutter pose this is."""
-        errors = frame.observations.squared_errors(start.state)
+        errors = observed.observations.squared_errors(start.state)
         near: BoolArray = errors < (_POOL_SCALE * self._focal_length) ** 2
         return near
 
     def _global_shutter(
-        self, frame: Frame, among: IntArray, most: int, before: Candidate = NOTHING
+        self, observed: Observed, among: IntArray, most: int, before: Candidate = NOTHING
     ) -> Candidate:
         """A pose that fits all rows roughly, by P3P on some points and a wide threshold."""
         threshold = self._config.inlier_threshold
@@ -149,40 +130,40 @@ class MotionSearch:
             find_solver("p3p"), _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
         )
         return search(
-            frame.observations,
+            observed.observations,
             hypotheses,
             [np.eye(3)],
-            _pools(frame, among),
+            _pools(observed, among),
             before,
             self._config.confidence,
             most,
-            frame.random,
+            observed.random,
         )
 
     def _motion(
-        self, frame: Frame, start: Candidate, most: int, before: Candidate | None = None
+        self, observed: Observed, start: Candidate, most: int, before: Candidate | None = None
     ) -> Candidate:
         """The motion that most points agree on, from the solver's hypotheses."""
         if not self._solver.rolling_shutter or not start.found:
             return start
         threshold = self._config.inlier_threshold
-        near = np.flatnonzero(self._near(frame, start))
+        near = np.flatnonzero(self._near(observed, start))
         # The global-shutter pose is a hypothesis, too: at rest it is the best one.
         if before is None:
             scale = _POOL_SCALE * self._focal_length
-            before = self.optimize(frame, start.state, scale, frame.terms)
+            before = self.optimize(observed, start.state, scale, observed.terms)
         hypotheses = self._hypotheses(
-            self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, frame.terms
+            self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, observed.terms
         )
         return search(
-            frame.observations,
+            observed.observations,
             hypotheses,
             [start.state[:9].reshape(3, 3)],
-            [Pool(near), *_pools(frame, np.arange(len(frame.observations)))],
+            [Pool(near), *_pools(observed, np.arange(len(observed.observations)))],
             before,
             self._config.confidence,
             most,
-            frame.random,
+            observed.random,
         )
 
     def _hypotheses(
@@ -217,14 +198,14 @@ class MotionSearch:
         )
 
     def optimize(
-        self, frame: Frame, state: Array, first_scale: float, terms: PriorTerms
+        self, observed: Observed, state: Array, first_scale: float, terms: PriorTerms
     ) -> Candidate:
         """Local optimisation of one state down to the inlier threshold."""
         optimized, cost = optimize(
             state[None],
             np.zeros(1),
-            frame.observations.packed,
-            frame.observations.row_time_gradient,
+            observed.observations.packed,
+            observed.observations.row_time_gradient,
             first_scale,
             self._config.inlier_threshold,
             terms,
@@ -232,17 +213,19 @@ class MotionSearch:
         )
         return Candidate(optimized, cost)
 
-    def global_shutter_inliers(self, frame: Frame, start: Candidate) -> int:
+    def global_shutter_inliers(self, observed: Observed, start: Candidate) -> int:
         """How many points a global-shutter pose explains at the inlier threshold."""
         threshold = self._config.inlier_threshold
         still = np.concatenate([start.state[:12], np.zeros(12)])
-        pose = self.optimize(frame, still, 2.0 * _SCORE_SCALE * threshold, held_terms())
-        return int(np.count_nonzero(frame.observations.squared_errors(pose.state) < threshold**2))
+        pose = self.optimize(observed, still, 2.0 * _SCORE_SCALE * threshold, held_terms())
+        return int(
+            np.count_nonzero(observed.observations.squared_errors(pose.state) < threshold**2)
+        )
 
 
-def _pools(frame: Frame, among: IntArray) -> list[Pool]:
+def _pools(observed: Observed, among: IntArray) -> list[Pool]:
     everything = Pool(among)
     # Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
-    if frame.ranking is None:
+    if observed.ranking is None:
         return [everything]
-    return [Pool(frame.ranking[np.isin(frame.ranking, among)], ranked=True), everything]
+    return [Pool(observed.ranking[np.isin(observed.ranking, among)], ranked=True), everything]

@@ -45,14 +45,16 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
                 total -= factor[i, k] * factor[j, k]
             factor[i, j] = np.sqrt(max(total, _NOISE * _NOISE)) if i == j else total / factor[j, j]
         for axis in range(3):
+            left = solved[i, axis]
             for k in range(i):
-                solved[i, axis] -= factor[i, k] * solved[k, axis]
-            solved[i, axis] /= factor[i, i]
+                left -= factor[i, k] * solved[k, axis]
+            solved[i, axis] = left / factor[i, i]
     for i in range(count - 1, -1, -1):
         for axis in range(3):
+            left = solved[i, axis]
             for k in range(i + 1, count):
-                solved[i, axis] -= factor[k, i] * solved[k, axis]
-            solved[i, axis] /= factor[i, i]
+                left -= factor[k, i] * solved[k, axis]
+            solved[i, axis] = left / factor[i, i]
     dense, found = np.empty(2 * count - 1), np.zeros((2 * count - 1, 3))
     for i in range(count):
         dense[2 * i] = times[i]

@@ -142,9 +142,11 @@ def _within(
     if rough * min(deviation / _NEAR, 1.0) > _MOST_ROUGH:
         for k in range(6):
             variances[k] += rough * rough * (2.0 if k < 3 else 2.0 * _WAVE_SLOPE)
+            uncertain = 0.0
             for column in range(PARAMETERS):
                 own = by_parameters[k, column]
-                variances[k] += own * own * of_parameters[column, column]
+                uncertain += own * own * of_parameters[column, column]
+            variances[k] += uncertain
         by_parameters[:] = 0.0
     error = by_parameters @ of_parameters @ by_parameters.T
     for k in range(6):
