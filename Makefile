@@ -37,6 +37,8 @@ test: lint
 
 lint: $(ready)
 	@$(python) -m ruff check --quiet --output-format concise .
+	@$(python) -m ruff format --quiet --check .
+	@$(python) -m codespell_lib
 	@$(python) -m mypy --no-error-summary
 
 $(ready): setup.py pyproject.toml Makefile

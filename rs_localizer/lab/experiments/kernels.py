@@ -5,23 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.jit import kernel
-from rs_localizer.core.prior import PriorTerms
-from rs_localizer.core.refine import refine
-from rs_localizer.core.residuals import (
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.refine import refine
+from rs_localizer.estimation.residuals import (
     normal_equations,
     pack,
     set_weights,
     squared_errors,
     truncated_cost,
 )
-from rs_localizer.core.scoring import optimize, state_of_model
-from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.estimation.scoring import optimize, state_of_model
 
 
 @kernel
 def best_solutions(
-    models: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array,
+    models: Array,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    by_ray: Array,
+    gradient: Array,
     scale: float,
 ) -> Array:
     """Of the solutions (h,k,18) of each frame the one with the least truncated error: (h,18).
@@ -46,8 +51,14 @@ def best_solutions(
 
 @kernel
 def refine_frames(
-    models: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array,
-    threshold: float, prior: PriorTerms,
+    models: Array,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    by_ray: Array,
+    gradient: Array,
+    threshold: float,
+    prior: PriorTerms,
 ) -> Array:
     """Local optimisation and final refinement of the Localizer on all points: states (h,24)."""
     states = np.full((len(models), STATE_SIZE), np.nan)

@@ -158,9 +158,7 @@ def _best(models: Array, trials: Trials, scale: float) -> Array:
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
     prior, _ = assumptions(camera(), LocalizerConfig(), find_solver("r6p_vcwt"))
-    found = refine_frames(
-        np.ascontiguousarray(models), *view_arguments(trials), threshold, prior
-    )
+    found = refine_frames(np.ascontiguousarray(models), *view_arguments(trials), threshold, prior)
     w, velocity = -found[:, 12:15], found[:, 15:18]
     translation = found[:, 9:12]
     return Motions(found[:, :9].reshape(-1, 3, 3), translation, w,

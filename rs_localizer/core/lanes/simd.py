@@ -1,0 +1,321 @@
+"""Straight-line SIMD code for Numba, written as plain Python arithmetic.
+
+A minimal solver is a few hundred multiplications on a system of fixed size, needed for thousands
+of samples. :func:`traced` turns a Python function on numbers into a Numba-callable function that
+works on ``LANES`` samples at once: the Python function runs once, at compile time, on
+:class:`Lanes` objects that record every operation as one LLVM vector instruction. Loops over
+rows and columns are thereby unrolled, intermediate matrices live in registers and on the stack,
+and nothing is left to an auto-vectorizer. Values of the lanes never mix, and a structural zero
+(the Python number 0.0) costs nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Union
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+LANES = 8  # one AVX-512 register of doubles; narrower machines split it
+
+_VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+_get_or_insert_function: Any = cgutils.get_or_insert_function
+_alloca_once: Any = cgutils.alloca_once
+_FLAGS = ("contract", "nsz", "arcp")  # a*b + c may fuse; NaN and infinity keep their meaning
+
+Number = Union["Lanes", float]
+
+
+class Lanes:
+    """One double per lane, as a value in the LLVM code being built."""
+
+    __slots__ = ("builder", "value")
+
+    def __init__(self, builder: Any, value: Any) -> None:
+        self.builder = builder
+        self.value = value
+
+    def _apply(self, name: str, left: Any, right: Any) -> Lanes:
+        return Lanes(self.builder, getattr(self.builder, name)(left, right, flags=_FLAGS))
+
+    def __add__(self, other: Number) -> Lanes:
+        if _is_number(other, 0.0):
+            return self
+        return self._apply("fadd", self.value, _operand(other))
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Number) -> Lanes:
+        if _is_number(other, 0.0):
+            return self
+        return self._apply("fsub", self.value, _operand(other))
+
+    def __rsub__(self, other: Number) -> Lanes:
+        if _is_number(other, 0.0):
+            return -self
+        return self._apply("fsub", _operand(other), self.value)
+
+    def __mul__(self, other: Number) -> Any:
+        if _is_number(other, 0.0):
+            return 0.0
+        if _is_number(other, 1.0):
+            return self
+        return self._apply("fmul", self.value, _operand(other))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Number) -> Lanes:
+        return self._apply("fdiv", self.value, _operand(other))
+
+    def __rtruediv__(self, other: Number) -> Lanes:
+        return self._apply("fdiv", _operand(other), self.value)
+
+    def __neg__(self) -> Lanes:
+        return Lanes(self.builder, self.builder.fneg(self.value))
+
+    def __abs__(self) -> Lanes:
+        return self._call("llvm.fabs")
+
+    def __lt__(self, other: Number) -> Mask:
+        return self._compare("<", other)
+
+    def __gt__(self, other: Number) -> Mask:
+        return self._compare(">", other)
+
+    def _compare(self, relation: str, other: Number) -> Mask:
+        value = self.builder.fcmp_ordered(relation, self.value, _operand(other))
+        return Mask(self.builder, value)
+
+    def _call(self, name: str) -> Lanes:
+        function = _get_or_insert_function(
+            self.builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), f"{name}.v{LANES}f64"
+        )
+        return Lanes(self.builder, self.builder.call(function, [self.value]))
+
+    def _sqrt(self) -> Lanes:
+        return self._call("llvm.sqrt")
+
+
+class Mask:
+    """One truth value per lane; comparisons with NaN are false."""
+
+    __slots__ = ("builder", "value")
+
+    def __init__(self, builder: Any, value: Any) -> None:
+        self.builder = builder
+        self.value = value
+
+    def __and__(self, other: Mask) -> Mask:
+        return Mask(self.builder, self.builder.and_(self.value, other.value))
+
+
+def sqrt(number: Any) -> Any:
+    """Square root, of lanes (NaN where negative) or of a number."""
+    return number._sqrt() if isinstance(number, Lanes) else math.sqrt(number)
+
+
+def select(condition: Any, if_true: Any, if_false: Any) -> Any:
+    """Lane by lane one value or the other; of a plain truth value, the whole one."""
+    if not isinstance(condition, Mask):
+        return if_true if condition else if_false
+    chosen = condition.builder.select(condition.value, _operand(if_true), _operand(if_false))
+    return Lanes(condition.builder, chosen)
+
+
+def _operand(number: Number) -> Any:
+    if isinstance(number, Lanes):
+        return number.value
+    return ir.Constant(_VECTOR, [float(number)] * LANES)
+
+
+def _is_number(value: Any, number: float) -> bool:
+    return not isinstance(value, Lanes) and value == number
+
+
+def traced(body: Callable[[list[Lanes]], Sequence[Number]], *inputs: int) -> Any:
+    """Make a Numba-callable ``function(source, ..., target)`` of straight-line arithmetic.
+
+    Args:
+        body: takes a list of lanes, returns the outputs; plain Python arithmetic.
+        inputs: how many values each source holds; the body gets them in one list.
+
+    Returns:
+        a function for use inside kernels; sources and target are flat float64 arrays of ``LANES``
+        doubles per value. The target may be one of the sources: all is read before any write.
+    """
+
+    def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def element(argument: int, i: int) -> Any:
+            array = context.make_array(signature.args[argument])(context, builder, args[argument])
+            base = builder.bitcast(array.data, _VECTOR.as_pointer())
+            return builder.gep(base, [ir.Constant(ir.IntType(64), i)])
+
+        lanes = [
+            Lanes(builder, builder.load(element(argument, i), align=8))
+            for argument, count in enumerate(inputs)
+            for i in range(count)
+        ]
+        for i, number in enumerate(body(lanes)):
+            builder.store(_operand(number), element(len(inputs), i), align=8)
+        return context.get_dummy_value()
+
+    # Numba reads the number of arguments off the function that it is given.
+    @intrinsic
+    def one_source(typingctx: Any, source: Any, target: Any) -> Any:
+        return types.void(source, target), compile_call
+
+    @intrinsic
+    def two_sources(typingctx: Any, source: Any, uniform: Any, target: Any) -> Any:
+        return types.void(source, uniform, target), compile_call
+
+    return one_source if len(inputs) == 1 else two_sources
+
+
+def traced_sums(inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Number]], int]) -> Any:
+    """Make a Numba-callable ``function(source, blocks, target)`` of sums over points.
+
+    Args:
+        inputs: how many values a block of the source holds.
+        bodies: each takes a list of lanes and returns terms, as in :func:`traced`, and how many it
+            returns. It goes through all blocks on its own, with its sums in registers, so it should
+            not return more than 20.
+
+    Returns:
+        a function for use inside kernels: the target gets one number for each term of each body,
+        its sum over all lanes of the first ``blocks`` blocks.
+    """
+
+    @intrinsic
+    def sums(typingctx: Any, source: Any, blocks: Any, target: Any) -> Any:
+        def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            source_data, target_data = (
+                context.make_array(signature.args[i])(context, builder, args[i]).data
+                for i in (0, 2)
+            )
+            first = builder.bitcast(source_data, _VECTOR.as_pointer())
+            place = 0
+            for body, count in bodies:
+                totals = [_alloca_once(builder, _VECTOR) for _ in range(count)]
+                for total in totals:
+                    builder.store(_operand(0.0), total)
+                with cgutils.for_range(builder, args[1]) as loop:
+                    offset = builder.mul(loop.index, ir.Constant(loop.index.type, inputs))
+                    base = builder.gep(first, [offset])
+                    lanes = [
+                        Lanes(
+                            builder,
+                            builder.load(
+                                builder.gep(base, [ir.Constant(ir.IntType(64), i)]), align=8
+                            ),
+                        )
+                        for i in range(inputs)
+                    ]
+                    for total, term in zip(totals, body(lanes), strict=True):
+                        so_far = Lanes(builder, builder.load(total))
+                        builder.store(_operand(so_far + term), total)
+                for total in totals:
+                    scalar = _across_lanes(builder, builder.load(total))
+                    builder.store(
+                        scalar, builder.gep(target_data, [ir.Constant(ir.IntType(64), place)])
+                    )
+                    place += 1
+            return context.get_dummy_value()
+
+        return types.void(source, blocks, target), compile_call
+
+    return sums
+
+
+def _across_lanes(builder: Any, vector: Any) -> Any:
+    double = ir.DoubleType()
+    function = _get_or_insert_function(
+        builder.module,
+        ir.FunctionType(double, [double, _VECTOR]),
+        f"llvm.vector.reduce.fadd.v{LANES}f64",
+    )
+    return builder.call(function, [ir.Constant(double, 0.0), vector], fastmath=("reassoc",))
+
+
+# -- small fixed-size linear algebra on lanes (or on anything with the same operators) ---------
+
+Vector = list[Any]
+
+
+def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    """Scalar product of two vectors of equal length."""
+    total: Any = 0.0
+    for x, y in zip(a, b, strict=True):
+        total = x * y + total
+    return total
+
+
+def cross(a: Sequence[Any], b: Sequence[Any]) -> Vector:
+    """Vector product of two 3-vectors."""
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+
+
+def multiply(matrix: Sequence[Sequence[Any]], vector: Sequence[Any]) -> Vector:
+    """Matrix times vector; the matrix is a list of rows."""
+    return [dot(row, vector) for row in matrix]
+
+
+def triangularize(columns: list[Vector], count: int) -> None:
+    """Householder QR in place: reflect so that the first ``count`` columns are upper triangular.
+
+    ``columns`` are equally long lists; all of them are reflected. Entries below the diagonal of
+    the first ``count`` columns are left undefined. A column without length below its diagonal
+    (a rank-deficient system) gives NaN.
+    """
+    rows = len(columns[0])
+    for k in range(min(count, rows - 1)):
+        pivot = columns[k]
+        head, tail = pivot[k], pivot[k + 1 :]
+        norm = sqrt(head * head + dot(tail, tail))
+        diagonal = select(head < 0.0, norm, -norm)  # the sign that avoids cancellation
+        first = head - diagonal
+        scale = 1.0 / (diagonal * first)
+        pivot[k] = diagonal
+        for column in columns[k + 1 :]:
+            factor = (first * column[k] + dot(tail, column[k + 1 :])) * scale
+            column[k] = column[k] + first * factor
+            for i, value in enumerate(tail, k + 1):
+                column[i] = column[i] + value * factor
+
+
+def back_substitute(columns: Sequence[Vector], right: Sequence[Any]) -> Vector:
+    """Solve ``sum_j columns[j] x_j = right`` for upper triangular columns."""
+    right = list(right)
+    solution: Vector = [0.0] * len(columns)
+    for k in reversed(range(len(columns))):
+        solution[k] = right[k] / columns[k][k]
+        for i in range(k):
+            right[i] = right[i] - columns[k][i] * solution[k]
+    return solution
+
+
+def least_squares(columns: list[Vector], right: Vector) -> Vector:
+    """Least-squares solution of ``sum_j columns[j] x_j = right`` by Householder QR."""
+    system = [*[list(column) for column in columns], list(right)]
+    triangularize(system, len(columns))
+    return back_substitute(system[:-1], system[-1])
+
+
+def nearest_rotation(v: Sequence[Any]) -> list[Vector]:
+    """The rotation nearest to ``I + [v]x`` (its polar factor): by ``atan |v|`` about ``v``."""
+    x, y, z = v
+    q = 1.0 / sqrt(dot(v, v) + 1.0)
+    c = q * q / (q + 1.0)
+    sx, sy, sz = q * x, q * y, q * z
+    return [
+        [1.0 - c * (y * y + z * z), c * x * y - sz, c * x * z + sy],
+        [c * x * y + sz, 1.0 - c * (x * x + z * z), c * y * z - sx],
+        [c * x * z - sy, c * y * z + sx, 1.0 - c * (x * x + y * y)],
+    ]
