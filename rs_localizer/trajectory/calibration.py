@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.blocks import Block, blocks_of, disagreement
-from rs_localizer.trajectory.fit import Fit, cost_at, fit
+from rs_localizer.trajectory.fit import Fit, cost_at, fit, image_speeds
 from rs_localizer.trajectory.gyro import NoMount
 from rs_localizer.trajectory.imu import ImuRecording, MountFound, mount_of, with_gyro
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
@@ -65,7 +65,7 @@ class Calibration:
     @property
     def jitter(self) -> float:
         """By how much (s rms) images were exposed beside their stamps; 0: they were not."""
-        return float(np.std(self.fit.state.delays)) if self.fit.freedom.stamps > 0.0 else 0.0
+        return self.fit.freedom.stamps
 
     @property
     def odds(self) -> float:
@@ -166,8 +166,8 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
     found = fit(camera, seen, plain.state, _calm(plain.state, freedom), plain.deviation)
     with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
         other = _unsteady(camera, seen, found, interval, freedom)
-        delays = other.state.delays
-        if np.std(delays) > _LEAST_JITTER * interval and _cheaper(other, found, len(delays)):
+        unsteady = other.freedom.stamps > _LEAST_JITTER * interval
+        if unsteady and _cheaper(other, found, len(other.state.delays)):
             found = other
     with suppress(Undetermined):
         state = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
@@ -186,8 +186,21 @@ def _unsteady(
     for share in _FIRST_JITTERS:
         own = replace(own, stamps=share * interval)
         other = fit(camera, seen, other.state, own)
-    own = replace(own, stamps=max(float(np.std(other.state.delays)), _LEAST_STAMPS))
+    own = replace(own, stamps=max(_jitter(camera, seen, other.state), _LEAST_STAMPS))
     return fit(camera, seen, other.state, own, other.deviation)
+
+
+def _jitter(camera: Camera, seen: Observations, state: State) -> float:
+    """What the images' own times are off their stamps, s rms.
+
+    By how one image differs from the mean of its neighbours: times that drift are nearly a motion
+    that drifts. And by the fast images: in slow ones a hundredth of a pixel, which may be the
+    detector's error, is worth a millisecond.
+    """
+    weights = np.bincount(seen.frames, image_speeds(camera, seen, state) ** 2, len(state.delays))
+    weights = np.minimum(weights[1:-1], np.minimum(weights[:-2], weights[2:]))
+    beside = np.diff(state.delays, 2)
+    return float(np.sqrt(weights @ beside**2 / (6.0 * np.sum(weights))))
 
 
 def _calm(state: State, freedom: Freedom) -> Freedom:
@@ -250,6 +263,6 @@ def _disagreement(blocks: tuple[Block, ...], value: str, deviation: str) -> floa
 
 def _interval_deviation(found: Fit, stamps: Stamps) -> float:
     """Of the readout time (s), where stamps are even and the images were not."""
-    unsaid = float(np.var(found.state.delays)) - stamps.jitter**2
+    unsaid = found.freedom.stamps**2 - stamps.jitter**2
     share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
     return _INTERVAL_SHARE * share * abs(found.state.readout_time)

@@ -41,7 +41,8 @@ class ImuRecording:
         """Its finite samples in the order of time, one for each stamp, from a time 0 on."""
         finite = np.isfinite(self.angular_velocities).all(axis=1)
         stamps, order = np.unique(self.stamps_ns[finite], return_index=True)
-        return GyroSamples((stamps - start_ns) * 1e-9, self.angular_velocities[finite][order])
+        times = (stamps - start_ns).astype(float) * 1e-9
+        return GyroSamples(times, self.angular_velocities[finite][order])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,15 +63,15 @@ class MountFound:
 
     @property
     def time_offset_determined(self) -> bool:
-        return self.time_offset_deviation < _MOST_OFFSET
+        return bool(self.time_offset_deviation < _MOST_OFFSET)
 
     @property
     def rotation_determined(self) -> bool:
-        return float(self.rotation_deviations.max()) < _MOST_TURN
+        return bool(np.all(self.rotation_deviations < _MOST_TURN))
 
     @property
     def bias_determined(self) -> bool:
-        return float(self.bias_deviations.max()) < _MOST_BIAS
+        return bool(np.all(self.bias_deviations < _MOST_BIAS))
 
     def turned_from(self, given: Array) -> float:
         """Angle (rad) between the rotation that was found and a given one (3,3)."""
