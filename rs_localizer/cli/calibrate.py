@@ -14,7 +14,7 @@ from tqdm import tqdm
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
-from rs_localizer.cli.detect import find_map
+from rs_localizer.cli.detect import add_board_arguments, find_map
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
@@ -65,8 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--map", type=Path, metavar="FILE", help="map of the keypoints, or marker map of the images"
     )
-    parser.add_argument("--board", metavar="9x6", help="a chessboard: inner corners along x rows")
-    parser.add_argument("--square", type=above, metavar="M", help="side of its squares")
+    add_board_arguments(parser)
     parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="lens; without one it is found, too"
     )

@@ -55,6 +55,26 @@ _PATTERNS = [
 _BOARD_AXES = np.diag([1.0, -1.0, -1.0])
 
 
+def add_board_arguments(to: argparse._ActionsContainer) -> None:
+    """The options of a board that :func:`find_map` takes instead of a map."""
+    to.add_argument(
+        "--board",
+        metavar="6x4",
+        help="instead: a board, inner corners (or circles) along a row x rows",
+    )
+    to.add_argument(
+        "--pattern",
+        choices=_PATTERNS,
+        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
+    )
+    to.add_argument(
+        "--square",
+        type=number(0.0, above=True),
+        metavar="M",
+        help="side of its squares in metres, or distance of its rows of circles",
+    )
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "images",
@@ -65,23 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     markers = parser.add_argument_group("what to look for")
     markers.add_argument("--map", type=Path, metavar="FILE", help="marker map")
-    markers.add_argument(
-        "--board",
-        metavar="6x4",
-        help="instead: a board, inner corners (or circles) along a row x rows",
-    )
-    markers.add_argument(
-        "--pattern",
-        choices=_PATTERNS,
-        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
-    )
-    above = number(0.0, above=True)
-    markers.add_argument(
-        "--square",
-        type=above,
-        metavar="M",
-        help="side of its squares in metres, or distance of its rows of circles",
-    )
+    add_board_arguments(markers)
     markers.add_argument(
         "--min-side",
         type=number(0.0),
@@ -111,7 +115,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     camera.add_argument(
         "--rate",
-        type=above,
+        type=number(0.0, above=True),
         metavar="HZ",
         help="images per second, instead of the presentation times of a video, or for files whose "
         "names are no times in ns",

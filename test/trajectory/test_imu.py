@@ -49,9 +49,7 @@ def test_derivatives_are_those_of_the_errors() -> None:
     turns, h = terms.look(state), 1e-6
 
     def errors(step: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        moved = replace(
-            state, spline=state.spline.moved(controls), mount=terms.moved(mount, step)
-        )
+        moved = replace(state, spline=state.spline.moved(controls), mount=terms.moved(mount, step))
         return terms.look(moved).errors
 
     count = 6 * len(state.spline.positions)
@@ -64,9 +62,7 @@ def test_derivatives_are_those_of_the_errors() -> None:
             step = np.zeros(count)
             step[6 * first + k] = h
             numeric = (errors(np.zeros(MOUNT), step) - errors(np.zeros(MOUNT), -step)) / (2 * h)
-            np.testing.assert_allclose(
-                turns.by_controls[sample, :, k], numeric[sample], atol=1e-5
-            )
+            np.testing.assert_allclose(turns.by_controls[sample, :, k], numeric[sample], atol=1e-5)
 
 
 def test_offset_rotation_and_bias_are_found() -> None:
