@@ -35,7 +35,7 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.refine import step_between
 from rs_localizer.localizer import Localizer
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 # A prediction over a longer gap (s) says less than a fresh search costs.
 _LONGEST_GAP = 0.5

@@ -20,8 +20,9 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import PARAMETERS, VELOCITIES
+from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.mirror import mirrored
-from rs_localizer.estimation.model_error import Examined, Sizes, examine
+from rs_localizer.estimation.model_error import Examined, examine
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, Posterior, fit, maximum_a_posteriori
 from rs_localizer.estimation.prior import PriorTerms, held_beside, slower_terms

@@ -17,7 +17,8 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import basis_sizes, shake_at
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.model_error import columns_of, neighbours_agree
+from rs_localizer.estimation.columns import columns_of
+from rs_localizer.estimation.model_error import neighbours_agree
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, add_prior

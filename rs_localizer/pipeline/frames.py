@@ -39,7 +39,7 @@ from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.oddities import oddities
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
 
 # Stands in until the first CameraInfo: kernels are compiled and settings checked before it comes.

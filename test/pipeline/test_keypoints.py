@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rs_localizer.pipeline.frames
 
+import rs_localizer.pipeline.frames
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message

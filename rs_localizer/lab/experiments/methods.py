@@ -19,7 +19,8 @@ from rs_localizer.lab.experiments.errors import angles
 from rs_localizer.lab.experiments.kernels import best_solutions, refine_frames
 from rs_localizer.lab.experiments.trials import POINTS, Motions, Trials, camera
 from rs_localizer.localizer import assumptions
-from rs_localizer.solvers import SOLVERS, find_solver, solve_minimal
+from rs_localizer.solvers.minimal import solve_minimal
+from rs_localizer.solvers.table import SOLVERS, find_solver
 
 _SIX = 6
 _TRIPLETS = np.array(list(combinations(range(_SIX), 3)))

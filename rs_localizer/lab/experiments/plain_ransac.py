@@ -14,7 +14,7 @@ from rs_localizer.estimation.ransac import MODEL_SIZE
 from rs_localizer.estimation.sampling import draw, generator
 from rs_localizer.estimation.scoring import best_models
 from rs_localizer.lab.experiments.methods import Method
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 
 def observe(camera: Camera, points: Array, pixels: Array) -> Observations:
