@@ -24,7 +24,7 @@ def error(image: np.ndarray, left: float, top: float, side: float) -> float:
     """The largest error (px) of the four corners, from a start that is half a pixel off."""
     low, right, bottom = np.array([left, top]), left + side, top + side
     truth = np.array([low, [right, top], [right, bottom], [left, bottom]])
-    quads = (truth + [[0.4, -0.3], [-0.5, 0.2], [0.3, 0.5], [-0.2, -0.4]])[None]
+    quads = (truth + np.array([[0.4, -0.3], [-0.5, 0.2], [0.3, 0.5], [-0.2, -0.4]]))[None]
     gray = np.ascontiguousarray(np.clip(np.rint(image), 0, 255).astype(np.uint8))
     assert np.all(refine(gray, quads, np.array([8])))
     return float(np.abs(quads[0] - truth).max())
