@@ -16,7 +16,7 @@ _MOST_DELAY, _DELAY_STEP = 0.5, 0.005
 _GUESS_SAMPLES = 3000
 _LEAST_SAMPLES = 100
 # Of the gyroscope's variance, what the camera's turns must explain.
-_LEAST_EXPLAINED = 0.3
+_LEAST_EXPLAINED = 0.5
 # A unit is wrong, not a scale, where rates differ by more than this.
 _MOST_SCALE = 1.5
 # Weight of a rotation that is given, by what the motion says: it helps where that is nothing.
