@@ -263,6 +263,8 @@ def _disagreement(blocks: tuple[Block, ...], value: str, deviation: str) -> floa
 
 def _interval_deviation(found: Fit, stamps: Stamps) -> float:
     """Of the readout time (s), where stamps are even and the images were not."""
-    unsaid = found.freedom.stamps**2 - stamps.jitter**2
+    # So many images know a variance no better than that.
+    chance = 1.0 + 2.0 * math.sqrt(2.0 / len(found.state.delays))
+    unsaid = found.freedom.stamps**2 - chance * stamps.jitter**2
     share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
     return _INTERVAL_SHARE * share * abs(found.state.readout_time)

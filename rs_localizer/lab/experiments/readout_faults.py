@@ -16,7 +16,7 @@ from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import calibrate
 from rs_localizer.trajectory.observe import Observed
 
-_TRUTH, _RATE, _START, _SECONDS = 0.02, 30.0, 30, 10
+_TRUTH, _RATE, _START = 0.02, 30.0, 30
 _SETTINGS = FrameSettings(points=100, noise=0.5, outliers=0.2, rate=_RATE)
 _JITTER, _MISSING, _FAST = 3e-3, 0.2, 0.01
 _SPECIFICATION = "our issue"
@@ -74,15 +74,17 @@ _FAULTS: tuple[tuple[str, Fault], ...] = (
 )
 
 
-def readout_faults(motion: RecordedMotion, points: Array, seed: int) -> tuple[Claim, Table]:
-    """One recording of 10 s, whole and with one fault at a time."""
+def readout_faults(
+    motion: RecordedMotion, points: Array, seconds: float, seed: int
+) -> tuple[Claim, Table]:
+    """One recording, whole and with one fault at a time."""
     K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
     camera = Camera(
         width=640, height=480, K=K, D=np.array([-0.1, 0.05, 0.001, 0.001, 0.0]),
         readout_time=_TRUTH,
     )  # fmt: skip
     first = round(_START * _RATE)
-    stamps = frame_stamps(motion, camera, _RATE)[first : first + round(_SECONDS * _RATE)]
+    stamps = frame_stamps(motion, camera, _RATE)[first : first + round(seconds * _RATE)]
     frames = simulate_frames(camera, motion, points, _SETTINGS, stamps_ns=stamps, seed=seed)
     images = [Observed(frame.stamp_ns, frame.points, frame.pixels) for frame in frames]
     rows: list[tuple[str | float, ...]] = []
