@@ -77,7 +77,7 @@ def _remarks(found: MountFound, imu: ImuRecording) -> list[str]:
     scales, errors = found.mount.shape[:3], found.shape_deviations[:3]
     if np.any(np.abs(scales) > np.maximum(_LEAST_SCALE, _SIGMAS * errors)):
         percent = " ".join(f"{100.0 * scale:+.1f}" for scale in scales)
-        said.append(f"imu: the gyroscope's axes must be stretched by {percent} % (allowed for)")
+        said.append(f"imu: the gyroscope's scales are {percent} % off (allowed for)")
     return said
 
 

@@ -45,9 +45,9 @@ class GyroSamples:
 class GyroMount:
     """How a gyroscope measures.
 
-    The camera's rate at ``t + delay`` is ``camera_from_imu (1 + shape) (measured - bias)``. The
-    symmetric ``shape`` has what a consumer's gyroscope is wrong in: the scales of its axes and the
-    angles between them, a percent or so. Without it the readout time would pay for them.
+    It measures ``(1 + shape) camera_from_imu^T rate + bias`` of the camera's rate at ``t + delay``.
+    The symmetric ``shape`` has what a consumer's gyroscope is wrong in: the scales of its axes and
+    the angles between them, a percent or so. Without it the readout time would pay for them.
     """
 
     camera_from_imu: Array  # (3,3)
@@ -57,10 +57,10 @@ class GyroMount:
 
     @property
     def matrix(self) -> Array:
-        """(3,3), from unbiased measured rates to the camera's."""
+        """(3,3), from the camera's rates to measured ones without bias."""
         xx, yy, zz, yz, xz, xy = self.shape
         symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        matrix: Array = self.camera_from_imu @ (np.eye(3) + symmetric)
+        matrix: Array = (np.eye(3) + symmetric) @ self.camera_from_imu.T
         return matrix
 
 

@@ -1,7 +1,7 @@
 """The gyroscope's part of the normal equations, compiled.
 
-In the camera's axes ``e = rate(t + delay) - M (measured - bias)``: the noise is alike in all
-directions, so that the derivative by the controls is that of the spline's rate.
+In the gyroscope's axes ``e = M rate(t + delay) + bias - measured``: the noise of the samples must
+not stand beside what is estimated of ``M``, which it would make smaller.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Turns(NamedTuple):
     """Samples on the spline."""
 
     first: IntArray  # (k,) first of the four controls
-    errors: Array  # (k,3) rad/s, in the camera's axes
+    errors: Array  # (k,3) rad/s, in the gyroscope's axes
     by_controls: Array  # (k,3,24)
     by_mount: Array  # (k,3,13)
 

@@ -43,15 +43,14 @@ class GyroTerms:
         times = self.samples.times + mount.delay
         states = state.spline.states(times)
         first, jacobians = state.spline.jacobians(times)
-        unbiased = self.samples.rates - mount.bias
-        straight = unbiased @ (mount.camera_from_imu.T @ mount.matrix).T
+        turned = states.angular @ mount.camera_from_imu
         by_mount = np.empty((len(first), 3, MOUNT))
-        by_mount[:, :, :3] = mount.camera_from_imu @ so3.hat(straight)
-        by_mount[:, :, 3:6] = mount.matrix
-        by_mount[:, :, 6] = states.angular_acceleration
-        by_mount[:, :, 7:] = -mount.camera_from_imu @ _by_shape(unbiased)
-        errors = states.angular - unbiased @ mount.matrix.T
-        return Turns(first, errors, np.ascontiguousarray(jacobians[:, 6:9]), by_mount)
+        by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
+        by_mount[:, :, 3:6] = np.eye(3)
+        by_mount[:, :, 6] = states.angular_acceleration @ mount.matrix.T
+        by_mount[:, :, 7:] = _by_shape(turned)
+        errors = states.angular @ mount.matrix.T + mount.bias - self.samples.rates
+        return Turns(first, errors, mount.matrix @ jacobians[:, 6:9], by_mount)
 
     def squared_errors(self, state: State) -> Array:
         """Squared errors (k,), (rad/s)^2, of three axes together."""

@@ -29,7 +29,7 @@ def gyroscope(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times (k,) by its own clock and rates (k,3) at 200 Hz, 0.01 rad/s noise."""
     times = np.arange(-0.1, seconds + 0.1, 0.005)
-    rates = motion.twist(times)[0] @ CAMERA_FROM_IMU @ np.linalg.inv(np.eye(3) + shape).T
+    rates = motion.twist(times)[0] @ CAMERA_FROM_IMU @ (np.eye(3) + shape)
     return times - OFFSET, rates + BIAS + rng.normal(0.0, 0.01, rates.shape)
 
 
