@@ -55,26 +55,6 @@ _PATTERNS = [
 _BOARD_AXES = np.diag([1.0, -1.0, -1.0])
 
 
-def add_board_arguments(to: argparse._ActionsContainer) -> None:
-    """The options of a board that :func:`find_map` takes instead of a map."""
-    to.add_argument(
-        "--board",
-        metavar="6x4",
-        help="instead: a board, inner corners (or circles) along a row x rows",
-    )
-    to.add_argument(
-        "--pattern",
-        choices=_PATTERNS,
-        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
-    )
-    to.add_argument(
-        "--square",
-        type=number(0.0, above=True),
-        metavar="M",
-        help="side of its squares in metres, or distance of its rows of circles",
-    )
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "images",
@@ -85,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     markers = parser.add_argument_group("what to look for")
     markers.add_argument("--map", type=Path, metavar="FILE", help="marker map")
+    above = number(0.0, above=True)
     add_board_arguments(markers)
     markers.add_argument(
         "--min-side",
@@ -115,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     camera.add_argument(
         "--rate",
-        type=number(0.0, above=True),
+        type=above,
         metavar="HZ",
         help="images per second, instead of the presentation times of a video, or for files whose "
         "names are no times in ns",
@@ -178,6 +159,26 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
     print(
         f"time per image: {1e3 * seconds / images:.2f} ms, of which OpenCV's search took "
         f"{1e3 * in_opencv / images:.2f} ms and all else {100 * (1 - in_opencv / seconds):.1f} %"
+    )
+
+
+def add_board_arguments(parser: argparse._ActionsContainer) -> None:
+    """A board of its own instead of a map, for :func:`find_map`."""
+    parser.add_argument(
+        "--board",
+        metavar="6x4",
+        help="instead: a board, inner corners (or circles) along a row x rows",
+    )
+    parser.add_argument(
+        "--pattern",
+        choices=_PATTERNS,
+        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
+    )
+    parser.add_argument(
+        "--square",
+        type=number(0.0, above=True),
+        metavar="M",
+        help="side of its squares in metres, or distance of its rows of circles",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,13 @@ _FIELD_TERMS = (_FIELD_DEGREE + 1) * (_FIELD_DEGREE + 2) // 2
 # Size of each degree: fields of lenses and maps are smooth, and no lens and no paper shears an
 # image.
 _FIELD_DEGREE_SIZES = (1.0, 0.2, 0.5, 0.25)
+_TERM_SIZES = np.array(
+    [
+        _FIELD_DEGREE_SIZES[degree] * math.sqrt((2 * i + 1) * (2 * (degree - i) + 1))
+        for degree in range(_FIELD_DEGREE + 1)
+        for i in range(degree + 1)
+    ]
+) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(_FIELD_DEGREE_SIZES)))
 
 
 class Columns(NamedTuple):
@@ -111,13 +119,10 @@ def with_prior(columns: Columns, prior: PriorTerms, state: Array, noise: float) 
 @kernel
 def _field_terms(x: Array, y: Array, terms: Array) -> None:
     """Fill in the terms of a field whose expected mean square over the image is 1."""
-    total = 0.0
-    for degree in range(_FIELD_DEGREE + 1):
-        total += (degree + 1) * _FIELD_DEGREE_SIZES[degree] ** 2
     place = 0
     for degree in range(_FIELD_DEGREE + 1):
-        size = _FIELD_DEGREE_SIZES[degree] / np.sqrt(total)
         for i in range(degree + 1):
-            j = degree - i
-            terms[place] = size * np.sqrt((2.0 * i + 1.0) * (2.0 * j + 1.0)) * x[i] * y[j]
+            terms[place] = x[i] * y[degree - i]
             place += 1
+    for place in range(_FIELD_TERMS):
+        terms[place] *= _TERM_SIZES[place]

@@ -49,8 +49,9 @@ def project_out(products: Array, with_errors: Array, squared_errors: float, kept
         for k in range(i):
             for side in range(kept + 1):
                 half[i, side] -= factor[i, k] * half[k, side]
+        inverse = 1.0 / factor[i, i]
         for side in range(kept + 1):
-            half[i, side] /= factor[i, i]
+            half[i, side] *= inverse
     left, along, left_over = np.empty((kept, kept)), np.empty(kept), squared_errors
     for i in range(kept):
         for j in range(kept):
@@ -127,19 +128,14 @@ class Sizes(NamedTuple):
 @kernel
 def possible(evidence: Array, prior: Array, sizes: Array, noises: Array) -> Array:
     """Mean square size, mean noise, probability of the first size, and evidence of all (4,)."""
-    weights = np.empty(len(evidence))
     highest = np.max(evidence)
-    total = 0.0
+    weights = prior * np.exp(evidence - highest)
+    total = weights.sum()
+    square, noise = 0.0, 0.0
     for k in range(len(evidence)):
-        weights[k] = prior[k] * np.exp(evidence[k] - highest)
-        total += weights[k]
-    found = np.zeros(4)
-    for k in range(len(evidence)):
-        found[0] += weights[k] / total * sizes[k] ** 2
-        found[1] += weights[k] / total * noises[k]
-    found[2] = weights[0] / total
-    found[3] = highest + np.log(total)
-    return found
+        square += weights[k] / total * sizes[k] ** 2
+        noise += weights[k] / total * noises[k]
+    return np.array([square, noise, weights[0] / total, highest + np.log(total)])
 
 
 @kernel
