@@ -41,6 +41,7 @@ HELD = {
     "p3p-initialisation.relinearized",
     "readout-time.coverage",
     "readout-time.direction",
+    "readout-time.faults",
     "readout-time.global",
     "real.vcwt_equals_r6p",
     "real.vcwt_ahead_of_p3p",
