@@ -7,20 +7,19 @@ called from any thread.
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 
 Vector = tuple[float, float, float]
 
 MEMORY_NS = 3_000_000_000
 """For how long readings are remembered, before the newest."""
-_MOST = 8192
+MOST = 4096
+"""How many readings are remembered."""
 # Readings that come so much behind the newest are no stragglers: the clock was set back.
 _SET_BACK_NS = 500_000_000
 # Readings farther apart than this leave parts of an exposure unseen: a shaking of 30 Hz turns by
@@ -29,6 +28,8 @@ _LARGEST_STEP_NS = 16_000_000
 # A gyroscope that shows its greatest value so many times in a row, and at least this (rad/s; the
 # smallest range there is), shows the end of its range.
 _SATURATED_COUNT, _SATURATED_RATE = 4, 2.0
+# The rate is that of the last readings.
+_RATE_COUNT = 64
 
 
 class Lack(StrEnum):
@@ -56,21 +57,11 @@ class Lacking:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
-    """From the last reading before an interval to the first one after it, in the IMU's axes."""
+    """Readings without a gap, in the axes of the IMU."""
 
-    frame: str
     stamps_ns: IntArray  # (n,) by the IMU's clock, increasing
     angular_velocities: Array  # (n,3) rad/s
     specific_forces: Array | None  # (n,3) m/s^2; None: not all have one
-    gyroscope_deviation: float | None  # rad/s, of one axis of one reading; None: not told
-
-
-@dataclass(frozen=True, slots=True)
-class _Item:
-    frame: str
-    angular_velocity: Vector
-    specific_force: Vector | None
-    deviation: float | None
 
 
 class ReadingBuffer:
@@ -78,19 +69,22 @@ class ReadingBuffer:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._stamps: list[int] = []
-        self._items: list[_Item] = []
-        self._greatest = [0.0, 0.0, 0.0]  # rad/s on each axis, so far
+        # The readings stand from _first to _last; at the end of the arrays they move to the front.
+        self._stamps = np.zeros(2 * MOST, np.int64)
+        self._values = np.zeros((2 * MOST, 6))  # rate and force; NaN: it has none
+        self._first = self._last = 0
+        self._greatest = np.zeros(3)  # rad/s on each axis, so far
+        self.frame = ""  # of the readings' axes
         self.repeated = 0  # readings with a stamp that was there already
         self.jumps = 0  # times that the clock was set back
 
     def __len__(self) -> int:
-        return len(self._stamps)
+        return self._last - self._first
 
     def clear(self) -> None:
         """Forget all readings."""
         with self._lock:
-            self._stamps, self._items = [], []
+            self._first = self._last = 0
 
     def add(
         self,
@@ -98,125 +92,161 @@ class ReadingBuffer:
         frame: str,
         angular_velocity: Vector,
         specific_force: Vector | None = None,
-        deviation: float | None = None,
     ) -> bool:
         """Take a reading; whether it went on in time, and the clock was not set back."""
-        item = _Item(frame, angular_velocity, specific_force, deviation)
         with self._lock:
-            set_back = bool(self._stamps) and stamp_ns < self._stamps[-1] - _SET_BACK_NS
-            if set_back or (self._items and self._items[-1].frame != frame):
-                self._stamps, self._items = [], []
+            newest = int(self._stamps[self._last - 1]) if len(self) else stamp_ns
+            set_back = stamp_ns < newest - _SET_BACK_NS
+            if set_back or frame != self.frame:
+                self._first = self._last = 0
+                self.frame = frame
                 self.jumps += set_back
-            place = bisect_left(self._stamps, stamp_ns)  # mostly the end
-            if place < len(self._stamps) and self._stamps[place] == stamp_ns:
+            if not self._insert(stamp_ns):
                 self.repeated += 1
-                return not set_back
-            self._stamps.insert(place, stamp_ns)
-            self._items.insert(place, item)
-            self._trim()
-            self._greatest = [
-                max(most, abs(value))
-                for most, value in zip(self._greatest, angular_velocity, strict=True)
-            ]
+            else:
+                row = self._values[self._place]
+                row[:3] = angular_velocity
+                row[3:] = np.nan if specific_force is None else specific_force
+                np.maximum(self._greatest, np.abs(row[:3]), out=self._greatest)
             return not set_back
 
-    def _trim(self) -> None:
-        # In blocks, so that each reading is moved once on the average.
-        stamps = self._stamps
-        if len(stamps) < 2 * _MOST and stamps[-1] - stamps[0] < 2 * MEMORY_NS:
-            return
-        first = max(bisect_left(stamps, stamps[-1] - MEMORY_NS), len(stamps) - _MOST)
-        del self._stamps[:first], self._items[:first]
+    def _insert(self, stamp_ns: int) -> bool:
+        """Make room for a reading at ``_place``; false where its stamp is there already."""
+        if self._last == len(self._stamps):
+            self._compact()
+        place = self._last
+        while place > self._first and self._stamps[place - 1] >= stamp_ns:
+            place -= 1
+        if place < self._last:
+            if self._stamps[place] == stamp_ns:
+                return False
+            for array in (self._stamps, self._values):
+                array[place + 1 : self._last + 1] = array[place : self._last].copy()
+        self._stamps[place] = stamp_ns
+        self._place = place
+        self._last += 1
+        return True
 
-    def latest_ns(self) -> int | None:
-        """The newest stamp."""
+    def _compact(self) -> None:
+        first = max(self._oldest(), self._last - MOST)
+        count = self._last - first
+        for array in (self._stamps, self._values):
+            array[:count] = array[first : self._last].copy()
+        self._first, self._last = 0, count
+
+    def _oldest(self) -> int:
+        """The row of the first reading that is remembered."""
+        stamps = self._stamps[self._first : self._last]
+        return self._first + int(np.searchsorted(stamps, stamps[-1] - MEMORY_NS))
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Whether a reading of this moment or a later one has come."""
         with self._lock:
-            return self._stamps[-1] if self._stamps else None
+            return len(self) > 0 and int(self._stamps[self._last - 1]) >= stamp_ns
 
     def rate(self) -> float:
-        """Readings per second, by the median of the steps; NaN for less than two."""
+        """Readings per second, by the median of the last steps; NaN for less than two."""
         with self._lock:
-            period = _period(self._stamps)
-        return 1e9 / period if period else float("nan")
+            stamps = self._stamps[self._first : self._last].copy()
+        return 1e9 / _period(stamps) if len(stamps) > 1 else float("nan")
 
-    def between(self, start_ns: int, end_ns: int) -> Readings | Lacking:
-        """The readings that cover an interval of the IMU's clock, its ends included."""
+    def between(
+        self, start_ns: int, end_ns: int, since_ns: int | None = None, until_ns: int | None = None
+    ) -> Readings | Lacking:
+        """The readings that cover an interval, and those around it.
+
+        Args:
+            start_ns, end_ns: of the IMU's clock; from the last reading before to the first after
+                it, none may be missing.
+            since_ns, until_ns: as far as these go on without a gap.
+        """
+        since_ns = start_ns if since_ns is None else min(since_ns, start_ns)
+        until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
         with self._lock:
-            if not self._stamps:
+            if not len(self):
                 return Lacking(Lack.NEVER, "no message has come")
-            if (lacking := self._outside(start_ns, end_ns)) is not None:
-                return lacking
-            first = bisect_right(self._stamps, start_ns) - 1
-            last = bisect_left(self._stamps, end_ns) + 1
-            stamps, items = self._stamps[first:last], self._items[first:last]
-            greatest, period = list(self._greatest), _period(self._stamps)
-        rates = np.array([item.angular_velocity for item in items])
-        steps = np.diff(stamps)
-        if len(steps) and steps.max() > _LARGEST_STEP_NS:
-            return _sparse(float(steps.max()), period)
-        if (axis := _saturated(rates, greatest)) is not None:
-            return Lacking(
-                Lack.SATURATED,
-                f"the gyroscope shows {greatest[axis]:.2f} rad/s on its axis {'xyz'[axis]}, and no "
-                "more: the end of its range",
-            )
-        forces = [item.specific_force for item in items]
+            self._first = self._oldest()
+            known = self._stamps[self._first : self._last]
+            if (outside := _outside(known, start_ns, end_ns)) is not None:
+                return outside
+            begin = max(int(known.searchsorted(since_ns, "right")) - 1, 0)
+            end = int(known.searchsorted(until_ns)) + 1
+            stamps = known[begin:end].copy()
+            values = self._values[self._first + begin : self._first + end].copy()
+            latest = known[-_RATE_COUNT:].copy()
+            greatest = self._greatest.copy()
+        first = int(stamps.searchsorted(start_ns, "right")) - 1
+        last = int(stamps.searchsorted(end_ns)) + 1
+        stops = np.flatnonzero(stamps[1:] - stamps[:-1] > _LARGEST_STEP_NS) + 1
+        if ((stops > first) & (stops < last)).any():
+            return _sparse(_period(latest), stamps[first:last])
+        if greatest.max() >= _SATURATED_RATE:
+            ends = _at_the_end_of_the_range(values[:, :3], greatest)
+            if np.any(ends[first:last]):
+                most = float(np.abs(values[first:last, :3]).max())
+                return Lacking(
+                    Lack.SATURATED,
+                    f"the gyroscope shows {most:.2f} rad/s and no more: the end of its range",
+                )
+            # Cut on both sides of what it could not tell.
+            stops = np.concatenate([stops, np.flatnonzero(ends), np.flatnonzero(ends) + 1])
+        begin = max(stops[stops <= first].tolist(), default=0)
+        end = min(stops[stops >= last].tolist(), default=len(stamps))
+        forces = values[begin:end, 3:]
         return Readings(
-            frame=items[-1].frame,
-            stamps_ns=np.array(stamps, np.int64),
-            angular_velocities=rates,
-            specific_forces=None if None in forces else np.array(forces, np.float64),
-            gyroscope_deviation=items[-1].deviation,
+            stamps[begin:end],
+            values[begin:end, :3],
+            None if np.isnan(forces).any() else forces,
         )
 
-    def _outside(self, start_ns: int, end_ns: int) -> Lacking | None:
-        oldest, newest = self._stamps[0], self._stamps[-1]
-        if start_ns < oldest:
-            return Lacking(
-                Lack.TOO_LATE,
-                f"the first reading is {_span(oldest - start_ns)} younger than the first row (did "
-                "it begin later, or has it another clock?)",
-            )
-        if newest < start_ns - _SET_BACK_NS:
-            return Lacking(
-                Lack.STOPPED,
-                f"the last reading is {_span(start_ns - newest)} older than the first row (has it "
-                "stopped, or has it another clock?)",
-            )
-        if newest < end_ns:
-            return Lacking(
-                Lack.NOT_YET,
-                f"the last reading is {_span(end_ns - newest)} older than the last row",
-            )
-        return None
+
+def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:
+    oldest, newest = int(stamps[0]), int(stamps[-1])
+    if start_ns < oldest:
+        return Lacking(
+            Lack.TOO_LATE,
+            f"the first reading is {_span(oldest - start_ns)} younger than the first row (did it "
+            "begin later, or has it another clock?)",
+        )
+    if newest < start_ns - _SET_BACK_NS:
+        return Lacking(
+            Lack.STOPPED,
+            f"the last reading is {_span(start_ns - newest)} older than the first row (has it "
+            "stopped, or has it another clock?)",
+        )
+    if newest < end_ns:
+        return Lacking(
+            Lack.NOT_YET, f"the last reading is {_span(end_ns - newest)} older than the last row"
+        )
+    return None
 
 
-def _sparse(step: float, period: float) -> Lacking:
+def _sparse(period: float, within: IntArray) -> Lacking:
     if period > _LARGEST_STEP_NS:
         return Lacking(
             Lack.TOO_SLOW,
-            f"a reading comes every {_span(period)}; at most {_span(_LARGEST_STEP_NS)} tell how "
-            "a camera shakes",
+            f"a reading comes every {_span(period)}; at most {_span(_LARGEST_STEP_NS)} tell how a "
+            "camera shakes",
         )
+    step = float(np.diff(within).max())
     return Lacking(Lack.GAP, f"for {_span(step)} within the exposure there is no reading")
 
 
-def _period(stamps: Sequence[int]) -> float:
-    """Median step in ns of the last readings; 0 for less than two."""
-    return float(np.median(np.diff(stamps[-64:]))) if len(stamps) > 1 else 0.0
+def _period(stamps: IntArray) -> float:
+    """Median step in ns of the last readings (2 or more)."""
+    return float(np.median(np.diff(stamps[-_RATE_COUNT:]))) if len(stamps) > 1 else 0.0
 
 
-def _saturated(rates: Array, greatest: Sequence[float]) -> int | None:
-    """The axis on which the greatest value so far stands in a row, if there is one."""
-    for axis in range(3):
-        if greatest[axis] < _SATURATED_RATE:
-            continue
-        at_end = np.abs(rates[:, axis]) == greatest[axis]
-        if at_end.sum() >= _SATURATED_COUNT:
-            run = np.convolve(at_end, np.ones(_SATURATED_COUNT), "valid")
-            if len(run) and run.max() >= _SATURATED_COUNT:
-                return axis
-    return None
+def _at_the_end_of_the_range(rates: Array, greatest: Array) -> BoolArray:
+    """Which of the readings (n,3) show the greatest value so far, several times in a row."""
+    found = np.zeros(len(rates), np.bool_)
+    for axis in np.flatnonzero(greatest >= _SATURATED_RATE):
+        same = np.abs(rates[:, axis]) == greatest[axis]
+        if same.sum() >= _SATURATED_COUNT:
+            row = np.ones(_SATURATED_COUNT)
+            begins = np.convolve(same, row, "valid") >= _SATURATED_COUNT
+            found |= np.convolve(begins, row) > 0.0
+    return found
 
 
 def _span(nanoseconds: float) -> str:

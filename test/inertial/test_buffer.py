@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from rs_localizer.inertial.buffer import MEMORY_NS, Lack, Lacking, ReadingBuffer, Readings
+from rs_localizer.inertial.buffer import MEMORY_NS, MOST, Lack, Lacking, ReadingBuffer, Readings
 
 MS = 1_000_000
 START = 1_700_000_000 * 10**9
@@ -51,6 +51,21 @@ def test_an_exposure_gets_its_readings_and_one_on_either_side() -> None:
     assert isinstance(exact, Readings)
     assert exact.stamps_ns[[0, -1]].tolist() == [START + 500 * MS, START + 530 * MS]
     assert buffer.rate() == pytest.approx(400.0)
+
+
+def test_what_lies_around_it_comes_as_far_as_there_is_no_gap() -> None:
+    lost = range(START + 300 * MS, START + 330 * MS)
+    buffer = filled([t for t in stamps(400) if t not in lost])
+    start, end = START + 501 * MS, START + 531 * MS
+    for since, first in ((400, 400.0), (100, 330.0)):
+        found = buffer.between(start, end, START + since * MS, START + 541 * MS)
+        assert isinstance(found, Readings)
+        assert (found.stamps_ns[0] - START) / MS == first
+        assert (found.stamps_ns[-1] - START) / MS == 542.5
+    # What is not there yet is not waited for.
+    late = buffer.between(START + 960 * MS, START + 990 * MS, None, START + 2000 * MS)
+    assert isinstance(late, Readings)
+    assert (late.stamps_ns[-1] - START) / MS == 997.5
 
 
 def test_order_and_repetition_do_not_matter() -> None:
@@ -142,18 +157,22 @@ def test_rest_and_steady_turns_are_no_end_of_a_range() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    buffer = filled(stamps(20_000))
-    assert MEMORY_NS // PERIOD <= len(buffer) <= 2 * MEMORY_NS // PERIOD
+    times = stamps(20_000)
+    buffer = filled(times)
+    found = buffer.between(times[-20], times[-10], times[0])
+    assert isinstance(found, Readings)
+    assert found.stamps_ns[0] == times[-1] - MEMORY_NS
     # So many that a second holds more than can be remembered, also all behind the newest.
     rush = ReadingBuffer()
-    for i in range(40_000):
+    for i in range(20_000):
         rush.add(START + 10_000 * i, "imu", (0.0, 0.0, 0.0))
         rush.add(START + 10_000 * i - 5_000, "imu", (0.0, 0.0, 0.0))
-    assert len(rush) <= 16_384
+    assert MOST <= len(rush) <= 2 * MOST
+    assert rush.between(START + 199_000_000, START + 199_500_000)
 
 
 def test_readings_come_while_others_are_asked_for() -> None:
-    buffer, wrong = ReadingBuffer(), []
+    buffer, found = ReadingBuffer(), []
     done = threading.Event()
 
     def feed() -> None:
@@ -163,12 +182,15 @@ def test_readings_come_while_others_are_asked_for() -> None:
 
     thread = threading.Thread(target=feed)
     thread.start()
+    asked = START + 200 * MS
     while not done.is_set():
-        latest = buffer.latest_ns()
-        if latest is None or latest < START + 200 * MS:
-            continue
-        found = buffer.between(latest - 100 * MS, latest)
-        if not isinstance(found, Readings) or np.any(np.diff(found.stamps_ns) != PERIOD):
-            wrong.append(found)
+        if buffer.covers(asked):
+            found.append(buffer.between(asked - 100 * MS, asked))
+            asked += 20 * MS
     thread.join()
-    assert wrong == []
+    complete = [item for item in found if isinstance(item, Readings)]
+    assert len(complete) > 10
+    for item in complete:
+        assert np.all(np.diff(item.stamps_ns) == PERIOD)
+        seconds = (item.stamps_ns - START) * 1e-9
+        np.testing.assert_array_equal(item.angular_velocities[:, 0], seconds)
