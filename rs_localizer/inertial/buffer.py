@@ -18,7 +18,7 @@ Vector = tuple[float, float, float]
 
 MEMORY_NS = 3_000_000_000
 """For how long readings are remembered, before the newest."""
-MOST = 4096
+MOST = 16_384
 """How many readings are remembered."""
 # Readings that come so much behind the newest are no stragglers: the clock was set back.
 _SET_BACK_NS = 500_000_000
@@ -71,9 +71,10 @@ class ReadingBuffer:
         self._lock = threading.Lock()
         # The readings stand from _first to _last; at the end of the arrays they move to the front.
         self._stamps = np.zeros(2 * MOST, np.int64)
-        self._values = np.zeros((2 * MOST, 6))  # rate and force; NaN: it has none
+        # Rate, force (NaN: it has none), and the greatest rate of each axis so far: by the stamps,
+        # so that what came early or late in a recording makes no difference.
+        self._values = np.zeros((2 * MOST, 9))
         self._first = self._last = 0
-        self._greatest = np.zeros(3)  # rad/s on each axis, so far
         self.frame = ""  # of the readings' axes
         self.repeated = 0  # readings with a stamp that was there already
         self.jumps = 0  # times that the clock was set back
@@ -101,31 +102,33 @@ class ReadingBuffer:
                 self._first = self._last = 0
                 self.frame = frame
                 self.jumps += set_back
-            if not self._insert(stamp_ns):
+            place = self._insert(stamp_ns)
+            if place is None:
                 self.repeated += 1
-            else:
-                row = self._values[self._place]
-                row[:3] = angular_velocity
-                row[3:] = np.nan if specific_force is None else specific_force
-                np.maximum(self._greatest, np.abs(row[:3]), out=self._greatest)
+                return not set_back
+            row = self._values[place]
+            row[:3] = angular_velocity
+            row[3:6] = np.nan if specific_force is None else specific_force
+            row[6:] = np.abs(row[:3])
+            if place > self._first:
+                np.maximum(row[6:], self._values[place - 1, 6:], out=row[6:])
             return not set_back
 
-    def _insert(self, stamp_ns: int) -> bool:
-        """Make room for a reading at ``_place``; false where its stamp is there already."""
+    def _insert(self, stamp_ns: int) -> int | None:
+        """Make room for a reading: its row; None where its stamp is there already."""
         if self._last == len(self._stamps):
             self._compact()
         place = self._last
-        while place > self._first and self._stamps[place - 1] >= stamp_ns:
-            place -= 1
-        if place < self._last:
+        if len(self) and stamp_ns <= self._stamps[place - 1]:  # mostly it is the newest
+            known = self._stamps[self._first : self._last]
+            place = self._first + int(known.searchsorted(stamp_ns))
             if self._stamps[place] == stamp_ns:
-                return False
+                return None
             for array in (self._stamps, self._values):
                 array[place + 1 : self._last + 1] = array[place : self._last].copy()
         self._stamps[place] = stamp_ns
-        self._place = place
         self._last += 1
-        return True
+        return place
 
     def _compact(self) -> None:
         first = max(self._oldest(), self._last - MOST)
@@ -174,12 +177,12 @@ class ReadingBuffer:
             stamps = known[begin:end].copy()
             values = self._values[self._first + begin : self._first + end].copy()
             latest = known[-_RATE_COUNT:].copy()
-            greatest = self._greatest.copy()
         first = int(stamps.searchsorted(start_ns, "right")) - 1
         last = int(stamps.searchsorted(end_ns)) + 1
         stops = np.flatnonzero(stamps[1:] - stamps[:-1] > _LARGEST_STEP_NS) + 1
         if ((stops > first) & (stops < last)).any():
             return _sparse(_period(latest), stamps[first:last])
+        greatest = values[-1, 6:]
         if greatest.max() >= _SATURATED_RATE:
             ends = _at_the_end_of_the_range(values[:, :3], greatest)
             if np.any(ends[first:last]):
@@ -192,7 +195,7 @@ class ReadingBuffer:
             stops = np.concatenate([stops, np.flatnonzero(ends), np.flatnonzero(ends) + 1])
         begin = max(stops[stops <= first].tolist(), default=0)
         end = min(stops[stops >= last].tolist(), default=len(stamps))
-        forces = values[begin:end, 3:]
+        forces = values[begin:end, 3:6]
         return Readings(
             stamps[begin:end],
             values[begin:end, :3],
