@@ -17,15 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import rs_localizer
-from rs_localizer.reasons import REASONS
+from rs_localizer.pipeline.reasons import REASONS
 
 PAGE = Path(__file__).with_name("api.md")
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
 _REASONS_INTRODUCTION = """\
 # Why a frame has no pose
 
-Written by `python docs/make_api.py` from `rs_localizer/reasons.py`. The reasons are the same in the
-library (`Failure.reason`), in what `replay` prints, in the log and in `/diagnostics`.
+Written by `python docs/make_api.py` from `rs_localizer/pipeline/reasons.py`. The reasons are the
+same in the library (`Failure.reason`), in what `replay` prints, in the log and in `/diagnostics`.
 
 | reason | means | look at |
 |---|---|---|

@@ -6,15 +6,15 @@ TYPE_CHECKING = False  # type checkers take it for typing's, which takes millise
 if TYPE_CHECKING:
     from rs_localizer.config import Acceleration, LocalizerConfig, VelocityPrior
     from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection
-    from rs_localizer.core.prior import Prior
+    from rs_localizer.core.rectification import rectify
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.types import Estimate, Failure, Reason
-    from rs_localizer.io.calibration import read_calibration
+    from rs_localizer.core.units import CameraState, camera_state
+    from rs_localizer.estimation.prior import Prior
+    from rs_localizer.io.calibration.files import read_calibration
     from rs_localizer.localizer import Localizer
-    from rs_localizer.rectification import rectify
     from rs_localizer.solvers import solve_minimal
     from rs_localizer.tracking import Tracker
-    from rs_localizer.units import CameraState, camera_state
 
 __version__ = "0.1.0"
 
@@ -46,15 +46,15 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
     _HOMES = {
         "config": ("Acceleration", "LocalizerConfig", "VelocityPrior"),
         "core.camera": ("Camera", "DistortionModel", "Roi", "ScanDirection"),
-        "core.prior": ("Prior",),
+        "core.rectification": ("rectify",),
         "core.shutter": ("Motion",),
         "core.types": ("Estimate", "Failure", "Reason"),
-        "io.calibration": ("read_calibration",),
+        "core.units": ("CameraState", "camera_state"),
+        "estimation.prior": ("Prior",),
+        "io.calibration.files": ("read_calibration",),
         "localizer": ("Localizer",),
-        "rectification": ("rectify",),
         "solvers": ("solve_minimal",),
         "tracking": ("Tracker",),
-        "units": ("CameraState", "camera_state"),
     }
 
     def __getattr__(name):

@@ -6,8 +6,8 @@ import os
 import sys
 from contextlib import AbstractContextManager
 
-from rs_localizer import threads
-from rs_localizer.stopping import StopSignals
+from rs_localizer.process import threads
+from rs_localizer.process.stopping import StopSignals
 
 _PROGRAM = "rs_localizer"
 

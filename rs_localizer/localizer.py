@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, localizer_config
-from rs_localizer.core.acceptance import refusal
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.inputs import checked, distinct, median_point, near_image, unfit
-from rs_localizer.core.observations import Observations
-from rs_localizer.core.posterior import Posterior
-from rs_localizer.core.prior import (
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.estimation.acceptance import refusal
+from rs_localizer.estimation.inputs import checked, distinct, median_point, near_image, unfit
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.estimation.prior import (
     Prior,
     PriorTerms,
     held_terms,
@@ -24,13 +26,11 @@ from rs_localizer.core.prior import (
     with_measurements,
     with_motion,
 )
-from rs_localizer.core.ransac import Candidate
-from rs_localizer.core.refine import step_between
-from rs_localizer.core.sampling import generator
-from rs_localizer.core.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, settle
-from rs_localizer.core.shutter import Motion
-from rs_localizer.core.types import Estimate, Failure, Reason
-from rs_localizer.searching import Frame, MotionSearch
+from rs_localizer.estimation.ransac import Candidate
+from rs_localizer.estimation.refine import step_between
+from rs_localizer.estimation.sampling import generator
+from rs_localizer.estimation.searching import Frame, MotionSearch
+from rs_localizer.estimation.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, settle
 from rs_localizer.solvers import Solver, find_solver
 
 # A prediction may be off by this multiple of the inlier threshold.

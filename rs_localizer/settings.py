@@ -170,3 +170,14 @@ def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
         with contextlib.suppress(ValueError):
             return float(value)
     return value
+
+
+def write_parameters(path: Path, readout_time: float, scan_direction: str) -> None:
+    """The shutter of a recording as a params file, for ``replay --params``."""
+    config = NodeConfig(readout_time=readout_time, scan_direction=scan_direction)
+    path.write_text(
+        f"/**/{NODE_NAME}:\n  ros__parameters:\n"  # in whatever namespace
+        f"    readout_time: {config.readout_time!r}\n"
+        f"    scan_direction: {config.scan_direction}\n",
+        encoding="utf-8",
+    )

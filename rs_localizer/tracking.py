@@ -20,9 +20,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.model_error import shake_in_the_middle
-from rs_localizer.core.prior import Prior, state_in
-from rs_localizer.core.refine import step_between
+from rs_localizer.core.shake import shake_in_the_middle
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import (
     ANGULAR,
@@ -34,6 +32,8 @@ from rs_localizer.core.state import (
     TURN,
 )
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.refine import step_between
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers import find_solver
 

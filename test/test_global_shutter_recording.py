@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
 from rs_localizer.config import NodeConfig
-from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import open_bag
-from rs_localizer.moments import twist_at
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.moments import twist_at
 
 # Of 6 dimensions: what 95 % of a chi-squared variable lie below.
 REGION = 12.59

@@ -301,7 +301,7 @@ def test_config_and_settings_exclude_each_other():
 
 
 def test_warming_up_compiles_all_that_a_frame_needs():
-    from rs_localizer.core import refine, residuals, scoring
+    from rs_localizer.estimation import refine, residuals, scoring
 
     cam = camera()
     localizer = rsl.Localizer(cam, solver="joint")

@@ -7,11 +7,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
-from rs_localizer.core.observations import Observations
-from rs_localizer.core.posterior import maximum_a_posteriori
-from rs_localizer.core.prior import state_in
-from rs_localizer.core.refine import apply_step
 from rs_localizer.core.shutter import project_rolling
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.posterior import maximum_a_posteriori
+from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.refine import apply_step
 from rs_localizer.localizer import assumptions
 from rs_localizer.solvers import find_solver
 

@@ -17,12 +17,12 @@ from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.keypoints import read_keypoints, read_map
-from rs_localizer.io.map_files import read_map_file, write_map_file
-from rs_localizer.io.maps import Map, MapError
-from rs_localizer.io.maps_ply import write_ply
+from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.messages import MessageError
-from rs_localizer.lab.fuzzing import seeds
-from rs_localizer.lab.landmarks import map_rows
+from rs_localizer.lab.checks.fuzzing import seeds
+from rs_localizer.lab.simulation.landmarks import map_rows
 from rs_localizer.settings import SettingsError, build, parse_assignment
 from rs_localizer.settings import settings as all_settings
 

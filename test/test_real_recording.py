@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.observations import Observations
-from rs_localizer.core.prior import PriorTerms, state_in
-from rs_localizer.core.refine import refine
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.prior import PriorTerms, state_in
+from rs_localizer.estimation.refine import refine
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences

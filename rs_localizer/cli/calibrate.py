@@ -11,13 +11,19 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.arguments import number
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.detect import find_map
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.image_clock import ImageClock
-from rs_localizer.image_sources import (
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
+from rs_localizer.io.calibration.files import read_calibration, write_calibration
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.image_clock import ImageClock
+from rs_localizer.io.images import Image
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.video import has_times
+from rs_localizer.lab.measures.calibration_plots import save_plots
+from rs_localizer.offline.image_sources import (
     IMAGE_TYPES,
     INFO_TYPE,
     Carried,
@@ -29,16 +35,10 @@ from rs_localizer.image_sources import (
     have_times,
     image_files,
 )
-from rs_localizer.io.bags import BagReader, is_bag, open_bag
-from rs_localizer.io.calibration import read_calibration, write_calibration
-from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.images import Image
-from rs_localizer.io.map_files import read_map_file
-from rs_localizer.lab.calibration_plots import save_plots
-from rs_localizer.lab.video import has_times
-from rs_localizer.marker_frames import FrameDetector
-from rs_localizer.recordings import read_recording
-from rs_localizer.replay import find_topics
+from rs_localizer.offline.recordings import read_recording
+from rs_localizer.offline.replay import find_topics
+from rs_localizer.pipeline.images import FrameDetector
+from rs_localizer.process.arguments import number
 from rs_localizer.settings import build, load_params_file, parse_assignment
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate

@@ -19,19 +19,19 @@ from rs_localizer.config import SOLVER_NAMES, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab import plots
-from rs_localizer.lab.comparison import Recording, Result, compare, load_recording
-from rs_localizer.lab.comparison_pictures import (
+from rs_localizer.lab.measures import plots
+from rs_localizer.lab.measures.comparison import Recording, Result, compare, load_recording
+from rs_localizer.lab.measures.comparison_pictures import (
     error_picture,
     inlier_picture,
     residual_picture,
     trajectory_picture,
 )
-from rs_localizer.lab.comparison_table import table
-from rs_localizer.lab.recording import write_simulated
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import FrameSettings, frame_stamps, simulate_frames
-from rs_localizer.lab.true_motion import RecordedMotion
+from rs_localizer.lab.measures.comparison_table import table
+from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.lab.simulation.recording import write_simulated
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import RecordedMotion
 from rs_localizer.settings import build, load_params_file
 
 _GLOBAL, _ROLLING = "global_shutter", "rolling_shutter"
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     try:
-        session_type = importlib.import_module("rs_localizer.ros.demo_session").Session
+        session_type = importlib.import_module("rs_localizer.ros.graph.demo_session").Session
     except ImportError as error:
         raise ValueError(
             f"the demo needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "

@@ -10,8 +10,9 @@ from tqdm import tqdm
 
 from rs_localizer import data
 from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.recording import write_frame
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.comparison import Recording, Result
+from rs_localizer.io.video import Image
 from rs_localizer.lab.experiments.cube_clip import (
     CLIP_SENSOR,
     OURS,
@@ -21,8 +22,8 @@ from rs_localizer.lab.experiments.cube_clip import (
     draw_clip,
 )
 from rs_localizer.lab.experiments.marker_frames import CAMERA, MarkerWalls
-from rs_localizer.lab.recording import write_frame, write_truth
-from rs_localizer.lab.video import Image
+from rs_localizer.lab.measures.comparison import Recording, Result
+from rs_localizer.lab.simulation.recording import write_truth
 
 CUBE = "cube.gif"
 

@@ -14,13 +14,22 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.arguments import number
 from rs_localizer.cli import UsageError
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera, ScanDirection
-from rs_localizer.detect import Recorded, record
-from rs_localizer.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
-from rs_localizer.image_sources import (
+from rs_localizer.io.bags import STORAGES, is_bag, open_bag
+from rs_localizer.io.calibration.files import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
+from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.io.video import has_times
+from rs_localizer.io.whole import told
+from rs_localizer.markers.consistency import other_units
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
+from rs_localizer.offline.detect import Recorded, record
+from rs_localizer.offline.image_sources import (
     IMAGE_TYPES,
     INFO_TYPE,
     Carried,
@@ -32,18 +41,9 @@ from rs_localizer.image_sources import (
     have_times,
     image_files,
 )
-from rs_localizer.io.bags import STORAGES, is_bag, open_bag
-from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
-from rs_localizer.io.whole import told
-from rs_localizer.lab.recording import PARAMETERS, write_parameters
-from rs_localizer.lab.video import has_times
-from rs_localizer.marker_frames import FrameDetector
-from rs_localizer.markers.consistency import other_units
-from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.markers.maps import MarkerMap
-from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
-from rs_localizer.settings import settings
+from rs_localizer.pipeline.images import FrameDetector
+from rs_localizer.process.arguments import number
+from rs_localizer.settings import settings, write_parameters
 
 _CHESSBOARD, _CIRCLES, _ASYMMETRIC = "chessboard", "circles", "asymmetric_circles"
 _INVERTED = "inverted_"
@@ -256,7 +256,7 @@ def _write_parameters(args: argparse.Namespace) -> None:
     beside = args.images / PARAMETERS
     if args.readout_time is not None:
         direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
-        write_parameters(args.out, args.readout_time, direction)
+        write_parameters(args.out / PARAMETERS, args.readout_time, direction)
     elif is_bag(args.images) and beside.exists():
         shutil.copy(beside, args.out / PARAMETERS)
 

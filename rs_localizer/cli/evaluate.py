@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.arguments import number
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
+from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
-from rs_localizer.lab.alignment import aligned
-from rs_localizer.lab.metrics import (
+from rs_localizer.lab.measures.alignment import aligned
+from rs_localizer.lab.measures.metrics import (
     Errors,
     Summary,
     associate,
@@ -20,14 +20,14 @@ from rs_localizer.lab.metrics import (
     summarize,
     twist_errors,
 )
-from rs_localizer.lab.recording import CORRESPONDENCES_TOPIC
-from rs_localizer.lab.time_offset import (
+from rs_localizer.lab.measures.time_offset import (
     TimeOffset,
     estimate_offset,
     interpolated,
     interpolated_twists,
     shifted,
 )
+from rs_localizer.process.arguments import number
 
 _AUTO = "auto"
 # An offset is worth a warning when errors without it are larger by this factor.
@@ -156,7 +156,7 @@ def _print_offset(found: TimeOffset | None) -> None:
 def _plot(
     directory: Path, estimate: Trajectory, truth: Trajectory, poses: Errors, twists: Errors | None
 ) -> None:
-    from rs_localizer.lab import plots
+    from rs_localizer.lab.measures import plots
 
     directory.mkdir(parents=True, exist_ok=True)
     drawn = (

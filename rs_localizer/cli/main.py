@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import rs_localizer
 from rs_localizer.cli import UsageError
-from rs_localizer.missing import explain
-from rs_localizer.stopping import INTERRUPTED
+from rs_localizer.process.missing import explain
+from rs_localizer.process.stopping import INTERRUPTED
 
 # What shells report of a program whose output nobody reads any more: 128 + SIGPIPE.
 _SIGPIPE = 141

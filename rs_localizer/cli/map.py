@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer.cli import UsageError
-from rs_localizer.io.map_files import WRITERS, read_map_file
-from rs_localizer.io.maps import Map
-from rs_localizer.io.maps_ply import write_ply
+from rs_localizer.io.maps.files import WRITERS, read_map_file
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.whole import whole_files
 
 _KINDS = "a .npz or .ply file or a folder of COLMAP"

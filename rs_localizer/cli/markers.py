@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.arguments import integer, number
 from rs_localizer.cli import UsageError
 from rs_localizer.io.whole import whole_files
 from rs_localizer.markers.consistency import problems
@@ -18,6 +17,7 @@ from rs_localizer.markers.pages import page_files, write_pages
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.printing import PAGES, plan
 from rs_localizer.markers.prints import Board, Charuco, Chessboard
+from rs_localizer.process.arguments import integer, number
 
 # Six markers that fill a page of A4 or letter.
 _FAMILY, _GRID, _SIZE, _GAP = "4x4_50", "2x3", 0.06, 0.02

@@ -25,11 +25,10 @@ from rs_localizer.cli.replay_result import (
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
 from rs_localizer.config import NodeConfig
-from rs_localizer.frames import FrameLocalizer
-from rs_localizer.image_sources import holds_images, image_topics
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.replay import (
+from rs_localizer.offline.image_sources import holds_images, image_topics
+from rs_localizer.offline.replay import (
     NO_FRAMES,
     Topics,
     find_topics,
@@ -37,8 +36,9 @@ from rs_localizer.replay import (
     has_frames,
     replay,
 )
+from rs_localizer.offline.smoothed import smooth_frames
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import build, load_params_file, parse_assignment
-from rs_localizer.smoothed_frames import smooth_frames
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

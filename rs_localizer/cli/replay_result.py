@@ -10,17 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.broadcasts import broadcast
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.outputs import Frame, messages
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
-from rs_localizer.io.transforms import TransformError, make_transform
+from rs_localizer.io.transforms.rigid import TransformError, make_transform
 from rs_localizer.io.whole import told, whole
-from rs_localizer.replay import TF_TYPE
+from rs_localizer.offline.replay import TF_TYPE
+from rs_localizer.pipeline.broadcasts import broadcast
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import NODE_NAME
 
 POSES, TWISTS, RESULT, BRIDGED = "poses.txt", "twists.txt", "result", "bridged.txt"

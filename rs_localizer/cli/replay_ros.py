@@ -6,9 +6,9 @@ import importlib
 
 from tqdm import tqdm
 
-from rs_localizer.image_sources import INFO_TYPE, image_topics
 from rs_localizer.io.bags import BagError, BagReader
-from rs_localizer.replay import TF_TYPE, Topics, tf_topics
+from rs_localizer.offline.image_sources import INFO_TYPE, image_topics
+from rs_localizer.offline.replay import TF_TYPE, Topics, tf_topics
 from rs_localizer.settings import NODE_NAME
 
 _IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -26,7 +26,7 @@ def play(bag: BagReader, topics: Topics | None, rate: float) -> None:
         ValueError: without ROS, without anything to play, or when nobody listens.
     """
     try:  # by name: whoever has no ROS replays offline
-        play = importlib.import_module("rs_localizer.ros.player").play
+        play = importlib.import_module("rs_localizer.ros.graph.player").play
     except ImportError as error:
         raise ValueError(
             f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "

@@ -11,10 +11,10 @@ import numpy as np
 
 from rs_localizer.cli.replay_result import BRIDGED
 from rs_localizer.config import NodeConfig
-from rs_localizer.image_clock import readout_fault
+from rs_localizer.io.image_clock import readout_fault
 from rs_localizer.io.outputs import Frame
-from rs_localizer.reasons import explained
-from rs_localizer.smoothed_frames import SmoothedFrames
+from rs_localizer.offline.smoothed import SmoothedFrames
+from rs_localizer.pipeline.reasons import explained
 from rs_localizer.solvers import find_solver
 
 # Notices of a frame that could not follow the one before.

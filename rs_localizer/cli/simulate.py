@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.arguments import integer, number
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.simulated_camera import (
     add_camera_arguments,
@@ -21,25 +20,20 @@ from rs_localizer.cli.simulated_camera import (
 )
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import STORAGES, BagWriter
-from rs_localizer.io.map_files import write_map_file
+from rs_localizer.io.maps.files import write_map_file
+from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
 from rs_localizer.io.whole import whole
-from rs_localizer.lab.image_sequence import FORMATS, Encoding, rendered_frames
-from rs_localizer.lab.landmarks import described, keypoint_rows
-from rs_localizer.lab.recording import (
-    MAP,
-    MAP_FRAME,
-    MARKER_MAP,
-    PARAMETERS,
-    write_parameters,
-    write_rendered,
-    write_simulated,
-)
-from rs_localizer.lab.rendering import ImageSettings, Renderer
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import FrameSettings, simulate_frames
-from rs_localizer.lab.true_motion import TrueMotion, sampled_way
-from rs_localizer.lab.walls import SCENES
+from rs_localizer.lab.rendering.image_sequence import FORMATS, Encoding, rendered_frames
+from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
+from rs_localizer.lab.rendering.walls import SCENES
+from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.landmarks import described, keypoint_rows
+from rs_localizer.lab.simulation.recording import write_rendered, write_simulated
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import TrueMotion, sampled_way
 from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.process.arguments import integer, number
+from rs_localizer.settings import write_parameters
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")
@@ -133,7 +127,7 @@ def _write_points(args: argparse.Namespace) -> None:
             raise ValueError(
                 f"none of the {len(stamps)} frames sees any point; nothing is written to {args.out}"
             )
-        write_parameters(args.out, args.readout_time, args.scan_direction)
+        write_parameters(args.out / PARAMETERS, args.readout_time, args.scan_direction)
         if args.keypoints:
             write_map_file(args.out / MAP, landmarks)
     print(
@@ -160,7 +154,7 @@ def _write_images(args: argparse.Namespace) -> None:
             frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
             for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
                 write_rendered(bag, camera, frame)
-        write_parameters(args.out, args.readout_time, args.scan_direction)
+        write_parameters(args.out / PARAMETERS, args.readout_time, args.scan_direction)
         if scene.marker_map is not None:
             write_marker_map(args.out / MARKER_MAP, scene.marker_map)
     said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"

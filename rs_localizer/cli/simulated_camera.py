@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer import data
-from rs_localizer.arguments import integer, number
 from rs_localizer.cli import UsageError
 from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.simulation import FrameSettings, frame_stamps
-from rs_localizer.lab.true_motion import (
+from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps
+from rs_localizer.lab.simulation.true_motion import (
     BODY_FROM_CAMERA,
     KNOT_SPACING,
     ConstantVelocity,
     RecordedMotion,
     TrueMotion,
 )
+from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import settings
 
 # A still hand is no example: without any motion given, the camera turns and walks like this.

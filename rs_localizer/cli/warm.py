@@ -8,9 +8,9 @@ import warnings
 from collections.abc import Callable
 
 from rs_localizer.config import SOLVER_NAMES, NodeConfig
-from rs_localizer.core.jit import cache_directory
-from rs_localizer.frames import FrameLocalizer
+from rs_localizer.core.lanes.jit import cache_directory
 from rs_localizer.markers import detection
+from rs_localizer.pipeline.frames import FrameLocalizer
 
 # Any that is known: with it, frames are tracked, too.
 _READOUT_TIME = 0.03

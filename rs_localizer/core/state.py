@@ -3,7 +3,7 @@
 A state holds rotation (9, row-major) and translation (3), camera_from_map at the middle row, the
 angular and linear velocities (3, 3) and the accelerations (3, 3) there, per readout and per
 readout squared (:class:`rs_localizer.core.shutter.Motion`). A step has three parameters for the
-rotation; it is what :func:`rs_localizer.core.refine.apply_step` applies.
+rotation; it is what :func:`rs_localizer.estimation.refine.apply_step` applies.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.model_error import shake_at
+from rs_localizer.core.shake import shake_at
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS
 
@@ -45,11 +45,11 @@ class Estimate(Motion):
     global_shutter_inliers: int  # of the best global-shutter pose, at the same threshold
     iterations: int  # minimal samples drawn
     # (k,3) rad: what the camera turns beside the motion, polynomials of the row time (see
-    # rs_localizer.core.model_error); most of it is vibration
+    # rs_localizer.estimation.model_error); most of it is vibration
     shake: Array = field(default_factory=lambda: np.zeros((0, 3)))
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
     # What the frame says of how large shaking and model error are: logarithms of the odds of
-    # the sizes that rs_localizer.core.settling tries.
+    # the sizes that rs_localizer.estimation.settling tries.
     of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
     of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
     tracked: bool = False  # found near a prior motion, without a search

@@ -10,7 +10,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.clouds import Rows, read_rows
-from rs_localizer.io.maps import Descriptors, Ids, Map, MapError, make_map
+from rs_localizer.io.maps.landmarks import Descriptors, Ids, Map, MapError, make_map
 from rs_localizer.io.messages import MessageError, frame_id, stamp_ns
 
 

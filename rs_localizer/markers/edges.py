@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.jit import kernel
+from rs_localizer.core.lanes.jit import kernel
 
 # Most points along a side, of each round: the first only has to get near.
 _POINTS = (12, 32)

@@ -15,11 +15,11 @@ import numpy as np
 from rs_localizer.config import MatchBy, Matching
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.prior import Prior
 from rs_localizer.core.shutter import Motion
+from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.keypoints import Keypoints
-from rs_localizer.io.maps import Descriptors, Ids, Map
+from rs_localizer.io.maps.landmarks import Descriptors, Ids, Map
 from rs_localizer.matching.descriptors import Index, Nearest, make_index
 from rs_localizer.matching.prediction import find_view, predict, search_cost
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.io.maps import Descriptors
+from rs_localizer.io.maps.landmarks import Descriptors
 from rs_localizer.matching.kernels import (
     nearest_binary,
     nearest_binary_within,

@@ -9,8 +9,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.prior import Prior, state_in
 from rs_localizer.core.shutter import Motion
+from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.matching.descriptors import Visible
 from rs_localizer.matching.kernels import in_view, move
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from rs_localizer import threads
-from rs_localizer.missing import explain
+from rs_localizer.process import threads
+from rs_localizer.process.missing import explain
+from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.usage import answer
-from rs_localizer.stopping import StopRequest
 
 Run = Callable[[StopRequest, list[str] | None], int]
 
@@ -17,7 +17,7 @@ def main(args: list[str] | None = None) -> int:
     """Run the localizer until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
 
     def load() -> Run:
-        from rs_localizer.ros.run import run
+        from rs_localizer.ros.node.run import run
 
         return run
 
@@ -28,8 +28,8 @@ def marker_detector(args: list[str] | None = None) -> int:
     """Run the marker detector likewise."""
 
     def load() -> Run:
-        from rs_localizer.ros.marker_detector_node import MarkerDetectorNode
-        from rs_localizer.ros.run import run
+        from rs_localizer.ros.detector.node import MarkerDetectorNode
+        from rs_localizer.ros.node.run import run
         from rs_localizer.settings import DETECTOR_NAME
 
         return lambda stop, args: run(stop, args, MarkerDetectorNode, DETECTOR_NAME)

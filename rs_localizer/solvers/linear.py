@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rs_localizer.core.simd import (
+from rs_localizer.core.lanes.simd import (
     Vector,
     back_substitute,
     least_squares,

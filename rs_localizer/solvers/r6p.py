@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.eigenvalues import real_eigenvalues, reduce_to_hessenberg
-from rs_localizer.core.jit import kernel
-from rs_localizer.core.simd import (
+from rs_localizer.core.lanes.eigenvalues import real_eigenvalues, reduce_to_hessenberg
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.simd import (
     LANES,
     Lanes,
     Vector,
@@ -39,7 +39,7 @@ from rs_localizer.core.simd import (
     traced,
     triangularize,
 )
-from rs_localizer.core.vectors import lane_array
+from rs_localizer.core.lanes.vectors import lane_array
 from rs_localizer.solvers import linear, rank_drop
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
 from rs_localizer.solvers.rank_drop import RELATIONS, SOLUTIONS

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.jit import kernel
-from rs_localizer.core.simd import (
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.simd import (
     LANES,
     Lanes,
     Vector,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import IntArray
-from rs_localizer.core.jit import kernel
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.trajectory.normal_kernels import Curve, Normal
 from rs_localizer.trajectory.spline_kernels import CONTROL, ORDER
 

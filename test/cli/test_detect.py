@@ -15,15 +15,15 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.cli.main import main
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.image_sources import SourceError, from_bag
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.lab.recording import make_camera_info
-from rs_localizer.marker_frames import FrameDetector, correspondences
+from rs_localizer.io.recording import make_camera_info
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.offline.image_sources import SourceError, from_bag
+from rs_localizer.pipeline.images import FrameDetector, correspondences
 from rs_localizer.settings import build, load_params_file
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])

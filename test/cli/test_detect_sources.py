@@ -17,7 +17,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.lab.recording import make_camera_info, write_image
+from rs_localizer.io.recording import make_camera_info, write_image
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from rs_localizer.cli.main import main
-from rs_localizer.io.map_files import read_map_file, write_map_file
-from rs_localizer.io.maps import Map
+from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.landmarks import Map
 
-COLMAP = Path(__file__).parents[1] / "io" / "colmap"
+COLMAP = Path(__file__).parents[1] / "io" / "maps" / "colmap"
 
 
 def test_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

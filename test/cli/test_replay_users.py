@@ -10,7 +10,7 @@ import pytest
 import rs_localizer.cli.replay as replay_command
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.lab.recording import write_image
+from rs_localizer.io.recording import write_image
 
 FRAMES = 8
 SHUTTER = ["-p", "readout_time:=0.03"]

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.detect import _RollingFit
 from rs_localizer.markers.detection import Detections
 from rs_localizer.markers.displaced import Fit, LeaveOneOut, still_fit
 from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.offline.detect import _RollingFit
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)

@@ -10,11 +10,11 @@ import pytest
 from rs_localizer.config import Matching
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera, Roi
-from rs_localizer.core.prior import Prior
 from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.keypoints import Keypoints
-from rs_localizer.io.maps import Map
-from rs_localizer.lab.scene import room
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.lab.simulation.scene import room
 from rs_localizer.matching import Matcher
 from rs_localizer.matching.descriptors import Visible
 from rs_localizer.matching.prediction import find_view, predict

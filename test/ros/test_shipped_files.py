@@ -18,9 +18,9 @@ from rclpy.context import Context
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.lab.recording import PARAMETERS, write_parameters
-from rs_localizer.ros.feed import Feed
-from rs_localizer.settings import NODE_NAME, build, load_params_file, settings
+from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
 
 ROOT = Path(__file__).parents[2]
 # Displays of RViz and what they can show.
@@ -261,7 +261,7 @@ def test_two_cameras_pass_on_what_one_camera_takes(describe: Describe) -> None:
 def test_the_parameters_of_a_recording_hold_in_every_namespace(
     tmp_path: Path, namespace: str
 ) -> None:
-    write_parameters(tmp_path, 0.021, "bottom_to_top")
+    write_parameters(tmp_path / "parameters.yaml", 0.021, "bottom_to_top")
     context = Context()
     rclpy.init(args=["--ros-args", "--params-file", str(tmp_path / PARAMETERS)], context=context)
     made = rclpy.create_node(NODE_NAME, namespace=namespace, context=context)

@@ -24,7 +24,7 @@ from rs_localizer.lab.experiments.results import (
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.uncertainty import Interval, quantile, share
 from rs_localizer.lab.experiments.views import GROSS, Outcome, outcome, synthetic_views
-from rs_localizer.lab.palette import BLUE, ORANGE
+from rs_localizer.lab.measures.palette import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 _REGION = 0.95

@@ -19,7 +19,7 @@ from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import METRICS
 from rs_localizer.lab.experiments.methods import Method
 from rs_localizer.lab.experiments.sweeps import Curves
-from rs_localizer.lab.palette import BLUE, ORANGE
+from rs_localizer.lab.measures.palette import BLUE, ORANGE
 
 _DPI = 110
 _LEGEND_MARGIN, _LEGEND_ROW = 0.1, 0.21  # inches

@@ -11,14 +11,14 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion
 from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.lab.animation import gif, side_by_side
-from rs_localizer.lab.cube import Cube, corner_pixels, cube_on, draw_cube
+from rs_localizer.io.video import Image
 from rs_localizer.lab.experiments.marker_frames import CAMERA, RATE, MarkerWalls
 from rs_localizer.lab.experiments.results import Track
-from rs_localizer.lab.rendering import ImageSettings
-from rs_localizer.lab.simulation import true_poses_at
-from rs_localizer.lab.true_motion import TrueMotion
-from rs_localizer.lab.video import Image
+from rs_localizer.lab.measures.animation import gif, side_by_side
+from rs_localizer.lab.rendering.cube import Cube, corner_pixels, cube_on, draw_cube
+from rs_localizer.lab.rendering.renderer import ImageSettings
+from rs_localizer.lab.simulation.frames import true_poses_at
+from rs_localizer.lab.simulation.true_motion import TrueMotion
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

@@ -7,9 +7,9 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.observations import Observations
-from rs_localizer.core.ransac import NOTHING, Hypotheses, search
-from rs_localizer.core.sampling import Pool, generator
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.ransac import NOTHING, Hypotheses, search
+from rs_localizer.estimation.sampling import Pool, generator
 from rs_localizer.lab.experiments.competitors import robust_subjects
 from rs_localizer.lab.experiments.plain_ransac import observe
 from rs_localizer.lab.experiments.stopwatch import Subject

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.jit import kernel
-from rs_localizer.core.prior import PriorTerms
-from rs_localizer.core.refine import refine
-from rs_localizer.core.residuals import (
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.refine import refine
+from rs_localizer.estimation.residuals import (
     normal_equations,
     pack,
     set_weights,
     squared_errors,
     truncated_cost,
 )
-from rs_localizer.core.scoring import optimize, state_of_model
-from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.estimation.scoring import optimize, state_of_model
 
 
 @kernel

@@ -12,12 +12,12 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.trajectories import Trajectory
-from rs_localizer.lab.image_sequence import in_order
-from rs_localizer.lab.rendering import ImageSettings, Renderer
-from rs_localizer.lab.simulation import frame_stamps, middle_stamp, true_poses_at
-from rs_localizer.lab.true_motion import RecordedMotion, sampled_way
-from rs_localizer.lab.video import Image
-from rs_localizer.lab.walls import three_walls
+from rs_localizer.io.video import Image
+from rs_localizer.lab.rendering.image_sequence import in_order
+from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
+from rs_localizer.lab.rendering.walls import three_walls
+from rs_localizer.lab.simulation.frames import frame_stamps, middle_stamp, true_poses_at
+from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.prints import Marker
 

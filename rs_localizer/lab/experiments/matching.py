@@ -12,24 +12,24 @@ import numpy as np
 
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.frames import FrameLocalizer
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.maps import Map
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments.matching_scores import scores_claim
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
-from rs_localizer.lab.landmarks import keypoint_rows, random_descriptors
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import (
+from rs_localizer.lab.simulation.frames import (
     FrameSettings,
     SimulatedFrame,
     frame_stamps,
     simulate_frames,
 )
-from rs_localizer.lab.true_motion import RecordedMotion
+from rs_localizer.lab.simulation.landmarks import keypoint_rows, random_descriptors
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import RecordedMotion
+from rs_localizer.pipeline.frames import FrameLocalizer
 
 _LANDMARKS = 100_000
 _SEEN = FrameSettings(points=500, noise=0.5, outliers=0.3, rate=30.0)

@@ -11,11 +11,11 @@ from rs_localizer.config import Matching
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.keypoints import Keypoints
-from rs_localizer.io.maps import Map
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.lab.experiments.results import Claim, Context, judge
-from rs_localizer.lab.landmarks import random_descriptors, seen_descriptors
-from rs_localizer.lab.simulation import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.lab.true_motion import TrueMotion
+from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.lab.simulation.landmarks import random_descriptors, seen_descriptors
+from rs_localizer.lab.simulation.true_motion import TrueMotion
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher
 

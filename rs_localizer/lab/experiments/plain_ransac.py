@@ -8,11 +8,11 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.observations import Observations
-from rs_localizer.core.ransac import MODEL_SIZE
-from rs_localizer.core.sampling import draw, generator
-from rs_localizer.core.scoring import best_models
 from rs_localizer.core.state import STATE_SIZE
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.ransac import MODEL_SIZE
+from rs_localizer.estimation.sampling import draw, generator
+from rs_localizer.estimation.scoring import best_models
 from rs_localizer.lab.experiments.methods import Method
 from rs_localizer.solvers import find_solver
 

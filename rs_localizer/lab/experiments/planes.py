@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from rs_localizer.config import VelocityPrior
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.posterior import maximum_a_posteriori
-from rs_localizer.core.prior import motion_terms, state_in
+from rs_localizer.estimation.posterior import maximum_a_posteriori
+from rs_localizer.estimation.prior import motion_terms, state_in
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.errors import angles
@@ -20,7 +20,7 @@ from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, 
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.uncertainty import quantile
 from rs_localizer.lab.experiments.views import View, synthetic_views
-from rs_localizer.lab.palette import BLUE, ORANGE
+from rs_localizer.lab.measures.palette import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 # 10 degrees and 0.1 m in a readout of 30 ms, which is assumed without one.

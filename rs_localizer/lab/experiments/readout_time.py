@@ -12,9 +12,9 @@ from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import FrameSettings, frame_stamps, simulate_frames
-from rs_localizer.lab.true_motion import RecordedMotion
+from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import RecordedMotion
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.observe import Observed

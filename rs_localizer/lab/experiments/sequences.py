@@ -13,11 +13,11 @@ from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import FrameSettings, frame_stamps, simulate_frames
-from rs_localizer.lab.true_motion import RecordedMotion
+from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import RecordedMotion
 
 _POINTS = 150
 _OUTLIERS = 0.3

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.ransac import MODEL_SIZE
+from rs_localizer.estimation.ransac import MODEL_SIZE
 from rs_localizer.lab.experiments.competitors import p3p_subjects
 from rs_localizer.lab.experiments.frame_timings import (
     ALL_SAMPLES,

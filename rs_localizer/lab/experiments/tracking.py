@@ -24,15 +24,15 @@ from rs_localizer.lab.experiments.results import (
     judge_intervals,
 )
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
-from rs_localizer.lab.palette import BLUE, ORANGE
-from rs_localizer.lab.scene import room
-from rs_localizer.lab.simulation import (
+from rs_localizer.lab.measures.palette import BLUE, ORANGE
+from rs_localizer.lab.simulation.frames import (
     FrameSettings,
     SimulatedFrame,
     frame_stamps,
     simulate_frames,
 )
-from rs_localizer.lab.true_motion import RecordedMotion
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import RecordedMotion
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

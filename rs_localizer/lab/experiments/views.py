@@ -9,11 +9,11 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.prior import state_in
-from rs_localizer.core.refine import step_between
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.refine import step_between
 from rs_localizer.lab.experiments.kernels import informations
 from rs_localizer.lab.experiments.methods import states
 from rs_localizer.lab.experiments.trials import Setting, camera, draw_trials

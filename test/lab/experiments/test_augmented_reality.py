@@ -14,7 +14,7 @@ from rs_localizer.lab.experiments.augmented_reality_claims import Frames, claims
 from rs_localizer.lab.experiments.cube_clip import clip_cube, clip_stamps, cube_errors
 from rs_localizer.lab.experiments.marker_frames import CAMERA, MarkerFrame, MarkerWalls, visible
 from rs_localizer.lab.experiments.results import Verdict
-from rs_localizer.lab.simulation import middle_stamp
+from rs_localizer.lab.simulation.frames import middle_stamp
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 SPREAD = np.linspace(0.0, 1.0, 400)

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from rs_localizer import data
-from rs_localizer.arguments import integer
 from rs_localizer.lab.experiments.honesty.benches import Bench, Recordings, benches
 from rs_localizer.lab.experiments.honesty.picture import Shares, picture, shares_at_stamp
 from rs_localizer.lab.experiments.honesty.text import heading, line
 from rs_localizer.lab.experiments.results import Table
+from rs_localizer.process.arguments import integer
 
 _NAMES = ("coverage", "p3p", "vibration", "planes", "tags", "rendered")
 

@@ -16,26 +16,20 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
-from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.estimates import read_motions
+from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, write_frame
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments.honesty.estimating import Found
 from rs_localizer.lab.experiments.honesty.scores import Score, Scores, Truth, score
-from rs_localizer.lab.image_sequence import in_order
-from rs_localizer.lab.recording import (
-    CAMERA_INFO_TOPIC,
-    CORRESPONDENCES_TOPIC,
-    TRUE_POSE_TOPIC,
-    TRUE_TWIST_TOPIC,
-    write_frame,
-    write_truth,
-)
-from rs_localizer.lab.rendering import ImageSettings, Renderer
-from rs_localizer.lab.simulation import frame_stamps, middle_stamp
-from rs_localizer.lab.true_motion import RecordedMotion, sampled_way
-from rs_localizer.lab.walls import three_walls
+from rs_localizer.lab.rendering.image_sequence import in_order
+from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
+from rs_localizer.lab.rendering.walls import three_walls
+from rs_localizer.lab.simulation.frames import frame_stamps, middle_stamp
+from rs_localizer.lab.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC, write_truth
+from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
 from rs_localizer.markers.detection import Detections, MarkerDetector
+from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
 
 MOTIONS = {"tum_vi_room5": "forward_left_up", "tum_rgbd_fr1_xyz": "optical"}
 """Trajectories by name, and the axes of the body whose poses they hold."""

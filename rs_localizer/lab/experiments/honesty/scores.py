@@ -15,7 +15,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.outputs import Pose, Twist
 from rs_localizer.lab.independent.rotations import logarithm
-from rs_localizer.moments import pose_at, twist_at
+from rs_localizer.pipeline.moments import pose_at, twist_at
 
 REGION = float(chi2.ppf(0.95, 6))
 # As unlikely as five standard deviations are of one variable (6 in 10 million).

@@ -12,13 +12,13 @@ import numpy as np
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.frames import FrameLocalizer, Refusal
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import Frame
 from rs_localizer.lab.experiments.honesty.scores import REGION, motion_evidence, percent
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
 from rs_localizer.lab.independent.rotations import logarithm
-from rs_localizer.moments import twist_at
+from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.moments import twist_at
 from rs_localizer.solvers import find_solver
 
 CAMERA_INFO, CORRESPONDENCES = "/camera/camera_info", "/camera/correspondences"

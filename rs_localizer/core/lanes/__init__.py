@@ -1,0 +1,1 @@
+"""Compiled arithmetic: how kernels are compiled, and what they are made of."""

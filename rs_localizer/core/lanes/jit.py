@@ -1,0 +1,176 @@
+"""How kernels of this package are compiled and where the machine code is kept."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.util
+import os
+import pickle
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self, TypeVar, cast
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+if importlib.util.find_spec("scipy") is None:  # Numba would say so in the first kernel, and not why
+    raise ModuleNotFoundError("No module named 'scipy', which compiled kernels need", name="scipy")
+
+PARTS = ("core", "solvers", "estimation", "matching", "markers", "trajectory", "lab")
+"""Folders of the package with kernels; a kernel calls those of its own and of earlier ones."""
+
+_PACKAGE = Path(__file__).resolve().parents[2]
+# What reading a file that was cut off, overwritten or written by another program may raise.
+_DAMAGE = (EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError)
+_CHECKSUM_BYTES = 4
+_said: set[str] = set()
+
+
+def cache_directory() -> Path:
+    """The user's folder of compiled kernels: ``NUMBA_CACHE_DIR``, or below ``XDG_CACHE_HOME``."""
+    config: Any = numba.config
+    chosen = config.CACHE_DIR or os.environ.get("XDG_CACHE_HOME")
+    if not chosen:
+        try:
+            chosen = Path.home() / ".cache"
+        except RuntimeError:  # a user without a home, as in some containers
+            chosen = "/nonexistent"
+    return Path(chosen) if config.CACHE_DIR else Path(chosen) / "rs_localizer"
+
+
+def digest(part: str, package: Path) -> str:
+    """Of all sources that may be compiled into a kernel of this part.
+
+    Numba notices a change of the file that holds a kernel, not of what the kernel calls in other
+    files; after an update it would run the old code. Hence one folder per state of the sources.
+    """
+    parts = PARTS[: PARTS.index(part) + 1] if part in PARTS else PARTS
+    found = hashlib.sha256()
+    for folder in parts:
+        for file in sorted((package / folder).rglob("*.py")):
+            found.update(file.relative_to(package).as_posix().encode())
+            found.update(file.read_bytes())
+    return found.hexdigest()[:16]
+
+
+_digest = functools.cache(digest)
+
+
+@functools.cache
+def _stamp(file: str) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+def kernel(function: F) -> F:
+    """Compile a function with Numba: cached on disk, without the GIL, NaN preserved."""
+    compiled: Any = numba.njit(
+        nogil=True,
+        # Without it every division is checked for zero, which stops vectorization.
+        error_model="numpy",
+        # NaN and infinity keep their meaning: they mark lanes and points without a solution.
+        fastmath={"contract", "reassoc", "nsz", "arcp"},
+    )(function)
+    if Path(function.__code__.co_filename).is_file():  # not what was typed at a prompt
+        compiled._cache = _Cache(function)
+    return cast(F, compiled)
+
+
+class _Locator:
+    """Numba's question where the machine code of a function is kept; the folder may be read-only.
+
+    Numba's own locators take only folders into which they can write.
+    """
+
+    def __init__(self, function: Any, file: str) -> None:
+        names = function.__module__.split(".")
+        part = names[1] if len(names) > 1 else ""
+        self._py_file = file  # Numba's name, for its warnings
+        self._directory = cache_directory() / _digest(part, _PACKAGE) / function.__module__
+        self._line = function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> Self:
+        return cls(function, file)
+
+    def ensure_cache_path(self) -> None:
+        self._directory.mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return str(self._directory)
+
+    def get_source_stamp(self) -> str:
+        return _stamp(self._py_file)
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Implementation(CompileResultCacheImpl):
+    def __init__(self, function: Any) -> None:
+        self._locator_classes = [_Locator]
+        super().__init__(function)
+
+
+class _File(IndexDataCacheFile):
+    """Machine code behind a checksum: half of it would run, and end the process."""
+
+    def _save_data(self, name: str, data: Any) -> None:
+        code = self._dump(data)
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(zlib.crc32(code).to_bytes(_CHECKSUM_BYTES, "little") + code)
+
+    def _load_data(self, name: str) -> Any:
+        content = Path(self._data_path(name)).read_bytes()
+        code = content[_CHECKSUM_BYTES:]
+        if zlib.crc32(code).to_bytes(_CHECKSUM_BYTES, "little") != content[:_CHECKSUM_BYTES]:
+            raise ValueError("the checksum is wrong")
+        return pickle.loads(code)
+
+    def remove(self) -> None:
+        """Remove the function's files, as far as that is allowed."""
+        start = self._index_name.removesuffix("nbi")
+        for path in Path(self._cache_path).glob(f"{start}*"):
+            path.unlink(missing_ok=True)
+
+
+class _Cache(FunctionCache):
+    """The machine code of a function on disk; whatever is wrong there, the function is compiled."""
+
+    _impl_class = _Implementation
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        self._cache_file: _File = _File(
+            self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp()
+        )
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        try:
+            return super().load_overload(signature, target)
+        except (*_DAMAGE, pickle.UnpicklingError) as error:
+            _say(f"damaged files are compiled anew ({self._cache_file._index_path}: {error!r})")
+            with contextlib.suppress(OSError):  # saving says what is wrong with the folder
+                self._cache_file.remove()
+        except OSError:
+            pass
+        return None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        try:
+            super().save_overload(signature, compiled)
+        except OSError as error:
+            _say(f"kernels are compiled again at the next start: {error.strerror or error}")
+
+
+def _say(text: str) -> None:
+    """Warn, once of each kind and process."""
+    kind = text.partition(" (")[0]
+    if kind not in _said:
+        _said.add(kind)
+        warnings.warn(f"cache of kernels in {cache_directory()}: {text}", RuntimeWarning, 2)

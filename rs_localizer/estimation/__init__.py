@@ -1,0 +1,1 @@
+"""From the points of one image to the posterior of its motion."""

@@ -1,0 +1,127 @@
+"""Whether an estimate may be published: nothing rather than a wrong pose."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.types import Failure, Reason
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.posterior import Posterior
+
+# Beyond this the camera turns by more than the motion model is meant for, rad per readout.
+_MOST_TURN = 1.5
+# Errors as large as the gate lets them be are those of points strewn over it.
+# A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
+_MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
+# Errors that neighbouring rows share although the motion follows vibration, in standard deviations.
+_MOST_AGREEMENT = 3.0
+# Less than this, in inlier thresholds, makes the covariance larger and refuses nothing.
+_LEAST_MODEL_ERROR = 0.05
+# Errors of map and lens, root mean square, in inlier thresholds.
+_MOST_MODEL_ERROR = 0.4
+# An image that moves along with the rows is one moment of the scene, drawn out: any motion that
+# does so fits anything. See :meth:`Observations.row_paces`.
+_LEAST_PACE = 0.25
+# How far away (rad) a mirrored pose that fits as well may be: what the covariance speaks for may be
+# farther away than what it does not.
+_MOST_MIRRORED_TURN, _MOST_COVERED_TURN = 0.2, 0.35
+
+
+def refusal(
+    observations: Observations,
+    posterior: Posterior,
+    samples: int,
+    *,
+    min_inliers: int,
+    threshold: float,
+    rolling: bool,
+) -> Failure | None:
+    """What is wrong with an estimate, or None.
+
+    Args:
+        samples: minimal samples drawn, for the message.
+        min_inliers, threshold: of the configuration.
+        rolling: whether velocities were estimated.
+    """
+    state = posterior.state
+    found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
+    if found < needed:
+        behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
+        if 2 * behind > len(observations):
+            return Failure(
+                Reason.BEHIND_CAMERA,
+                f"{behind} of {len(observations)} points lie behind the camera",
+            )
+        return Failure(
+            Reason.TOO_FEW_INLIERS,
+            f"{found} inliers of {len(observations)} points after {samples} samples, "
+            f"{needed} are needed",
+        )
+    if not posterior.determined:
+        return Failure(
+            Reason.DEGENERATE,
+            f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
+            f"information {posterior.smallest_eigenvalue:.1e}",
+        )
+    most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
+    if posterior.noise > most * threshold:
+        return Failure(
+            Reason.RESIDUAL,
+            f"{found} inliers with errors of {posterior.noise:.2g} px (one sigma) around an "
+            f"inlier_threshold of {threshold:g} px: no motion fits them, or the threshold is "
+            "too small for the noise",
+        )
+    shared = rolling and posterior.agreement > _MOST_AGREEMENT
+    if shared and posterior.noise > _LEAST_MODEL_ERROR * threshold:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"neighbouring rows share errors that no motion explains ({posterior.agreement:.1f} "
+            f"standard deviations, {posterior.noise:.2g} px): the camera vibrates faster than its "
+            "rows can tell, or the scan direction is another one",
+        )
+    if rolling and posterior.model_error > _MOST_MODEL_ERROR * threshold:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
+            "or the map is wrong by more than a pose could bear",
+        )
+    pace = _median(observations.row_paces(state), posterior.inliers)
+    if pace < _LEAST_PACE:
+        return Failure(
+            Reason.IMPLAUSIBLE,
+            f"the image would move along with the rows, {1.0 - pace:.0%} as fast as they",
+        )
+    turn = float(np.linalg.norm(state[12:15]))
+    if turn > _MOST_TURN:
+        return Failure(
+            Reason.IMPLAUSIBLE,
+            f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
+        )
+    depth = _median(observations.points @ state[6:9] + state[11], posterior.inliers)
+    travel = float(np.linalg.norm(state[15:18]))
+    if travel > depth:
+        return Failure(
+            Reason.IMPLAUSIBLE,
+            f"the camera would move by {travel:.3g} m per readout in front of points "
+            f"{depth:.3g} m away",
+        )
+    mirror = posterior.mirror
+    if mirror is not None and mirror.turn > (
+        _MOST_COVERED_TURN if mirror.covered else _MOST_MIRRORED_TURN
+    ):
+        return Failure(
+            Reason.MIRRORED,
+            f"the points lie on a plane, and the pose mirrored on it, "
+            f"{math.degrees(mirror.turn):.0f} deg away, fits but {mirror.evidence:.1f} noise "
+            "variances worse",
+        )
+    return None
+
+
+def _median(values: Array, chosen: BoolArray) -> float:
+    of = values[chosen]
+    middle = len(of) // 2
+    return float(np.partition(of, middle)[middle])

@@ -1,0 +1,216 @@
+"""The best motion of a frame: inliers by the noise, noise by the inliers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.state import PARAMETERS
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.refine import inverted, refine, smallest_eigenvalue
+from rs_localizer.estimation.residuals import set_weights, squared_errors
+
+# Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
+# distributed errors); the threshold is widened for them at most twofold.
+GATE = 3.5
+WIDEST_GATE = 2.0
+_ROUNDS = 3
+_ITERATIONS = 50
+_TOLERANCE = 1e-6  # noise variances
+# Positions of image points are never better than this, in pixels; it also keeps noise-free data
+# from claiming an infinite information.
+_LEAST_NOISE = 1e-4
+# A truncation that truncates nothing, px.
+_NO_SCALE = 1e6
+# Of the information matrix scaled to a unit diagonal.
+_LEAST_EIGENVALUE = 1e-11
+_NOISE_ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mirror:
+    """The mirrored pose before a plane, if it cannot be ruled out."""
+
+    step: Array  # (18,) from the estimate to it
+    evidence: float  # noise variances by which it fits worse
+    covered: bool  # the covariance speaks for it
+
+    @property
+    def turn(self) -> float:
+        """rad."""
+        return float(np.linalg.norm(self.step[:3]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """The refined motion of one frame and what the points say of it."""
+
+    state: Array  # (24,)
+    cost: float  # of the inliers, with the prior, px^2
+    covariance: Array  # (18,18), or more with the coefficients of the shaking
+    noise: float  # px, measured standard deviation
+    freedom: float  # of the errors
+    smallest_eigenvalue: float  # of the information scaled to a unit diagonal
+    inliers: BoolArray  # (n,)
+    squared_errors: Array  # (n,) px^2
+    mirror: Mirror | None = None
+    shake: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k,3) rad, coefficients
+    model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
+    agreement: float = 0.0  # of neighbouring rows, standard deviations
+    # What the frame says of the sizes of shaking and field, logarithms of odds; empty: nothing.
+    of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
+    of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def determined(self) -> bool:
+        """Whether points and prior together determine all parameters."""
+        return self.smallest_eigenvalue > _LEAST_EIGENVALUE
+
+    @property
+    def inflation(self) -> float:
+        """Of the variances, because the noise itself is an estimate.
+
+        Squared distances follow an F distribution; this makes its 95 % quantile that of the
+        chi-squared one, to half a percent from 40 degrees of freedom.
+        """
+        left = max(self.freedom, 6.0)
+        return left / (left - 5.0)
+
+
+@kernel
+def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float:
+    """Standard deviation of the pixel noise from the errors within a gate.
+
+    Args:
+        squared_errors: (n,) of all points.
+        gate: px.
+        freedom: degrees of freedom that the fit has used up.
+
+    The errors of true inliers are Rayleigh distributed; cutting them off at the gate lowers their
+    mean square by a factor that depends on the deviation itself, hence the fixed point.
+    """
+    total, left = 0.0, -freedom
+    for squared in squared_errors:
+        if squared < gate * gate:
+            total += squared
+            left += 2.0
+    if left <= 0.0:
+        return gate / GATE
+    mean = total / left
+    variance = mean
+    for _ in range(_NOISE_ROUNDS):
+        u = gate * gate / (2.0 * max(variance, 1e-12 * gate * gate))
+        kept = 1.0 - u * math.exp(-u) / -math.expm1(-u)
+        variance = min(mean / max(kept, 1e-3), gate * gate)
+    return max(math.sqrt(variance), _LEAST_NOISE)
+
+
+@kernel
+def decided(information: Array, prior: PriorTerms, noise: float) -> float:
+    """How many of the parameters the points decide, and not the prior.
+
+    Args:
+        information: (18,18) of both, px^2.
+        noise: px, the one that the prior was weighed against.
+    """
+    size = len(information)
+    inverse = inverted(information)
+    total = float(size)
+    for term in range(len(prior.informations)):
+        for i in range(size):
+            for j in range(size):
+                total -= noise * noise * inverse[i, j] * prior.informations[term, i, j]
+    return max(total, 0.0)
+
+
+@kernel
+def _rounds(
+    data: Array,
+    count: int,
+    start: Array,
+    gradient: Array,
+    prior: PriorTerms,
+    threshold: float,
+) -> tuple[Array, Array, float, Array, float, float, float]:
+    """Refine, measure the noise, choose the inliers, and again.
+
+    Returns:
+        state, information times the noise variance, cost, squared errors (count,), noise, gate, and
+        the parameters that the points decide (the prior takes its part of them).
+    """
+    # From the wide side: a start that fits few points well would see little noise and keep few.
+    state, gate, noise, freedom = start, WIDEST_GATE * threshold, 0.5 * threshold, 0.0
+    cost = 0.0
+    errors = squared_errors(data, count, state, gradient)
+    weights = np.empty(count)
+    information = np.empty((PARAMETERS, PARAMETERS))
+    for _ in range(_ROUNDS):
+        for i in range(count):
+            weights[i] = 1.0 if errors[i] < gate * gate else 0.0
+        set_weights(data, weights)
+        state, information, cost, _ = refine(
+            data, state, gradient, _NO_SCALE, 0.0, prior, noise, 2, _ITERATIONS, _TOLERANCE
+        )
+        errors = squared_errors(data, count, state, gradient)
+        freedom = decided(information, prior, noise)
+        noise = noise_deviation(errors, gate, freedom)
+        gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
+    weights[:] = 1.0
+    set_weights(data, weights)
+    return state, information, cost, errors, noise, gate, freedom
+
+
+def maximum_a_posteriori(
+    observations: Observations, start: Array, prior: PriorTerms, threshold: float
+) -> Posterior:
+    """Refine a motion on its inliers, which the noise decides that it leaves.
+
+    Args:
+        start: state (24,).
+        threshold: px, least gate for inliers.
+    """
+    state, information, cost, errors, noise, gate, by_points = _rounds(
+        observations.packed,
+        len(observations),
+        start,
+        observations.row_time_gradient,
+        prior,
+        threshold,
+    )
+    inliers = errors < gate * gate
+    return Posterior(
+        state=state,
+        cost=cost,
+        covariance=noise**2 * inverted(information),
+        noise=noise,
+        freedom=2.0 * np.count_nonzero(inliers) - by_points,
+        smallest_eigenvalue=smallest_eigenvalue(information),
+        inliers=inliers,
+        squared_errors=errors,
+    )
+
+
+def fit(
+    observations: Observations, start: Array, inliers: BoolArray, prior: PriorTerms, noise: float
+) -> tuple[Array, Array, float, bool]:
+    """Refine a state (24,) on some of the points (see :func:`.refine.refine`)."""
+    set_weights(observations.packed, inliers.astype(np.float64))
+    fitted: tuple[Array, Array, float, bool] = refine(
+        observations.packed,
+        start,
+        observations.row_time_gradient,
+        _NO_SCALE,
+        0.0,
+        prior,
+        noise,
+        2,
+        _ITERATIONS,
+        _TOLERANCE,
+    )
+    set_weights(observations.packed, np.ones(len(observations)))
+    return fitted

@@ -1,0 +1,277 @@
+"""Refinement of a motion on many points: Levenberg-Marquardt in model B, with a prior.
+
+Parameters of a step, as in ``Estimate.covariance``: the camera turns by ``exp([phi]x)`` in its own
+axes, moves by ``rho`` along them, and velocities and accelerations change additively.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.so3 import exp, log
+from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.estimation.prior import PriorTerms, add_prior
+from rs_localizer.estimation.residuals import normal_equations
+
+_MOST_DAMPING = 1e8
+# Pivots of a matrix of unit diagonal below this are rounding errors.
+_SINGULAR = 1e-15
+# More damping does not get along the flat valleys of planes that turn fast, less loses planes that
+# face the camera.
+_ANNEALING_DAMPING = 1e-4
+_ANNEALING_RATIO = 0.6
+
+
+@kernel
+def apply_step(state: Array, step: Array) -> Array:
+    """The state moved by a step (18,), or (12,) that leaves the accelerations."""
+    turn = exp(-step[0:3])
+    moved = np.empty(STATE_SIZE)
+    for i in range(3):
+        for j in range(3):
+            moved[3 * i + j] = (
+                turn[i, 0] * state[j] + turn[i, 1] * state[3 + j] + turn[i, 2] * state[6 + j]
+            )
+        moved[9 + i] = (
+            turn[i, 0] * (state[9] - step[3])
+            + turn[i, 1] * (state[10] - step[4])
+            + turn[i, 2] * (state[11] - step[5])
+        )
+    for i in range(12, STATE_SIZE):
+        moved[i] = state[i] + (step[i - 6] if i - 6 < len(step) else 0.0)
+    return moved
+
+
+def step_between(state: Array, other: Array) -> Array:
+    """The step (18,) that leads from one state to another."""
+    turn = state[:9].reshape(3, 3) @ other[:9].reshape(3, 3).T
+    return np.concatenate([log(turn), state[9:12] - turn @ other[9:12], other[12:] - state[12:]])
+
+
+@kernel
+def solve_positive(matrix: Array, right: Array) -> tuple[Array, bool]:
+    """Solution of a symmetric positive definite system by Cholesky, and whether it is one."""
+    size = len(right)
+    # Scaling to a unit diagonal makes radians and metres comparable.
+    scale = np.empty(size)
+    for i in range(size):
+        if not matrix[i, i] > 0.0:
+            return right, False
+        scale[i] = 1.0 / np.sqrt(matrix[i, i])
+    factor = np.empty((size, size))
+    solution = np.empty(size)
+    for i in range(size):
+        for j in range(i + 1):
+            total = matrix[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not total > _SINGULAR:
+                    return right, False
+                factor[i, i] = np.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+        total = right[i] * scale[i]
+        for k in range(i):
+            total -= factor[i, k] * solution[k]
+        solution[i] = total / factor[i, i]
+    for i in range(size - 1, -1, -1):
+        total = solution[i]
+        for k in range(i + 1, size):
+            total -= factor[k, i] * solution[k]
+        solution[i] = total / factor[i, i]
+    for i in range(size):
+        solution[i] *= scale[i]
+    return solution, True
+
+
+@kernel
+def _posterior(
+    data: Array,
+    state: Array,
+    gradient: Array,
+    scale: float,
+    softness: float,
+    prior: PriorTerms,
+    noise: float,
+    looks: int,
+    information: Array,
+    slope: Array,
+) -> float:
+    """Normal equations and cost with the prior, in squared pixels."""
+    cost = normal_equations(data, state, gradient, scale, softness, looks, information, slope)
+    return cost + add_prior(
+        prior.informations,
+        prior.references,
+        prior.gravity,
+        state,
+        noise * noise,
+        information,
+        slope,
+    )
+
+
+@kernel
+def refine(
+    data: Array,
+    start: Array,
+    gradient: Array,
+    scale: float,
+    softness: float,
+    prior: PriorTerms,
+    noise: float,
+    looks: int,
+    iterations: int,
+    tolerance: float,
+) -> tuple[Array, Array, float, bool]:
+    """Minimize the robust cost of all points plus the prior.
+
+    Args:
+        data: packed points, with weights.
+        start: state (24,).
+        gradient: (2,) row time by pixel.
+        scale, softness: of the robust loss, see :mod:`rs_localizer.estimation.residuals`.
+        prior: see :mod:`rs_localizer.estimation.prior`.
+        noise: standard deviation of the pixels, against which the prior is weighed.
+        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.estimation.view.View`);
+            1 holds the accelerations.
+        iterations: most steps.
+        tolerance: a step that gains less than this, in noise variances, is the last one.
+
+    Returns:
+        state (24,), information (18,18) or (12,12) times the noise variance, cost, and whether a
+        step was accepted as the last one or nothing more was to be gained.
+    """
+    state = start.copy()
+    size = MOTION_PARAMETERS if looks == 1 else PARAMETERS
+    information = np.empty((size, size))
+    slope = np.empty(size)
+    next_information = np.empty((size, size))
+    next_slope = np.empty(size)
+    cost = _posterior(
+        data, state, gradient, scale, softness, prior, noise, looks, information, slope
+    )
+    damping = 0.0
+    converged = False
+    for _ in range(iterations):
+        damped = information.copy()
+        for i in range(size):
+            damped[i, i] *= 1.0 + damping
+        step, solved = solve_positive(damped, -slope)
+        gain = 0.0
+        if solved:
+            for i in range(size):
+                gain -= step[i] * slope[i]
+            trial = apply_step(state, step)
+            trial_cost = _posterior(
+                data, trial, gradient, scale, softness, prior, noise, looks,
+                next_information, next_slope,
+            )  # fmt: skip
+            if trial_cost <= cost:
+                state, cost = trial, trial_cost
+                information, next_information = next_information, information
+                slope, next_slope = next_slope, slope
+                damping = 0.0 if damping < 1e-8 else 0.2 * damping
+                if gain < tolerance * noise * noise:
+                    converged = True
+                    break
+                continue
+            if gain < tolerance * noise * noise:
+                converged = True
+                break
+        damping = max(5.0 * damping, 1e-6)
+        if damping > _MOST_DAMPING:
+            break
+    return state, information, cost, converged
+
+
+@kernel
+def anneal(
+    data: Array,
+    start: Array,
+    gradient: Array,
+    first_scale: float,
+    last_scale: float,
+    prior: PriorTerms,
+    noise: float,
+) -> Array:
+    """State after one Gauss-Newton step at each scale of Tukey's loss, from the first to the last.
+
+    No step is tried twice: the next scale judges the points anew (graduated non-convexity).
+    """
+    state = start
+    information = np.empty((MOTION_PARAMETERS, MOTION_PARAMETERS))
+    slope = np.empty(MOTION_PARAMETERS)
+    scale = first_scale
+    while scale > last_scale:
+        _posterior(data, state, gradient, scale, 1.0, prior, noise, 1, information, slope)
+        for i in range(MOTION_PARAMETERS):
+            information[i, i] *= 1.0 + _ANNEALING_DAMPING
+        step, solved = solve_positive(information, -slope)
+        if not solved:
+            break
+        state = apply_step(state, step)
+        scale *= _ANNEALING_RATIO
+    return state
+
+
+@kernel
+def inverted(matrix: Array) -> Array:
+    """Inverse of a symmetric positive definite matrix by Cholesky; NaN where it is none.
+
+    Scaled to a unit diagonal first, so that units do not matter, nor parameters that a prior holds.
+    """
+    size = len(matrix)
+    inverse = np.empty((size, size))
+    scale = np.empty(size)
+    half = np.zeros((size, size))  # inverse of the factor
+    factor = np.empty((size, size))
+    inverse[:] = np.nan
+    for i in range(size):
+        if not matrix[i, i] > 0.0:
+            return inverse
+        scale[i] = 1.0 / np.sqrt(matrix[i, i])
+    for i in range(size):
+        for j in range(i + 1):
+            total = matrix[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = total / factor[j, j]
+            elif total > _SINGULAR:
+                factor[i, i] = np.sqrt(total)
+            else:
+                return inverse
+        half[i, i] = 1.0 / factor[i, i]
+        for j in range(i):
+            total = 0.0
+            for k in range(j, i):
+                total += factor[i, k] * half[k, j]
+            half[i, j] = -total * half[i, i]
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, size):
+                total += half[k, i] * half[k, j]
+            inverse[i, j] = total * scale[i] * scale[j]
+            inverse[j, i] = inverse[i, j]
+    return inverse
+
+
+@kernel
+def smallest_eigenvalue(information: Array) -> float:
+    """Of an information matrix scaled to a unit diagonal; 0 where it is none."""
+    size = len(information)
+    scaled = np.empty((size, size))
+    for i in range(size):
+        if not information[i, i] > 0.0:
+            return 0.0
+    for i in range(size):
+        for j in range(size):
+            scaled[i, j] = information[i, j] / np.sqrt(information[i, i] * information[j, j])
+            if not np.isfinite(scaled[i, j]):
+                return 0.0
+    smallest: float = np.linalg.eigvalsh(scaled)[0]
+    return smallest

@@ -1,0 +1,200 @@
+"""The search for the motion of a frame: a global-shutter start, then the solver's hypotheses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.posterior import WIDEST_GATE
+from rs_localizer.estimation.prior import PriorTerms, held_terms
+from rs_localizer.estimation.ransac import NOTHING, Candidate, Hypotheses, search
+from rs_localizer.estimation.sampling import Pool, Random
+from rs_localizer.estimation.scoring import optimize
+from rs_localizer.estimation.settling import Assumed
+from rs_localizer.solvers import Solver, find_solver
+
+# A global-shutter pose under motion misses the points of the first and last rows by a good part
+# of the image; it only has to be right to some degrees. In focal lengths.
+_GLOBAL_SHUTTER_SCALE = 0.05
+_POOL_SCALE = 0.12
+# Minimal models are scored at this multiple of the inlier threshold: noise makes a six-point
+# model miss the other inliers by several times their own noise.
+_SCORE_SCALE = 4.0
+_GLOBAL_SHUTTER_BLOCK = 48
+_BLOCK = 64
+_GLOBAL_SHUTTER_MOST_SAMPLES = 384
+# Enough to find three inliers among points of which two fifths are.
+_SECOND_LOOK_SAMPLES = 96
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One frame on its way through the steps."""
+
+    observations: Observations
+    usable: IntArray  # which of the given points are observed
+    count: int  # of the given points
+    centre: Array  # (3,) map frame: origin of the observed points
+    ranking: IntArray | None  # observed points from the best to the worst
+    terms: PriorTerms  # velocity prior and whatever else is known but the pose
+    random: Random
+    assumed: Assumed
+
+
+class MotionSearch:
+    """Finds the motion that most points of a frame agree on."""
+
+    def __init__(self, camera: Camera, config: LocalizerConfig, solver: Solver) -> None:
+        self._config = config
+        self._solver = solver
+        self._focal_length = camera.focal_length
+
+    def find(self, frame: Frame) -> tuple[Candidate, Candidate]:
+        """The global-shutter start and the motion found from it; the start may not be found."""
+        everything = np.arange(len(frame.observations))
+        start = self._global_shutter(frame, everything, self._config.max_iterations)
+        if not start.found:
+            return start, start
+        return self._largest_group(frame, start, self._motion(frame, start))
+
+    def _largest_group(
+        self, frame: Frame, start: Candidate, best: Candidate
+    ) -> tuple[Candidate, Candidate]:
+        """The start and the motion of another group of points, if it is the larger one.
+
+        The search stays near its global-shutter start. Where that lies on a second moving object,
+        the points that it leaves out may hold more inliers than it found.
+        """
+        if not best.found:
+            return start, best
+        others = np.flatnonzero(~self._near(frame, start))
+        # At the widest gate of the final estimate, so that noise hides none of them.
+        gate = WIDEST_GATE * self._config.inlier_threshold
+        inliers = frame.observations.squared_errors(best.state) < gate**2
+        if not self._solver.rolling_shutter or len(others) <= np.count_nonzero(inliers):
+            return start, best
+        second = self._global_shutter(frame, others, _SECOND_LOOK_SAMPLES)
+        if not second.found or (
+            np.count_nonzero(self._near(frame, second)[others]) <= np.count_nonzero(inliers)
+        ):
+            return start, best
+        rival = self._motion(frame, second)
+        return (second, rival) if rival.cost < best.cost else (start, best)
+
+    def _near(self, frame: Frame, start: Candidate) -> BoolArray:
+        """Which points may belong to a motion whose global-shutter pose this is."""
+        errors = frame.observations.squared_errors(start.state)
+        near: BoolArray = errors < (_POOL_SCALE * self._focal_length) ** 2
+        return near
+
+    def _global_shutter(self, frame: Frame, among: IntArray, most: int) -> Candidate:
+        """A pose that fits all rows roughly, by P3P on some points and a wide threshold."""
+        threshold = self._config.inlier_threshold
+        wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
+        if self._solver.rolling_shutter:
+            score_scale, final_scale = wide, wide
+            most = min(_GLOBAL_SHUTTER_MOST_SAMPLES, most)
+        else:
+            score_scale, final_scale = _SCORE_SCALE * threshold, threshold
+        hypotheses = self._hypotheses(
+            find_solver("p3p"), _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
+        )
+        return search(
+            frame.observations,
+            hypotheses,
+            [np.eye(3)],
+            _pools(frame, among),
+            NOTHING,
+            self._config.confidence,
+            most,
+            frame.random,
+        )
+
+    def _motion(self, frame: Frame, start: Candidate) -> Candidate:
+        """The motion that most points agree on, from the solver's hypotheses."""
+        if not self._solver.rolling_shutter:
+            return start
+        threshold = self._config.inlier_threshold
+        near = np.flatnonzero(self._near(frame, start))
+        # The global-shutter pose is a hypothesis, too: at rest it is the best one.
+        first = self.optimize(frame, start.state, _POOL_SCALE * self._focal_length, frame.terms)
+        hypotheses = self._hypotheses(
+            self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, frame.terms
+        )
+        return search(
+            frame.observations,
+            hypotheses,
+            [start.state[:9].reshape(3, 3)],
+            [Pool(near), *_pools(frame, np.arange(len(frame.observations)))],
+            first,
+            self._config.confidence,
+            self._config.max_iterations,
+            frame.random,
+        )
+
+    def _hypotheses(
+        self,
+        solver: Solver,
+        block: int,
+        score_scale: float,
+        final_scale: float,
+        terms: PriorTerms,
+    ) -> Hypotheses:
+        iterations = self._config.solver_iterations
+
+        def solve(
+            points: Array,
+            rays: Array,
+            tau: Array,
+            samples: IntArray,
+            rotations: Array,
+            models: Array,
+        ) -> None:
+            solver.solve(points, rays, tau, samples, rotations, iterations, models)
+
+        return Hypotheses(
+            solve=solve,
+            sample_size=solver.sample_size,
+            solutions=solver.solutions,
+            block=block,
+            score_scale=score_scale,
+            final_scale=final_scale,
+            prior=terms,
+            noise=0.5 * self._config.inlier_threshold,
+        )
+
+    def optimize(
+        self, frame: Frame, state: Array, first_scale: float, terms: PriorTerms
+    ) -> Candidate:
+        """Local optimisation of one state down to the inlier threshold."""
+        optimized, cost = optimize(
+            state[None],
+            np.zeros(1),
+            frame.observations.packed,
+            frame.observations.row_time_gradient,
+            first_scale,
+            self._config.inlier_threshold,
+            terms,
+            0.5 * self._config.inlier_threshold,
+        )
+        return Candidate(optimized, cost)
+
+    def global_shutter_inliers(self, frame: Frame, start: Candidate) -> int:
+        """How many points a global-shutter pose explains at the inlier threshold."""
+        threshold = self._config.inlier_threshold
+        still = np.concatenate([start.state[:12], np.zeros(12)])
+        pose = self.optimize(frame, still, 2.0 * _SCORE_SCALE * threshold, held_terms())
+        return int(np.count_nonzero(frame.observations.squared_errors(pose.state) < threshold**2))
+
+
+def _pools(frame: Frame, among: IntArray) -> list[Pool]:
+    everything = Pool(among)
+    # Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
+    if frame.ranking is None:
+        return [everything]
+    return [Pool(frame.ranking[np.isin(frame.ranking, among)], ranked=True), everything]

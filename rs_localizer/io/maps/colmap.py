@@ -1,0 +1,180 @@
+"""Maps from COLMAP: a sparse model's ``points3D``, and descriptors from its database.
+
+A landmark's descriptor is the medoid of those of the images that see it: the one nearest to the
+others.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.io.maps.colmap_model import Model, read_model
+from rs_localizer.io.maps.landmarks import Map, MapError, make_map
+
+DATABASE = "database.db"
+# Of a track, evenly: some are seen a thousand times.
+_MOST_OBSERVATIONS = 32
+_SIFT_WIDTH = 128
+_WIDEST = 4096
+# Extractors of COLMAP 3.12 and later; before, there was no such column.
+_UNDEFINED, _SIFT = -1, 0
+
+
+def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
+    """Read a sparse model, in its binary or its text form.
+
+    Args:
+        folder: with ``points3D.bin`` or ``points3D.txt``.
+        frame: of the model.
+        database: default: ``database.db`` in the folder or in one of the two above it, where
+            COLMAP leaves it, or the only ``.db`` file there that has descriptors; without one the
+            map has no descriptors.
+
+    Raises:
+        MapError: for anything that is no model, OSError as any file.
+    """
+    model = read_model(folder)
+    if database is None:
+        database = _find_database((folder, *folder.resolve().parents[:2]))
+    if database is None:
+        return make_map(model.points, model.ids, None, frame)
+    try:
+        descriptors, known = _descriptors(model, database)
+    except MapError as error:
+        raise MapError(f"{database}: {error}") from error
+    found = make_map(model.points[known], model.ids[known], descriptors, frame)
+    unknown = len(known) - int(np.count_nonzero(known))
+    return Map(found.points, found.ids, found.descriptors, frame, found.dropped + unknown)
+
+
+def _find_database(places: tuple[Path, ...]) -> Path | None:
+    for place in places:
+        if (place / DATABASE).is_file():
+            return place / DATABASE
+    for place in places:
+        found = [path for path in sorted(place.glob("*.db")) if _has_descriptors(path)]
+        if len(found) > 1:
+            names = ", ".join(path.name for path in found)
+            raise MapError(f"{place} has several databases of COLMAP, {names}: name one")
+        if found:
+            return found[0]
+    return None
+
+
+def _has_descriptors(path: Path) -> bool:
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as tables:
+            query = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name='descriptors'"
+            return bool(tables.execute(query).fetchone()[0])
+    except sqlite3.Error:
+        return False
+
+
+def _descriptors(model: Model, database: Path) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:
+    """Descriptors (k,d) of the points that have any, and which points (n,) these are."""
+    chosen = _chosen(model)
+    observations = model.tracks[chosen]
+    found, known = _observed(observations, database)
+    counts = np.diff(np.searchsorted(chosen, model.starts))
+    medoids = np.zeros((len(counts), found.shape[1]), found.dtype)
+    usable = np.zeros(len(counts), np.bool_)
+    end = 0
+    for point, count in enumerate(counts):
+        start, end = end, end + count
+        rows = found[start:end][known[start:end]]
+        if len(rows):
+            medoids[point], usable[point] = rows[_medoid(rows)], True
+    if not usable.any():
+        raise MapError("no point of the model has a descriptor in it; is it of another model?")
+    return (medoids.astype(np.float32) if _numeric(found) else medoids)[usable], usable
+
+
+def _numeric(descriptors: NDArray[np.generic]) -> bool:
+    """Whether they are compared as numbers; COLMAP keeps SIFT as bytes, but numbers they are."""
+    return descriptors.dtype == np.float32 or descriptors.shape[1] == _SIFT_WIDTH
+
+
+def _chosen(model: Model) -> NDArray[np.int64]:
+    """Which observations count: of long tracks an even choice."""
+    parts = []
+    for start, end in zip(model.starts[:-1].tolist(), model.starts[1:].tolist(), strict=True):
+        step = -(-(end - start) // _MOST_OBSERVATIONS) or 1
+        parts.append(np.arange(start, end, step))
+    return np.concatenate([*parts, np.zeros(0, np.int64)])
+
+
+def _observed(
+    observations: NDArray[np.void], database: Path
+) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:
+    """Descriptors (m,d) of observations (m,), and which of them (m,) are known."""
+    known = np.zeros(len(observations), np.bool_)
+    found: NDArray[np.generic] | None = None
+    order = np.argsort(observations["image"], kind="stable")
+    images, firsts = np.unique(observations["image"][order], return_index=True)
+    groups = np.split(order, firsts[1:]) if len(order) else []
+    try:
+        with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as tables:
+            tables.text_factory = bytes  # of a damaged one, text may be none
+            columns = [row[1] for row in tables.execute("PRAGMA table_info(descriptors)")]
+            kind = "type" if b"type" in columns else str(_SIFT)
+            for image, rows in zip(images.tolist(), groups, strict=True):
+                part = _of_image(tables, image, kind)
+                if part is None:
+                    continue
+                if found is None:
+                    found = np.zeros((len(observations), part.shape[1]), part.dtype)
+                if part.shape[1] != found.shape[1] or part.dtype != found.dtype:
+                    raise MapError(
+                        f"image {image} has descriptors of {part.shape[1]} x {part.dtype}, others "
+                        f"of {found.shape[1]} x {found.dtype}"
+                    )
+                features = observations["feature"][rows]
+                there = features < len(part)
+                found[rows[there]] = part[features[there]]
+                known[rows[there]] = True
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # which the text of an error may cause
+        raise MapError(f"it cannot be read as a database of COLMAP: {error}") from error
+    if found is None:
+        raise MapError("it has no descriptors of the images of the model")
+    return found, known
+
+
+def _of_image(
+    tables: sqlite3.Connection, image: int, kind: str
+) -> NDArray[np.uint8] | NDArray[np.float32] | None:
+    """Descriptors (n,d) of all features of an image."""
+    query = f"SELECT rows, cols, data, {kind} FROM descriptors WHERE image_id = ?"
+    row = tables.execute(query, (image,)).fetchone()
+    if row is None or row[0] == 0:
+        return None
+    rows, columns, data, extractor = row
+    if not isinstance(rows, int) or not isinstance(columns, int) or not isinstance(data, bytes):
+        raise MapError(f"the descriptors of image {image} are none")
+    if not 0 < columns <= _WIDEST or rows * columns != len(data):
+        raise MapError(
+            f"image {image}: {rows} descriptors of {columns} bytes, found {len(data)} bytes"
+        )
+    # Of all extractors but SIFT, which is the first, COLMAP keeps the bytes of floats.
+    if extractor in (_UNDEFINED, _SIFT):
+        return np.frombuffer(data, np.uint8).reshape(rows, columns)
+    if columns % 4:
+        raise MapError(f"image {image}: descriptors of {columns} bytes are no floats")
+    return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, columns // 4)
+
+
+def _medoid(rows: NDArray[np.generic]) -> int:
+    """The row with the least sum of distances to the others."""
+    if len(rows) < 3:
+        return 0
+    if _numeric(rows):
+        values = rows.astype(np.float64)
+        distances = np.sqrt(np.square(values[:, None] - values[None]).sum(axis=2))
+    else:
+        bits = np.unpackbits(rows.view(np.uint8), axis=1)
+        distances = np.count_nonzero(bits[:, None] != bits[None], axis=2)
+    return int(np.argmin(distances.sum(axis=1)))

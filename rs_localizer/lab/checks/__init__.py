@@ -1,0 +1,1 @@
+"""Programs that look for faults and for lost time."""

@@ -1,0 +1,1 @@
+"""Simulated frames, their truth, and their recordings."""

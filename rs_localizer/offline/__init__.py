@@ -1,0 +1,1 @@
+"""Recordings and files through the pipeline."""

@@ -1,0 +1,264 @@
+"""Offline detection: images -> a recording of correspondences, by the marker detector's code."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.shutter import project_rolling
+from rs_localizer.io.bags import BagWriter, make_message
+from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.io.images import Image
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, IMAGE_TOPIC
+from rs_localizer.io.whole import whole
+from rs_localizer.localizer import Localizer
+from rs_localizer.markers.displaced import LeaveOneOut, Predict
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.recognition import recognized
+from rs_localizer.markers.still import rms, still_errors, still_pose
+from rs_localizer.offline.image_sources import Carried, Shot
+from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
+
+# Fewer corners than this say nothing about how well a pose fits.
+_LEAST_CORNERS = 6
+# Of these, the last few are looked at for anything else: seconds each.
+_RECOGNIZED = 4
+# Fewer than this share of the images with anything of the map are a reason to look.
+_FEW = 0.3
+# So many images without anything of the map are no chance: a few seconds of a video.
+_PATIENCE = 64
+# Corners of two markers: the least that is left of three.
+_LEAST_INLIERS = 8
+# A global-shutter pose leaves at most so much (px rms) in the stillest images, in percent of all,
+# unless calibration or map are wrong: a good one leaves 0.1 to 0.5.
+_MOST_STILL, _STILL_PERCENT = 1.5, 10.0
+
+
+class DetectError(ValueError):
+    """Images without a use; the message says what was found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What became of the images."""
+
+    images: int
+    with_corners: int
+    corners: float  # median of the images that show any
+    refused: dict[str, str]  # why images could not be read: the first detail of each reason
+    residual: float  # px rms of a global-shutter pose, median; NaN where none was possible
+    period: float  # s from one image to the next, median; NaN for a single one
+    carried: dict[str, int]  # messages of each other topic that replay may need
+    faults: tuple[str, ...]  # what speaks against map or calibration
+
+
+def record(
+    shots: Iterable[Shot | Carried],
+    detector: FrameDetector,
+    out: Path,
+    *,
+    storage: str = "mcap",
+    with_images: bool = False,
+    scan_direction: str = ScanDirection.TOP_TO_BOTTOM,
+    done: Callable[[], object] = lambda: None,
+    tell: Callable[[str], object] = lambda text: None,
+) -> Recorded:
+    """Write the corners of all images that show any, each with its CameraInfo.
+
+    Args:
+        shots: the images, and what else of their recording is to be kept.
+        detector: looks for markers.
+        out: bag directory to create.
+        storage: ``mcap`` or ``sqlite3``.
+        with_images: write these images, too, as far as they are compressed.
+        scan_direction: of the shutter, for the check of the markers' places.
+        done: called after each image.
+        tell: called when many images in the beginning show nothing, with what they show instead.
+
+    Raises:
+        DetectError: when no image shows anything, or images and calibration differ in size.
+    """
+    tally = _Tally(detector.map)
+    cameras = _Cameras(scan_direction)
+    with whole(out), BagWriter(out, storage) as bag:
+        for shot in shots:
+            if isinstance(shot, Carried):
+                tally.carried[shot.topic] += 1
+                bag.write(shot.topic, shot.message, shot.recorded_ns)
+                continue
+            if isinstance(shot.image, Refusal):
+                tally.refuse(shot.image)
+            else:
+                detected = detector.detect(shot.image)
+                tally.add(cameras.of(shot, detected), detected)
+                if len(detected.detections.ids):
+                    _write(bag, shot, detected, with_images)
+                if tally.images == _PATIENCE and tally.are_few:
+                    count = len(tally.counts) or "none"
+                    tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")
+            done()
+        if not tally.counts:
+            raise DetectError(f"none of the {tally.images} images {tally.nothing()}")
+    return tally.recorded()
+
+
+class _Tally:
+    """Counts what became of the images."""
+
+    def __init__(self, marker_map: MarkerMap) -> None:
+        self.images = 0
+        self.counts: list[int] = []
+        self.carried: Counter[str] = Counter()
+        self._map = marker_map
+        self._refused: dict[str, str] = {}
+        self._others: Counter[str] = Counter()
+        self._residuals: list[float] = []
+        self._stamps: list[int] = []
+        self._empty: list[Image] = []  # some that show nothing
+        self._empties = 0
+        self._markers = LeaveOneOut(marker_map, _RollingFit())
+
+    def refuse(self, refusal: Refusal) -> None:
+        self.images += 1
+        self._refused.setdefault(refusal.reason, refusal.detail)
+
+    def add(self, camera: Camera, detected: Detected) -> None:
+        self.images += 1
+        self._stamps.append(detected.image.stamp_ns)
+        found = detected.detections
+        self._others.update(found.unknown)
+        if len(found.ids):
+            self.counts.append(len(found.ids))
+            self._residuals.append(static_residual(camera, detected))
+            self._markers.add(camera, found)
+            return
+        self._empties += 1
+        if self._empties.bit_count() == 1:  # the 1st, 2nd, 4th, 8th ...
+            self._empty = [*self._empty[1 - _RECOGNIZED :], detected.image]
+
+    @property
+    def are_few(self) -> bool:
+        """Whether so few images show anything that it may be another board, seen in part."""
+        return len(self.counts) < _FEW * self.images
+
+    def nothing(self) -> str:
+        """What is to be said of images that show nothing of the map."""
+        families = sorted({marker.family.name for marker in self._map.markers})
+        wanted = ", ".join([*families, *(board.name for board in self._map.boards)])
+        text = f"shows anything of the map ({wanted})"
+        if self._refused:
+            text += f"; {'; '.join(self._refused.values())}"
+        if self._others:
+            names = ", ".join(name for name, _ in self._others.most_common(5))
+            return f"{text}; they show {names}, which the map does not have"
+        seen = self.instead()
+        if seen:
+            return f"{text}; {'others' if self.counts else 'they'} show {'; '.join(seen)}"
+        if self._empty:
+            text += "; nor any other marker or chessboard that OpenCV knows"
+        return text
+
+    def instead(self) -> list[str]:
+        """What images that show nothing of the map show otherwise."""
+        seen = Counter(name for image in self._empty for name in recognized(image.pixels))
+        # What one of several shows may be chance.
+        return [name for name, count in seen.most_common(4) if 2 * count >= len(self._empty)]
+
+    def recorded(self) -> Recorded:
+        known = [value for value in self._residuals if np.isfinite(value)]
+        faults = [] if (fault := self._markers.fault()) is None else [fault]
+        if known and (least := float(np.percentile(known, _STILL_PERCENT))) > _MOST_STILL:
+            faults.append(
+                f"even the stillest images leave {least:.1f} px rms: the calibration can hardly be "
+                "of this camera in this mode, or the map (sizes, positions) is wrong"
+            )
+        if self.are_few and (seen := self.instead()):
+            faults.append(f"images that show nothing of the map show {'; '.join(seen)}")
+        period = np.diff(np.array(self._stamps, np.int64))
+        return Recorded(
+            self.images,
+            len(self.counts),
+            float(np.median(self.counts)),
+            self._refused,
+            float(np.median(known)) if known else np.nan,
+            float(np.median(period)) * 1e-9 if len(period) else np.nan,
+            dict(self.carried),
+            tuple(faults),
+        )
+
+
+class _RollingFit:
+    """Fits the motion of a rolling shutter (see :data:`rs_localizer.markers.displaced.Fit`)."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Camera, Localizer] | None = None
+
+    def __call__(self, camera: Camera, points: Array, pixels: Array) -> Predict | None:
+        if self._last is None or self._last[0] is not camera:
+            self._last = camera, Localizer(camera, min_inliers=_LEAST_INLIERS)
+        found = self._last[1].localize(points, pixels)
+        if not found:
+            return None
+        return lambda some: project_rolling(camera, found.at_rows, some)[0]
+
+
+class _Cameras:
+    """The camera of each image; mostly that of the one before."""
+
+    def __init__(self, scan_direction: str) -> None:
+        self._scan_direction = scan_direction
+        self._last: tuple[Calibration, Camera] | None = None
+
+    def of(self, shot: Shot, detected: Detected) -> Camera:
+        try:
+            calibration = read_camera_info(shot.camera_info)
+            if self._last is None or self._last[0] != calibration:
+                self._last = calibration, calibration.camera(0.0, self._scan_direction)
+        except MessageError as error:
+            raise DetectError(f"the camera_info cannot be used: {error}") from error
+        camera = self._last[1]
+        height, width = detected.image.pixels.shape
+        if (width, height) != camera.size:
+            raise DetectError(
+                f"the images are of {width}x{height}, the calibration is for "
+                f"{camera.size[0]}x{camera.size[1]}{_why((width, height), camera.size)}"
+            )
+        return camera
+
+
+def _why(found: tuple[int, int], calibrated: tuple[int, int]) -> str:
+    """What two sizes of images have to do with each other."""
+    if found == calibrated[::-1]:
+        return (
+            ": they are turned by a quarter; calibrate with images as they are recorded (the scan "
+            "direction turns with them)"
+        )
+    if abs(found[0] * calibrated[1] - found[1] * calibrated[0]) <= max(calibrated):
+        return ": another resolution of the same shape; calibrate in the mode that is used"
+    return ": another mode or camera; calibrate in the mode that is used"
+
+
+def _write(bag: BagWriter, shot: Shot, detected: Detected, with_images: bool) -> None:
+    bag.write(CAMERA_INFO_TOPIC, shot.camera_info, shot.recorded_ns)
+    bag.write(CORRESPONDENCES_TOPIC, correspondences(detected, make_message), shot.recorded_ns)
+    if with_images and shot.compressed is not None:
+        bag.write(IMAGE_TOPIC, shot.compressed, shot.recorded_ns)
+
+
+def static_residual(camera: Camera, detected: Detected) -> float:
+    """Reprojection error (px rms) of the best global-shutter pose; NaN: there is none."""
+    found = detected.detections
+    if len(found.ids) < _LEAST_CORNERS:
+        return np.nan
+    pose = still_pose(found.points, camera.rays(found.pixels))
+    if pose is None:
+        return np.nan
+    return rms(still_errors(camera, pose, found.points, found.pixels))

@@ -1,0 +1,185 @@
+"""Where images come from, offline: a video, a folder of files, a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagReader, make_message
+from rs_localizer.io.image_clock import ImageClock
+from rs_localizer.io.images import Image
+from rs_localizer.io.messages import make_header, stamp_ns
+from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
+from rs_localizer.io.video import read_video
+from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
+from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.pipeline.images import read
+
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+SUFFIXES = (".jpg", ".jpeg", ".png")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".mjpeg", ".mjpg", ".m4v", ".h264", ".ts")
+
+# Names of image files that are a time in ns, as EuRoC's and TUM-VI's: from 1973 (before, a name
+# may be a time of today in us) to what a stamp of ROS can hold.
+_EARLIEST_NS, _LATEST_NS = 10**17, 2**31 * 10**9
+
+
+class SourceError(ValueError):
+    """Images that cannot be used; the message says what was found."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """One image of a source, and the camera that took it."""
+
+    image: Image | Refusal
+    camera_info: Any  # sensor_msgs/CameraInfo
+    compressed: Any | None  # the image as sensor_msgs/CompressedImage, where it was compressed
+    recorded_ns: int  # when it was recorded; of a file, its stamp
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carried:
+    """A message of a bag that is no image, and that replay will need."""
+
+    topic: str
+    recorded_ns: int
+    message: Any
+
+
+def from_video(path: Path, camera: Camera, clock: ImageClock) -> Iterator[Shot]:
+    """The images of a video.
+
+    Raises:
+        ValueError: when it cannot be read, or has no times and the clock no rate.
+    """
+    for jpeg, gray, seconds in read_video(path):
+        now = clock.relative(None if seconds is None else round(1e9 * seconds))
+        if now is None:
+            lost = Refusal("no_time", "OpenCV does not tell its presentation time")
+            yield Shot(lost, make_camera_info(camera, 0), None, 0)
+        else:
+            yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")
+
+
+def from_files(files: list[Path], camera: Camera, clock: ImageClock) -> Iterator[Shot]:
+    """JPEG and PNG files; their names are times in ns, or they follow each other at a rate."""
+    timed = have_times(files)
+    for file in files:
+        now = clock.absolute(int(file.stem)) if timed else clock.relative(None)
+        assert now is not None  # a clock without a rate has refused
+        data = file.read_bytes()
+        name = "png" if file.suffix.lower() == ".png" else "jpeg"
+        seconds, nanoseconds = divmod(now, 10**9)
+        stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+        header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
+        found = read(SimpleNamespace(header=header, format=name, data=data))
+        if isinstance(found, Refusal):
+            found = Refusal(found.reason, f"{file.name}: {found.detail}")
+        yield _shot(found, camera, data, name, now)
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The JPEG and PNG files of a folder by name, or by number if the names are numbers.
+
+    Raises:
+        SourceError: when there is none.
+    """
+    files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
+    if not files:
+        raise SourceError(f"{folder} has no images: no file ends in {', '.join(SUFFIXES)}")
+    if all(file.stem.isdecimal() for file in files):
+        return sorted(files, key=lambda file: int(file.stem))
+    return sorted(files)
+
+
+def holds_images(path: Path) -> str:
+    """What a path that is no recording holds of images, as ``is a video``; empty: nothing."""
+    if path.is_dir():
+        found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
+        return f"is a folder of {found} images" if found else ""
+    if path.suffix.lower() in SUFFIXES:
+        return "is an image"
+    return "is a video" if path.is_file() and path.suffix.lower() in _VIDEOS else ""
+
+
+def image_topics(bag: BagReader) -> list[str]:
+    """Topics of a bag with images."""
+    return sorted(topic for topic, kind in bag.topics.items() if kind in IMAGE_TYPES)
+
+
+def have_times(files: list[Path]) -> bool:
+    """Whether the names of image files are times in ns."""
+    names = [file.stem for file in files]
+    return all(n.isdecimal() and _EARLIEST_NS <= int(n) < _LATEST_NS for n in names)
+
+
+def find_topic(bag: BagReader, types: tuple[str, ...], given: str | None, option: str) -> str:
+    """The topic of one of these types, given or the only one.
+
+    Raises:
+        SourceError: when it is not there, or several could be meant.
+    """
+    of_type = sorted(topic for topic, kind in bag.topics.items() if kind in types)
+    known = ", ".join(of_type) or "none"
+    if given is not None:
+        if given not in of_type:
+            raise SourceError(f"{bag.path} has no topic {given} of that kind; it has {known}")
+        return given
+    if len(of_type) != 1:
+        what = "several topics" if of_type else "no topic"
+        choose = f"; choose one with {option}" if of_type else ""
+        raise SourceError(f"{bag.path} has {what} of type {' or '.join(types)}: {known}{choose}")
+    return of_type[0]
+
+
+def from_bag(
+    bag: BagReader, image_topic: str, info_topic: str | None, camera: Camera | None
+) -> Iterator[Shot | Carried]:
+    """The images of a bag, each with the latest CameraInfo (before the first one: the first).
+
+    Between them comes what replay needs besides: transforms and inertial measurements.
+    """
+    carried = [topic for topic, kind in bag.topics.items() if kind in CARRIED_TYPES]
+    topics = [image_topic, *carried]
+    latest: Any = None
+    if info_topic is not None:
+        topics.append(info_topic)
+        latest = next((message for _, _, message in bag.messages([info_topic])), None)
+        if latest is None:
+            raise SourceError(f"{bag.path} has no message on {info_topic}; give --calibration")
+    for topic, recorded_ns, message in bag.messages(topics):
+        if topic == info_topic:
+            latest = message
+        elif topic in carried:
+            yield Carried(topic, recorded_ns, as_tf2(message))
+        else:
+            image = read(message)
+            compressed = message if hasattr(message, "format") else None
+            info = latest
+            if camera is not None:  # the image knows its frame, on which transforms hang
+                frame = str(message.header.frame_id) or CAMERA_FRAME
+                info = make_camera_info(camera, stamp_ns(message), frame)
+            yield Shot(image, info, compressed, recorded_ns)
+
+
+def _shot(
+    image: Image | Refusal, camera: Camera, data: bytes, format_: str, stamp: int = 0
+) -> Shot:
+    """An image of a file."""
+    if isinstance(image, Image):
+        stamp = image.stamp_ns
+    compressed = make_message(
+        IMAGE_TYPES[1],
+        header=make_header(make_message, stamp, CAMERA_FRAME),
+        format=format_,
+        data=np.frombuffer(data, np.uint8),
+    )
+    return Shot(image, make_camera_info(camera, stamp), compressed, stamp)

@@ -1,0 +1,137 @@
+"""Messages of images -> correspondences with the marker map: all of the marker detector but ROS.
+
+The node and the offline ``rs_localizer detect`` run this one class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from rs_localizer.config import DetectorConfig
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.images import Image, read_compressed_image, read_image
+from rs_localizer.io.messages import Make, MessageError
+from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
+from rs_localizer.markers.map_check import MapCheck
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError
+from rs_localizer.pipeline.frames import Refusal
+
+# Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
+# map of a kilometre. Larger ones (georeferenced) need more.
+_LARGE_MAP = 1000.0  # m
+# The map is held against every image until so many have agreed, then against one in so many.
+_AGREED, _ONE_IN = 20, 30
+
+Notice = Callable[[str, str], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detected:
+    """An image in which markers were looked for; true in a condition."""
+
+    image: Image
+    detections: Detections
+    map_frame: str
+    row: np.dtype[Any]  # of the cloud
+
+    def __bool__(self) -> Literal[True]:
+        return True
+
+
+def read(message: Any) -> Image | Refusal:
+    """A sensor_msgs/Image or CompressedImage; ``bad_image`` if it cannot be read."""
+    try:
+        if hasattr(message, "format"):
+            return read_compressed_image(message)
+        return read_image(message)
+    except MessageError as error:
+        return Refusal("bad_image", str(error))
+
+
+def correspondences(detected: Detected, make: Make) -> Any:
+    """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
+    found = detected.detections
+    rows = np.empty(len(found.ids), detected.row)
+    for column, name in enumerate("xyz"):
+        rows[name] = found.points[:, column]
+    rows["u"], rows["v"] = found.pixels[:, 0], found.pixels[:, 1]
+    rows["score"], rows["id"] = found.scores, found.ids
+    return make_cloud(make, detected.image.stamp_ns, detected.map_frame, rows)
+
+
+def _row_type(points: Array) -> np.dtype[Any]:
+    kind = "<f8" if np.abs(points).max() > _LARGE_MAP else "<f4"
+    places = [(name, kind) for name in "xyz"]
+    return np.dtype([*places, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")])
+
+
+class FrameDetector:
+    """Finds the markers of a map in images.
+
+    Args:
+        config: its settings.
+        notice: told of what is wrong but stops nothing, by a name and one sentence:
+            ``unknown_markers``, ``repeated_markers``, ``wrong_map``.
+        marker_map: instead of the file of the settings.
+
+    Raises:
+        MarkerMapError: without a map, or with one that cannot be used.
+    """
+
+    def __init__(
+        self,
+        config: DetectorConfig,
+        notice: Notice = lambda name, text: None,
+        marker_map: MarkerMap | None = None,
+    ) -> None:
+        if marker_map is None:
+            if not config.marker_map:
+                raise MarkerMapError("marker_map is not set; it must name the file of the map")
+            marker_map = read_marker_map(Path(config.marker_map).expanduser())
+        self.map = marker_map
+        self._notice = notice
+        self._detector = MarkerDetector(marker_map, config.min_side)
+        self._check = MapCheck(marker_map)
+        self._row = _row_type(marker_map.points)
+        self._agreed = self._images = 0
+
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        warm_up()
+
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """Spent looking for markers so far: altogether, and of that in OpenCV's search."""
+        return self._detector.seconds, self._detector.opencv_seconds
+
+    def take(self, message: Any) -> Detected | Refusal:
+        """Look for markers in a sensor_msgs/Image or CompressedImage."""
+        image = read(message)
+        return image if isinstance(image, Refusal) else self.detect(image)
+
+    def detect(self, image: Image) -> Detected:
+        """Look for markers in an image."""
+        found = self._detector.detect(image.pixels, image.stamp_ns)
+        for name, markers, text in (
+            ("unknown_markers", found.unknown, "which the map does not have"),
+            ("repeated_markers", found.repeated, "more than once: not used"),
+        ):
+            if markers:
+                shown = ", ".join(markers[:8]) + (", ..." if len(markers) > 8 else "")
+                self._notice(name, f"the image shows {shown}, {text}")
+        self._images += 1
+        if self._agreed < _AGREED or self._images % _ONE_IN == 0:
+            fault = self._check.fault(found)
+            if fault is not None:
+                self._agreed = 0
+                self._notice("wrong_map", fault)
+            elif len(found.ids):
+                self._agreed += 1
+        return Detected(image, found, self.map.map_frame, self._row)

@@ -1,0 +1,125 @@
+"""Pose and twist of the body at one moment of an estimated motion, with their covariances.
+
+The estimate is centred on the middle row and counts time in readouts; what is published holds at
+one moment, in SI units, and orders its covariance as REP-103 does. First-order propagation, with
+``R = map_from_camera`` and ``c`` the camera centre at ``tau = 0``, the turn ``theta = tau omega +
+tau^2/2 alpha`` and the way ``w = tau v + tau^2/2 a`` since then, and the estimate's errors ``phi,
+rho, d_omega, d_v, d_alpha, d_a`` in its own order:
+
+    rotation(tau) = R exp(phi) exp(theta + d_theta)
+                  = exp(R (phi + J(theta) d_theta)) R exp(theta)
+    centre(tau)   = c + R rho + R exp(phi) (w + d_w)
+                  = c + R w + R (rho - [w]x phi + d_w)
+    v(tau)        = exp(-theta - d_theta) (u + d_u),   u = v + tau a
+                  = E u + E d_u + [E u]x J(-theta) d_theta,   E = exp(-theta)
+    omega(tau)    = J(-theta) (omega + tau alpha)
+                  = omega + tau/2 (I + J(-theta)) alpha + ...
+
+where J is the left Jacobian of SO(3): ``exp(a + d) = exp(J(a) d) exp(a)``; it is the right one of
+``-a``. Without acceleration the body rate is ``omega`` at any time; second orders of the
+acceleration are left out.
+Shaking turns the camera by ``delta(tau)`` in its own axes beside all that; its coefficients stand
+behind the motion in the estimate's covariance, and its turn and rate are linear in them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.shake import shake_basis
+from rs_localizer.core.state import (
+    ANGULAR,
+    ANGULAR_ACCELERATION,
+    LINEAR,
+    LINEAR_ACCELERATION,
+    MOVE,
+    PARAMETERS,
+    TURN,
+)
+from rs_localizer.core.types import Estimate
+from rs_localizer.io.outputs import Pose, Twist
+
+# Blocks of the published covariances.
+_LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
+
+
+def pose_at(estimate: Estimate, tau: float) -> Pose:
+    """Pose of the camera in the map at row time ``tau``."""
+    rotation, translation = estimate.at(tau)
+    map_from_middle, map_from_then = estimate.rotation.T, rotation.T
+    by_angle = map_from_middle @ so3.right_jacobian(-estimate.angle_at(tau))
+    values, _ = _shaking(estimate, tau)
+    jacobian = np.zeros((6, len(estimate.joint_covariance)))
+    jacobian[_LINEAR, TURN] = -map_from_middle @ so3.hat(estimate.way_at(tau))
+    jacobian[_LINEAR, MOVE] = map_from_middle
+    jacobian[_LINEAR, LINEAR] = tau * map_from_middle
+    jacobian[_LINEAR, LINEAR_ACCELERATION] = 0.5 * tau * tau * map_from_middle
+    jacobian[_ANGULAR, TURN] = map_from_middle
+    jacobian[_ANGULAR, ANGULAR] = tau * by_angle
+    jacobian[_ANGULAR, ANGULAR_ACCELERATION] = 0.5 * tau * tau * by_angle
+    jacobian[_ANGULAR, PARAMETERS:] = np.kron(values, map_from_then)
+    return Pose(
+        position=-rotation.T @ translation,
+        rotation=rotation.T,
+        covariance=_propagate(jacobian, estimate.joint_covariance),
+    )
+
+
+def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
+    """Twist of the camera at row time ``tau``, in its axes at that moment; readout_time in s."""
+    linear = estimate.linear_velocity_at(tau)
+    shaken = so3.exp(-estimate.shake_at(tau)[0])
+    angle = estimate.angle_at(tau)
+    turn = shaken @ so3.exp(-angle)
+    by_angle = so3.hat(linear) @ shaken @ so3.right_jacobian(angle)
+    angular = estimate.angular_velocity_at(tau)
+    by_acceleration = 0.5 * tau * shaken @ (np.eye(3) + so3.right_jacobian(angle))
+    values, rates = _shaking(estimate, tau)
+    jacobian = np.zeros((6, len(estimate.joint_covariance)))
+    jacobian[_LINEAR, ANGULAR] = tau * by_angle
+    jacobian[_LINEAR, ANGULAR_ACCELERATION] = 0.5 * tau * tau * by_angle
+    jacobian[_LINEAR, LINEAR] = turn
+    jacobian[_LINEAR, LINEAR_ACCELERATION] = tau * turn
+    jacobian[_LINEAR, PARAMETERS:] = np.kron(values, so3.hat(linear))
+    jacobian[_ANGULAR, ANGULAR] = shaken
+    jacobian[_ANGULAR, ANGULAR_ACCELERATION] = by_acceleration
+    jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, np.eye(3)) + np.kron(values, so3.hat(angular))
+    return Twist(
+        linear=linear / readout_time,
+        angular=angular / readout_time,
+        covariance=_propagate(jacobian / readout_time, estimate.joint_covariance),
+    )
+
+
+def with_timing(pose: Pose, twist: Twist, deviation: float, delay: float) -> tuple[Pose, Twist]:
+    """The covariances with what is not known of the readout time.
+
+    Args:
+        pose, twist: of the camera at one moment.
+        deviation: of the readout time, as a part of it: velocities are inverse to it.
+        delay: s by which the moment itself is uncertain.
+    """
+    velocity = np.concatenate([twist.linear, twist.angular])
+    in_map = np.concatenate([pose.rotation @ twist.linear, pose.rotation @ twist.angular])
+    return (
+        replace(pose, covariance=pose.covariance + delay**2 * np.outer(in_map, in_map)),
+        replace(twist, covariance=twist.covariance + deviation**2 * np.outer(velocity, velocity)),
+    )
+
+
+def _shaking(estimate: Estimate, tau: float) -> tuple[Array, Array]:
+    """The polynomials of the shaking at ``tau``, and their rates, each as a row (1,k)."""
+    count = (len(estimate.joint_covariance) - PARAMETERS) // 3
+    values, rates = np.empty(count), np.empty(count)
+    if count:
+        shake_basis(tau, count + 1, values, rates)
+    return values[None], rates[None]
+
+
+def _propagate(jacobian: Array, covariance: Array) -> Array:
+    result: Array = jacobian @ covariance @ jacobian.T
+    return 0.5 * (result + result.T)  # rounding must not cost the symmetry

@@ -1,0 +1,124 @@
+"""The debug pictures of the marker detector: drawn when the localizer's answer has come."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.config import DetectorConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.camera_info import Calibration
+from rs_localizer.io.messages import MessageError, stamp_ns
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.overlay import CameraPath, Picture, draw_detections, draw_world
+from rs_localizer.markers.poses import rotation_of_quaternion
+from rs_localizer.pipeline.images import Detected
+
+# Images that wait for a pose; those without one are shown without cubes.
+_WAITING = 3
+# After so many images without an answer nobody localizes, and none waits.
+_PATIENCE = 10
+# Poses that wait for an image.
+_MOST_POSES = 100
+
+Show = Callable[[Detected, Picture], None]
+
+
+class DebugPictures:
+    """Holds images until their poses come; lives in the worker's thread.
+
+    Args:
+        show: takes the finished picture of an image.
+        notice: told why no cubes are drawn, by a name and one sentence.
+    """
+
+    def __init__(self, show: Show, notice: Callable[[str, str], None]) -> None:
+        self._show = show
+        self._notice = notice
+        self._calibration: Calibration | None = None
+        self._waiting: deque[tuple[Detected, MarkerMap]] = deque()
+        self._poses: dict[int, CameraPath] = {}  # without a twist, by stamp
+        self._unanswered = _PATIENCE
+
+    def add(self, detected: Detected, marker_map: MarkerMap, config: DetectorConfig) -> None:
+        """Take an image; the oldest that still waits is shown as it is."""
+        self._waiting.append((detected, marker_map))
+        self._unanswered += 1
+        while len(self._waiting) > (_WAITING if self._unanswered <= _PATIENCE else 0):
+            oldest = self._waiting.popleft()
+            self._finish(oldest, self._pose_of(oldest[0], config), config)
+        for stamp in [s for s in self._poses if s < detected.image.stamp_ns - 10**9]:
+            del self._poses[stamp]
+
+    def take_camera_info(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+
+    def take_pose(self, message: Any) -> None:
+        """A geometry_msgs/PoseStamped; of use where no odometry comes, without a twist."""
+        self._unanswered = 0
+        still = np.zeros(3)
+        self._poses[stamp_ns(message)] = _path(message, message.pose, still, still)
+        while len(self._poses) > _MOST_POSES:
+            del self._poses[next(iter(self._poses))]
+
+    def take_odometry(self, message: Any, config: DetectorConfig) -> None:
+        """A nav_msgs/Odometry, of the camera in the map: show the image that it belongs to."""
+        if self._calibration is not None and message.child_frame_id != self._calibration.frame:
+            self._notice(
+                "other_body",
+                f"the odometry is of {message.child_frame_id}, not of the camera "
+                f"({self._calibration.frame}): no cubes are drawn",
+            )
+            return
+        self._unanswered = 0
+        twist = message.twist.twist
+        path = _path(message, message.pose.pose, _vector(twist.linear), _vector(twist.angular))
+        for item in self._waiting:
+            if self._belongs(path, item[0], config):
+                while self._waiting[0] is not item:
+                    self._finish(self._waiting.popleft(), None, config)
+                self._finish(self._waiting.popleft(), path, config)
+                return
+
+    def _belongs(self, path: CameraPath, detected: Detected, config: DetectorConfig) -> bool:
+        """With ``pose_time: mid_frame``, the pose's stamp is up to a readout later."""
+        after = (path.stamp_ns - detected.image.stamp_ns) * 1e-9 - config.stamp_offset
+        offset = abs(config.stamp_offset)
+        return -offset - 1e-6 <= after <= config.readout_time + offset + 1e-6
+
+    def _pose_of(self, detected: Detected, config: DetectorConfig) -> CameraPath | None:
+        found = (path for path in self._poses.values() if self._belongs(path, detected, config))
+        return next(found, None)
+
+    def _finish(
+        self, item: tuple[Detected, MarkerMap], path: CameraPath | None, config: DetectorConfig
+    ) -> None:
+        detected, marker_map = item
+        picture = draw_detections(detected.image.pixels, detected.detections)
+        camera = self._camera(config)
+        if path is not None and camera is not None:
+            first_row_ns = detected.image.stamp_ns + round(1e9 * config.stamp_offset)
+            draw_world(picture, detected.detections, marker_map, camera, path, first_row_ns)
+        self._show(detected, picture)
+
+    def _camera(self, config: DetectorConfig) -> Camera | None:
+        if self._calibration is None:
+            return None
+        try:
+            return self._calibration.camera(config.readout_time, config.scan_direction)
+        except MessageError as error:
+            self._notice("bad_camera_info", str(error))
+            return None
+
+
+def _vector(vector: Any) -> Any:
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def _path(message: Any, pose: Any, linear: Any, angular: Any) -> CameraPath:
+    q = pose.orientation
+    rotation = rotation_of_quaternion([q.x, q.y, q.z, q.w])
+    return CameraPath(stamp_ns(message), _vector(pose.position), rotation, linear, angular)

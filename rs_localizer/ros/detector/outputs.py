@@ -1,0 +1,106 @@
+"""The publishers of the marker detector."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import cv2
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+
+from rs_localizer.io.messages import make_header
+from rs_localizer.markers.overlay import Picture
+from rs_localizer.pipeline.images import Detected, correspondences
+from rs_localizer.ros.node.conversion import make_message
+
+_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
+_JPEG_QUALITY = 85
+
+
+class DetectorOutputs:
+    """``correspondences``, ``~/debug_image`` and ``~/debug_image/compressed``.
+
+    Nothing is built that nobody listens to. All methods may be called from any thread.
+
+    Args:
+        node: creates the publishers, which publish while it is active.
+    """
+
+    def __init__(self, node: LifecycleNode) -> None:
+        self._node = node
+        self._clouds = self._create(PointCloud2, "correspondences")
+        self._pictures = self._create(Image, "~/debug_image")
+        self._jpegs = self._create(CompressedImage, "~/debug_image/compressed")
+        # Held while publishing: after close() nothing is published any more.
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def topics(self) -> tuple[str, str]:
+        """Full names of the correspondences and of the debug image."""
+        return self._clouds.topic_name, self._pictures.topic_name
+
+    def clouds_wanted(self) -> bool:
+        return not self._closed and self._clouds.get_subscription_count() > 0
+
+    def pictures_wanted(self) -> bool:
+        publishers = (self._pictures, self._jpegs)
+        return not self._closed and any(p.get_subscription_count() > 0 for p in publishers)
+
+    def publish(self, detected: Detected) -> None:
+        """The corners of an image."""
+        with self._lock:
+            if self.clouds_wanted():
+                self._clouds.publish(correspondences(detected, make_message))
+
+    def show(self, detected: Detected, picture: Picture) -> None:
+        """The debug picture of an image."""
+        header = make_header(make_message, detected.image.stamp_ns, detected.image.frame)
+        with self._lock:
+            if self._closed:
+                return
+            if self._pictures.get_subscription_count():
+                self._pictures.publish(_raw(header, picture))
+            if self._jpegs.get_subscription_count():
+                self._jpegs.publish(_compressed(header, picture))
+
+    def close(self) -> None:
+        with self._lock:
+            self._closed = True
+            for publisher in (self._clouds, self._pictures, self._jpegs):
+                self._node.destroy_lifecycle_publisher(publisher)
+
+    def _create(self, kind: type, topic: str) -> Any:
+        return self._node.create_lifecycle_publisher(
+            kind,
+            topic,
+            QoSProfile(**_QOS),  # a new one each: overrides are written into it
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+
+def _raw(header: Any, picture: Picture) -> Any:
+    height, width, _ = picture.shape
+    return make_message(
+        "sensor_msgs/msg/Image",
+        header=header,
+        height=height,
+        width=width,
+        encoding="bgr8",
+        is_bigendian=0,
+        step=3 * width,
+        data=picture.ravel(),
+    )
+
+
+def _compressed(header: Any, picture: Picture) -> Any:
+    _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return make_message(
+        "sensor_msgs/msg/CompressedImage",
+        header=header,
+        format="bgr8; jpeg compressed bgr8",
+        data=jpeg.ravel(),
+    )

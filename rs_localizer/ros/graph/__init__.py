@@ -1,0 +1,1 @@
+"""Other nodes of the graph: a player of recordings, listeners."""

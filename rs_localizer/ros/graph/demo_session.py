@@ -1,0 +1,222 @@
+"""Plays recordings through live localizer nodes, one per method, and hears their answers."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from statistics import median
+from typing import Any, Self
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from rs_localizer.config import PoseTime
+from rs_localizer.lab.measures.comparison import Answer, Recording
+from rs_localizer.process.stopping import StopSignals
+from rs_localizer.ros.graph.demo_listener import Listener
+from rs_localizer.ros.node.conversion import copy_message
+from rs_localizer.settings import NODE_NAME
+
+# The installed executable may not be on the path; this starts the same node.
+_NODE = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
+_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# The first start on a machine compiles all kernels.
+_START_TIMEOUT = 300.0
+_FIRST_ANSWER_TIMEOUT = 20.0
+# A frame that is refused has no answer. How long to wait for one (s), in terms of the median so
+# far; an answer that is later still counts when it comes.
+_PATIENCE = 10.0
+_ANSWER_TIMEOUT = (0.1, 1.0)
+_REST_TIME = 0.3
+_STOP_TIMEOUT = 10.0
+
+
+class SessionError(ValueError):
+    """A node that did not start or did not answer."""
+
+
+class Session:
+    """A ROS context for live nodes; a context manager that leaves no process behind."""
+
+    def __init__(self, log_directory: Path) -> None:
+        self._log_directory = log_directory
+        self._signals = StopSignals()
+        # No one else's nodes shall hear these frames, or be heard.
+        self.namespace = f"/demo_{os.getpid()}"
+
+    def __enter__(self) -> Self:
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        self._signals.__enter__()
+        rclpy.init()
+        return self
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        rclpy.try_shutdown()
+        self._signals.__exit__()
+        if error is not None and self._signals.requested:
+            # A signal also ends the context, and with it whatever call is under way.
+            raise KeyboardInterrupt from error
+
+    def play(
+        self,
+        recording: Recording,
+        readout_time: float,
+        methods: Mapping[str, Mapping[str, Any]],
+        progress: Callable[[], None],
+    ) -> dict[str, dict[int, Answer]]:
+        """Every frame to every node, as fast as the slowest of them answers.
+
+        Args:
+            recording: what to publish.
+            readout_time: s; the nodes answer for the middle row.
+            methods: parameters of the node of each method, by a name that is a ROS namespace.
+            progress: called after each frame.
+
+        Returns:
+            for each method its answers by the stamp of the frame.
+
+        Raises:
+            SessionError: when a node does not start or answer; with the last lines of its log.
+        """
+        listeners = {name: Listener(round(0.5e9 * readout_time)) for name in methods}
+        shutter = {"readout_time": readout_time, "pose_time": PoseTime.MID_FRAME}
+        node = rclpy.create_node("demo", namespace=self.namespace)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        processes: dict[str, subprocess.Popen[bytes]] = {}
+        try:
+            # Ctrl-C interrupts the main thread alone: what another one starts gets into the list.
+            with ThreadPoolExecutor(1) as starter:
+                for name, parameters in methods.items():
+                    listeners[name].subscribe(node, f"{self.namespace}/{name}/{NODE_NAME}")
+                    given = {**shutter, **parameters}
+                    starter.submit(self._start, name, given, processes).result()
+            player = _Player(node, executor, listeners)
+            player.wait_for_nodes(recording, lambda: self._check(processes))
+            for index in range(len(recording.clouds)):
+                if not player.play(recording, index):
+                    self._check(processes)
+                progress()
+            player.hear_the_rest()
+            self._check(processes)
+        finally:
+            _stop(processes.values())
+            executor.shutdown()
+            node.destroy_node()
+        return {name: listener.answers() for name, listener in listeners.items()}
+
+    def _start(
+        self,
+        name: str,
+        parameters: Mapping[str, Any],
+        processes: dict[str, subprocess.Popen[bytes]],
+    ) -> None:
+        remappings = [f"__ns:={self.namespace}/{name}"]
+        remappings += [
+            f"{topic}:={self.namespace}/{topic}" for topic in ("correspondences", "camera_info")
+        ]
+        words = [word for remapping in remappings for word in ("-r", remapping)]
+        for key, value in parameters.items():
+            words += ["-p", f"{key}:={value}"]
+        with self._log(name).open("wb") as log:
+            processes[name] = subprocess.Popen(
+                [sys.executable, "-c", _NODE, "--ros-args", *words],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+
+    def _log(self, name: str) -> Path:
+        return self._log_directory / f"{name}.log"
+
+    def _check(self, processes: Mapping[str, subprocess.Popen[bytes]]) -> None:
+        for name, process in processes.items():
+            code = process.poll()
+            if code is not None:
+                lines = self._log(name).read_text(errors="replace").strip().splitlines()
+                last = lines[-1] if lines else "it said nothing"
+                raise SessionError(f"the node {name} ended with exit code {code}: {last}")
+
+
+class _Player:
+    """Publishes frames and waits for their answers."""
+
+    def __init__(
+        self, node: Any, executor: SingleThreadedExecutor, listeners: Mapping[str, Listener]
+    ) -> None:
+        self._executor = executor
+        self._listeners = listeners
+        self._camera_info = node.create_publisher(CameraInfo, "camera_info", _QOS)
+        self._correspondences = node.create_publisher(PointCloud2, "correspondences", _QOS)
+
+    def wait_for_nodes(self, recording: Recording, check: Callable[[], None]) -> None:
+        """Until all nodes listen, and their answers to a first frame arrive."""
+        deadline = time.monotonic() + _START_TIMEOUT
+        publishers = (self._camera_info, self._correspondences)
+        while min(p.get_subscription_count() for p in publishers) < len(self._listeners):
+            check()
+            if time.monotonic() > deadline:
+                raise SessionError(f"the nodes did not start within {_START_TIMEOUT:.0f} s")
+            self._executor.spin_once(timeout_sec=0.05)
+        # A node may hear before it is heard. What it says is not counted.
+        deadline = time.monotonic() + _FIRST_ANSWER_TIMEOUT
+        index = 0
+        while not self.play(recording, index % len(recording.clouds)):
+            check()
+            if time.monotonic() > deadline:
+                raise SessionError(f"no answer within {_FIRST_ANSWER_TIMEOUT:.0f} s")
+            index += 1
+        for listener in self._listeners.values():
+            listener.clear()
+
+    def play(self, recording: Recording, index: int) -> bool:
+        """Publish one frame; whether all nodes have answered it in time."""
+        stamp = recording.stamps_ns[index]
+        info = copy_message(recording.camera_infos[index], "sensor_msgs/msg/CameraInfo")
+        cloud = copy_message(recording.clouds[index], "sensor_msgs/msg/PointCloud2")
+        self._camera_info.publish(info)
+        for listener in self._listeners.values():
+            listener.expect(stamp)
+        self._correspondences.publish(cloud)
+        deadline = time.monotonic() + self._timeout()
+        while not all(listener.has(stamp) for listener in self._listeners.values()):
+            if time.monotonic() > deadline:
+                return False
+            self._executor.spin_once(timeout_sec=0.05)
+        return True
+
+    def _timeout(self) -> float:
+        latencies = [x for listener in self._listeners.values() for x in listener.latencies()]
+        least, most = _ANSWER_TIMEOUT
+        return min(max(least, _PATIENCE * median(latencies)), most) if latencies else most
+
+    def hear_the_rest(self) -> None:
+        """What is still under way, of the last frame or of one that took too long."""
+        deadline = time.monotonic() + _REST_TIME
+        while time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.05)
+
+
+def _stop(processes: Iterable[subprocess.Popen[bytes]]) -> None:
+    """End the nodes: orderly if they will and Ctrl-C does not come meanwhile."""
+    started = list(processes)
+    deadline = time.monotonic() + _STOP_TIMEOUT
+    try:
+        for process in started:
+            process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            for process in started:
+                process.wait(max(0.0, deadline - time.monotonic()))
+    finally:
+        for process in started:
+            if process.poll() is None:
+                process.kill()
+                process.wait()

@@ -1,0 +1,209 @@
+"""The subscriptions of a node."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSCompatibility,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from rs_localizer.ros.node.conversion import type_name
+from rs_localizer.ros.node.intake import Intake, NotByExecutor
+from rs_localizer.ros.node.quality import Policies, best, offered, policies
+from rs_localizer.ros.node.refusals import Refusals
+
+# As qos_profile_sensor_data, but reliable where the publishers are, and with more room: what comes
+# while this process does not get the CPU shall be counted by the mailbox, which keeps the newest,
+# and not be lost unseen.
+SENSOR_DATA = {"depth": 20, "reliability": ReliabilityPolicy.BEST_AVAILABLE}
+# Also what was published before we came.
+LATCHED = {
+    "depth": 1,
+    "reliability": ReliabilityPolicy.BEST_AVAILABLE,
+    "durability": DurabilityPolicy.BEST_AVAILABLE,
+}
+
+# rclpy's default policies, and whether latched messages are wanted.
+_OVERRIDABLE = (
+    QoSPolicyKind.HISTORY,
+    QoSPolicyKind.DEPTH,
+    QoSPolicyKind.RELIABILITY,
+    QoSPolicyKind.DURABILITY,
+)
+
+# A topic without a message for so long (s) is silent.
+_LONG = 2.0
+# How often the publishers are looked at, in s.
+_LOOK_PERIOD = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """An input of a node."""
+
+    type: type
+    callback: Callable[[Any], None]  # runs in a thread of the inputs
+    qos: Mapping[str, Any] = field(default_factory=lambda: SENSOR_DATA)
+    lasting: bool = False  # one message is enough
+    raw: bool = False  # whether the callback takes serialized messages
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """Whether messages come on a topic, and why not."""
+
+    topic: str  # full name
+    seconds: float  # since the last message, or since the subscription was made
+    heard: bool  # whether there was a message
+    cause: str  # why there is none, if it has been silent for long
+    mismatch: bool  # there are publishers, and none of them can be heard
+    reliable: bool = False  # whether what is lost on the way is sent again
+
+
+class Inputs:
+    """Subscriptions that live while the node is active.
+
+    Args:
+        node: creates them.
+        topics: by name. Waiting messages are taken in this order.
+        refusals: told of publishers that cannot be heard, and of failing callbacks.
+    """
+
+    def __init__(self, node: Node, topics: Mapping[str, Topic], refusals: Refusals) -> None:
+        self._node = node
+        self._refusals = refusals
+        self._group = NotByExecutor()
+        self._created = time.monotonic()
+        self._heard: dict[str, float] = {}
+        self._topics = topics
+        self._wished: dict[str, Policies] = {}  # with overrides
+        self._subscriptions: dict[str, Subscription] = {}
+        try:
+            for name, topic in topics.items():
+                self._subscriptions[name] = self._subscribe(name, topic)
+        except Exception:
+            self._destroy()
+            raise
+        self._intake = self._take_all()
+        self._timer = node.create_timer(
+            _LOOK_PERIOD, self._follow_publishers, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    @property
+    def topics(self) -> list[str]:
+        """Full names, after remapping."""
+        return [subscription.topic_name for subscription in self._subscriptions.values()]
+
+    def silence(self) -> dict[str, Silence]:
+        """How it stands with each topic, by the name that the node gave it."""
+        return {name: self._silence(name) for name in self._subscriptions}
+
+    def close(self) -> None:
+        """Take no more messages."""
+        self._node.destroy_timer(self._timer)
+        self._intake.close()
+        self._destroy()
+
+    def _take_all(self) -> Intake:
+        return Intake(
+            self._node.context,
+            tuple(self._subscriptions.values()),
+            functools.partial(self._refusals.add, "internal_error"),
+        )
+
+    def _follow_publishers(self) -> None:
+        """Listen anew to topics whose publishers offer more, or less, than they are heard with."""
+        changed = []
+        for name, subscription in self._subscriptions.items():
+            offers = offered(self._node, subscription.topic_name)
+            present = policies(subscription.qos_profile)
+            if offers and best(self._wished[name], offers) != present:
+                changed.append(name)
+        if not changed:
+            return
+        self._intake.close()
+        for name in changed:
+            self._node.destroy_subscription(self._subscriptions[name])
+            self._subscriptions[name] = self._subscribe(name, self._topics[name])
+        self._intake = self._take_all()
+
+    def _destroy(self) -> None:
+        for subscription in self._subscriptions.values():
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = {}
+
+    def _subscribe(self, name: str, topic: Topic) -> Subscription:
+        def take(message: Any) -> None:
+            self._heard[name] = time.monotonic()
+            topic.callback(message)
+
+        return self._node.create_subscription(
+            topic.type,
+            name,
+            take,
+            QoSProfile(**topic.qos),  # a new one each: overrides are written into it
+            callback_group=self._group,
+            # Events of a subscription wake the executor with every message; the graph knows more.
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            qos_overriding_options=QoSOverridingOptions(
+                _OVERRIDABLE, callback=functools.partial(self._settle, name)
+            ),
+            raw=topic.raw,
+        )
+
+    def _settle(self, name: str, profile: QoSProfile) -> SetParametersResult:
+        """Fill in, after the user's overrides, what the publishers offer now."""
+        self._wished[name] = policies(profile)
+        offers = offered(self._node, self._node.resolve_topic_name(name))
+        profile.reliability, profile.durability = best(self._wished[name], offers)
+        return SetParametersResult(successful=True)
+
+    def _silence(self, name: str) -> Silence:
+        topic = self._subscriptions[name].topic_name
+        heard = self._heard.get(name)
+        seconds = time.monotonic() - (self._created if heard is None else heard)
+        cause, mismatch = "", False
+        if seconds > _LONG and not (heard is not None and self._topics[name].lasting):
+            cause, mismatch = self._cause(self._subscriptions[name])
+        if mismatch:
+            self._refusals.notice("incompatible_publisher", f"nothing is heard on {topic}: {cause}")
+        reliability, _ = policies(self._subscriptions[name].qos_profile)
+        reliable = reliability == ReliabilityPolicy.RELIABLE
+        return Silence(topic, seconds, heard is not None, cause, mismatch, reliable)
+
+    def _cause(self, subscription: Subscription) -> tuple[str, bool]:
+        """Why nothing is heard, and whether that is because of the QoS or the type."""
+        wanted = type_name(subscription.msg_type)
+        unfit = []
+        publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
+        for publisher in publishers:
+            where = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+            if publisher.topic_type != wanted:
+                unfit.append(f"{where} publishes {publisher.topic_type}, not {wanted}")
+                continue
+            fit, reason = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
+            if fit == QoSCompatibility.ERROR:
+                text = " ".join(reason.split()).removeprefix("ERROR: ").rstrip(";. ")
+                unfit.append(f"the QoS of {where} does not fit: {text}")
+        if not publishers:
+            return "it has no publisher", False
+        if len(unfit) == len(publishers):
+            return "; ".join(unfit), True
+        count = len(publishers)
+        return f"it has {count} publisher{'s' if count > 1 else ''}, but no message comes", False

@@ -1,0 +1,196 @@
+"""What became of the frames: totals since the start, and how things are now."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.outputs import Frame
+from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.ros.node.gaps import missing
+from rs_localizer.ros.node.refusals import Refusals
+
+WINDOW = 5.0
+"""What "now" means, in s."""
+
+# Frames that are remembered; a window of faster cameras is shorter.
+_MOST_FRAMES = 2048
+# A header's stamp that is older (s), or in the future, was made by another clock.
+_OLDEST_STAMP = 10.0
+
+Percentiles = tuple[float, float]  # s, the median and the 95th
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What is told of the last frame that was localized."""
+
+    points: int
+    inliers: int
+    global_shutter_inliers: int  # what a pose without motion would have explained
+    residual: float  # px, root mean square of the inliers
+    model_error: float  # px, root mean square of what map, lens and motion leave beside the noise
+    iterations: int
+    tracked: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """How things are now."""
+
+    received: dict[str, int]  # frames since the start, by topic
+    answered: int
+    replaced: int
+    dropped: int  # because the node was deactivated
+    refused: int
+    refusals: dict[str, int]  # also of messages that are no frames, by reason
+    rate_in: float  # Hz
+    rate_out: float  # Hz
+    recently_received: int  # in the window
+    recently_replaced: int
+    recently_refused: dict[str, int]  # frames, by reason
+    recently_missing: int  # sent and not received, by the gaps between the stamps
+    refused_since_answer: int  # frames in a row
+    busy: float | None  # s for which the worker has had the same frame
+    latency: Percentiles | None  # from receiving to publishing
+    delay: Percentiles | None  # from the header's stamp to publishing, where that makes sense
+    last: Any  # the last answer; None: there was none
+
+
+class Statistics:
+    """Counts frames; all methods may be called from any thread.
+
+    Args:
+        refusals: logs and counts what is refused.
+        ros_time: now in ns, by the clock of the stamps.
+        clock: s, monotonic.
+    """
+
+    def __init__(
+        self,
+        refusals: Refusals,
+        ros_time: Callable[[], int] = time.time_ns,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._refusals = refusals
+        self._ros_time = ros_time
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._received: Counter[str] = Counter()
+        self._answered = self._replaced = self._refused = self._dropped = self._in_a_row = 0
+        self._last: Any = None
+        self._started: float | None = None
+        # Times of what happened, and what is told of each answer.
+        self._in: deque[float] = deque(maxlen=_MOST_FRAMES)
+        self._stamps: dict[str, deque[tuple[float, int]]] = {}
+        self._refused_at: deque[tuple[float, str]] = deque(maxlen=_MOST_FRAMES)
+        self._replaced_at: deque[float] = deque(maxlen=_MOST_FRAMES)
+        self._out: deque[tuple[float, float, float]] = deque(maxlen=_MOST_FRAMES)
+
+    def received(self, topic: str, message: Any) -> None:
+        """A frame has come: a message with a header."""
+        with self._lock:
+            now = self._clock()
+            self._received[topic] += 1
+            self._in.append(now)
+            stamps = self._stamps.setdefault(topic, deque(maxlen=_MOST_FRAMES))
+            stamps.append((now, stamp_ns(message)))
+
+    def replaced(self) -> None:
+        """A frame gave way to a newer one before it was looked at."""
+        with self._lock:
+            self._replaced += 1
+            self._replaced_at.append(self._clock())
+
+    def dropped(self, count: int) -> None:
+        """The node was deactivated before these frames were answered."""
+        with self._lock:
+            self._dropped += count
+
+    def started(self) -> None:
+        """The worker has taken a frame."""
+        self._started = self._clock()
+
+    def ended(self) -> None:
+        self._started = None
+
+    def refused(self, refusal: Refusal) -> None:
+        with self._lock:
+            self._refused += 1
+            self._in_a_row += 1
+            self._refused_at.append((self._clock(), refusal.reason))
+        self._refusals.add(refusal.reason, refusal.detail)
+
+    def answered(self, frame: Frame, received: float) -> None:
+        """A frame was published that had been received at this time of the clock."""
+        estimate = frame.estimate
+        residuals = estimate.residuals[estimate.inliers]
+        answer = Answer(
+            points=len(estimate.inliers),
+            inliers=len(residuals),
+            global_shutter_inliers=estimate.global_shutter_inliers,
+            residual=float(np.sqrt(residuals @ residuals / max(len(residuals), 1))),
+            model_error=estimate.model_error,
+            iterations=estimate.iterations,
+            tracked=estimate.tracked,
+        )
+        self.note(frame.input_stamp_ns, answer, received)
+
+    def note(self, input_stamp_ns: int, answer: Any, received: float) -> None:
+        """A frame with this stamp was answered, and what is told of it."""
+        now = self._clock()
+        delay = (self._ros_time() - input_stamp_ns) * 1e-9
+        with self._lock:
+            self._answered += 1
+            self._in_a_row = 0
+            self._out.append((now, now - received, delay))
+            self._last = answer
+
+    def summary(self) -> Summary:
+        """How things are now."""
+        with self._lock:
+            since = self._clock() - WINDOW
+            out = [item for item in self._out if item[0] >= since]
+            started = self._started
+            return Summary(
+                received=dict(self._received),
+                answered=self._answered,
+                replaced=self._replaced,
+                dropped=self._dropped,
+                refused=self._refused,
+                refusals=dict(self._refusals.counts),
+                rate_in=_rate([when for when in self._in if when >= since]),
+                rate_out=_rate([when for when, _, _ in out]),
+                recently_received=sum(when >= since for when in self._in),
+                recently_replaced=sum(when >= since for when in self._replaced_at),
+                recently_refused=Counter(r for when, r in self._refused_at if when >= since),
+                recently_missing=sum(
+                    missing([stamp for when, stamp in stamps if when >= since])
+                    for stamps in self._stamps.values()
+                ),
+                refused_since_answer=self._in_a_row,
+                busy=None if started is None else self._clock() - started,
+                latency=_percentiles([latency for _, latency, _ in out]),
+                delay=_percentiles([d for _, _, d in out if 0.0 <= d <= _OLDEST_STAMP]),
+                last=self._last,
+            )
+
+
+def _rate(times: list[float]) -> float:
+    """Hz; of a single moment nothing can be said."""
+    span = times[-1] - times[0] if times else 0.0
+    return (len(times) - 1) / span if span > 0.0 else 0.0
+
+
+def _percentiles(values: list[float]) -> Percentiles | None:
+    if not values:
+        return None
+    median, high = np.percentile(values, (50, 95)).tolist()
+    return median, high

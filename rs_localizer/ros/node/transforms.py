@@ -1,0 +1,192 @@
+"""TF in the node: where the camera is on the robot, and where odometry believes the robot.
+
+tf2_ros is imported when a setting needs it: it is not on PyPI, and all else works without it.
+Transforms are taken in a thread of their own. Nobody waits in here for those that are not known
+yet: frames are kept until they are, while others are localized.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from rclpy.time import Time
+
+from rs_localizer.config import NodeConfig, PublishTf
+from rs_localizer.io.messages import stamp_ns as stamp_of
+from rs_localizer.io.transforms.rigid import NotYetError, Transform, TransformError, read_transform
+from rs_localizer.ros.node.intake import Intake, NotByExecutor
+
+# For how long tf2's buffer remembers, in ns: its default.
+_MEMORY = 10_000_000_000
+
+
+def check(config: NodeConfig) -> None:
+    """Raise ``ValueError`` if settings need tf2_ros and it is not installed."""
+    if needed(config):
+        import_tf2_ros(config)
+
+
+def needed(config: NodeConfig) -> str:
+    """The setting that needs TF, and its value; empty if there is none."""
+    if config.base_frame:
+        return f"base_frame {config.base_frame!r}"
+    return f"publish_tf {config.publish_tf}" if config.publish_tf != PublishTf.NONE else ""
+
+
+def import_tf2_ros(config: NodeConfig) -> ModuleType:
+    try:
+        return importlib.import_module("tf2_ros")
+    except ImportError as error:
+        raise ValueError(
+            f"{needed(config)} needs the Python package tf2_ros, which cannot be imported "
+            f"({error}): it comes with ROS 2, sudo apt install ros-jazzy-tf2-ros-py"
+        ) from error
+
+
+class Tf:
+    """Transforms from TF (see :class:`rs_localizer.io.transforms.rigid.Transforms`).
+
+    :meth:`lookup` and :meth:`moves` may be called from any thread, all else belongs to the
+    executor's.
+
+    Args:
+        node: listens.
+        heard: told, in a thread of the listener's, of the transforms that have come
+            (geometry_msgs/TransformStamped).
+        failed: told in one sentence of errors while they are taken.
+    """
+
+    def __init__(
+        self, node: Node, heard: Callable[[list[Any]], None], failed: Callable[[str], None]
+    ) -> None:
+        self._node = node
+        self._heard = heard
+        self._failed = failed
+        self._buffer: Any = None
+        self._listener: Any = None
+        self._intake: Intake | None = None
+        self._jumps: Any = None
+        self._errors: ModuleType | None = None  # tf2_ros
+
+    def configure(self, config: NodeConfig) -> None:
+        """Listen if these settings need it.
+
+        Raises:
+            ValueError: without tf2_ros.
+        """
+        if not needed(config) or self._buffer is not None:
+            return
+        tf2_ros = import_tf2_ros(config)
+        buffer = tf2_ros.Buffer()
+        # By its own clock tf2 would not see the time of a simulation or a recording go back.
+        self._jumps = self._node.get_clock().create_jump_callback(
+            JumpThreshold(
+                min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
+            ),
+            post_callback=lambda _: buffer.clear(),
+        )
+        self._errors, self._buffer = tf2_ros, buffer
+        node = _WithoutExecutor(self._node)
+        self._listener = _listen(tf2_ros, buffer, node, self._heard)
+        self._intake = Intake(self._node.context, node.subscriptions, self._failed)
+
+    def close(self) -> None:
+        """Stop listening; whoever asks for a transform gets none."""
+        if self._buffer is None:
+            return
+        self._buffer = None
+        self._intake.close()
+        self._listener.unregister()
+        self._jumps.unregister()
+        self._intake = self._listener = self._jumps = None
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
+        """``target_from_source`` at a time; None: the latest.
+
+        Raises:
+            NotYetError: when it is known for earlier times.
+            TransformError: when it is not known otherwise.
+        """
+        return read_transform(self._ask(target, source, stamp_ns).transform)
+
+    def moves(self, target: str, source: str) -> bool:
+        """Whether a part of the transform comes with a time.
+
+        Raises:
+            TransformError: when it is not known at all.
+        """
+        return stamp_of(self._ask(target, source, None)) != 0
+
+    def _ask(self, target: str, source: str, stamp_ns: int | None) -> Any:
+        """The geometry_msgs/TransformStamped that tf2 has now."""
+        buffer = self._buffer
+        if buffer is None:
+            raise TransformError("TF is not listened to")
+        if stamp_ns is not None and stamp_ns <= 0:  # which would mean the latest
+            raise TransformError(f"there are no transforms of the time {stamp_ns * 1e-9:.3f} s")
+        try:
+            return buffer.lookup_transform(target, source, Time(nanoseconds=stamp_ns or 0))
+        except self._errors.ExtrapolationException as error:
+            text = _text(error)
+        except self._errors.TransformException as error:
+            raise TransformError(_text(error)) from error
+        latest_ns = self._latest(buffer, target, source)
+        if stamp_ns is not None and latest_ns is not None:
+            if latest_ns < stamp_ns:
+                raise NotYetError(text)
+            if latest_ns - stamp_ns > _MEMORY:
+                # A recording that starts over: tf2 would ignore all that comes from now on.
+                buffer.clear()
+        raise TransformError(text)
+
+    def _latest(self, buffer: Any, target: str, source: str) -> int | None:
+        with contextlib.suppress(self._errors.TransformException):
+            return stamp_of(buffer.lookup_transform(target, source, Time()))
+        return None
+
+
+class _WithoutExecutor:
+    """What the TransformListener takes for its node: its messages are left to an Intake.
+
+    A robot sends some hundred messages a second on /tf, and the executor takes 0.4 ms for each.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.subscriptions: list[Subscription] = []
+        self._node = node
+        self._group = NotByExecutor()
+
+    def create_subscription(self, *args: Any, **settings: Any) -> Subscription:
+        settings["callback_group"] = self._group
+        self.subscriptions.append(self._node.create_subscription(*args, **settings))
+        return self.subscriptions[-1]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._node, name)
+
+
+def _listen(tf2_ros: ModuleType, buffer: Any, node: Any, hear: Callable[[list[Any]], None]) -> Any:
+    """A TransformListener that tells of what has come."""
+
+    class Listener(tf2_ros.TransformListener):
+        def callback(self, data: Any) -> None:
+            super().callback(data)
+            hear(data.transforms)
+
+        def static_callback(self, data: Any) -> None:
+            super().static_callback(data)
+            hear(data.transforms)
+
+    return Listener(buffer, node)
+
+
+def _text(error: Exception) -> str:
+    return " ".join(str(error).split())

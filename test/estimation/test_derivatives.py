@@ -1,0 +1,133 @@
+"""Derivatives by all 18 parameters and by the shaking, against a projection of the tests' own."""
+
+import numpy as np
+import pytest
+
+from rs_localizer.estimation import residuals
+
+from .projection import (
+    AXIS,
+    STILL,
+    disturbed,
+    gradient,
+    jacobian_of,
+    pixels_of,
+    project,
+    row_time,
+    scene,
+    shake,
+)
+
+DIRECTIONS = list(AXIS)
+SHAKE = 0.003 * np.random.default_rng(7).normal(size=(4, 3))
+
+
+def packed(points, rays, direction, shift=0.0):
+    """Points as measured at their pixels and ``shift`` (n,2) px beside them, to first order."""
+    by_ray = jacobian_of(rays)
+    moved = rays + np.linalg.solve(by_ray, np.broadcast_to(shift, rays.shape)[..., None])[..., 0]
+    tau = row_time(pixels_of(moved), direction)
+    return residuals.pack(points, moved, tau, jacobian_of(moved)), tau
+
+
+def numerical(state, points, direction, coefficients=STILL, h=1e-5):
+    """Derivatives (n,2,18) of the pixels by a step."""
+    columns = []
+    for e in np.eye(18):
+        ahead, behind = (
+            pixels_of(project(disturbed(state, sign * h * e), points, direction, coefficients)[0])
+            for sign in (1, -1)
+        )
+        columns.append((ahead - behind) / (2 * h))
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_normal_equations_are_those_of_the_forward_projection(direction):
+    state, points = scene(direction)
+    rays, _ = project(state, points, direction)
+    jacobian = numerical(state, points, direction)
+    shift = np.array([2e-3, -3e-3])
+    data, _ = packed(points, rays, direction, shift)
+    information, slope = np.empty((18, 18)), np.empty(18)
+    cost = residuals.normal_equations(
+        data, state, gradient(direction), 100.0, 0.0, 2, information, slope
+    )
+    assert cost == pytest.approx(len(points) * shift @ shift, rel=1e-3)
+    expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-4
+    )
+    np.testing.assert_allclose(
+        slope / scale, np.einsum("nci,c->i", jacobian, -shift) / scale, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("coefficients", [STILL, SHAKE], ids=["still", "shaking"])
+def test_lines_are_those_of_the_forward_projection(direction, coefficients):
+    state, points = scene(direction, seed=1)
+    rays, tau = project(state, points, direction, coefficients)
+    data, measured = packed(points, rays, direction)
+    np.testing.assert_allclose(measured, tau, atol=1e-12)
+    h = 1e-5
+    rates = (shake(tau + h, coefficients) - shake(tau - h, coefficients)) / (2 * h)
+    turns = np.column_stack([shake(tau, coefficients), rates])
+    errors, by_motion, by_turn, seen = residuals.linearized(
+        data, len(points), state, gradient(direction), turns
+    )
+    np.testing.assert_allclose(errors, 0.0, atol=1e-7)
+    np.testing.assert_allclose(seen, tau, atol=1e-9)
+    expected = numerical(state, points, direction, coefficients)
+    scale = np.abs(expected).max(axis=(0, 1))
+    # The rate of the shaking stands for the body rate that it makes.
+    near = 1e-3 if len(coefficients) else 2e-5
+    np.testing.assert_allclose(by_motion / scale, expected / scale, atol=near)
+    # By a turn of the camera in its own axes, over all rows alike: the pixel's own row moves, too.
+    columns = []
+    for axis in np.eye(3):
+        ahead, behind = (
+            pixels_of(project(state, points, direction, coefficients, sign * h * axis)[0])
+            for sign in (1, -1)
+        )
+        columns.append((ahead - behind) / (2 * h))
+    expected = np.stack(columns, axis=-1)
+    np.testing.assert_allclose(by_turn, expected, atol=near * np.abs(expected).max())
+
+
+def test_errors_beside_the_shaking_are_distances_of_pixels():
+    """Where a point was measured off its row, the shaking of that row is not its own."""
+    direction = "top_to_bottom"
+    state, points = scene(direction, seed=2)
+    rays, _ = project(state, points, direction, SHAKE)
+    off = 0.5 * np.random.default_rng(0).normal(size=rays.shape)
+    data, measured = packed(points, rays, direction, off)
+    h = 1e-5
+    rates = (shake(measured + h, SHAKE) - shake(measured - h, SHAKE)) / (2 * h)
+    errors, *_ = residuals.linearized(
+        data, len(points), state, gradient(direction),
+        np.column_stack([shake(measured, SHAKE), rates]),
+    )  # fmt: skip
+    np.testing.assert_allclose(errors, -off, atol=5e-3)
+
+
+def test_a_still_camera_has_the_lines_of_its_normal_equations():
+    direction = "left_to_right"
+    state, points = scene(direction, seed=3, count=37)  # no multiple of the lanes
+    rays, _ = project(state, points, direction)
+    off = 0.5 * np.random.default_rng(1).normal(size=rays.shape)
+    data, _ = packed(points, rays, direction, off)
+    errors, by_motion, *_ = residuals.linearized(
+        data, len(points), state, gradient(direction), np.zeros((len(points), 6))
+    )
+    information, slope = np.empty((18, 18)), np.empty(18)
+    cost = residuals.normal_equations(
+        data, state, gradient(direction), 1e3, 0.0, 2, information, slope
+    )
+    assert cost == pytest.approx(np.sum(errors**2), rel=1e-10)
+    products = np.einsum("nci,ncj->ij", by_motion, by_motion)
+    np.testing.assert_allclose(information, products, rtol=1e-9, atol=1e-9 * products.max())
+    np.testing.assert_allclose(slope, np.einsum("nci,nc->i", by_motion, errors), rtol=1e-8)
+    squared = residuals.squared_errors(data, len(points), state, gradient(direction))
+    np.testing.assert_allclose(squared, np.sum(errors**2, axis=1), rtol=1e-10)

@@ -1,0 +1,207 @@
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.core.shutter import Motion
+from rs_localizer.estimation.prior import (
+    Prior,
+    add_prior,
+    held_beside,
+    held_terms,
+    motion_terms,
+    slower_terms,
+    state_in,
+    with_measurements,
+    with_motion,
+)
+from rs_localizer.estimation.refine import apply_step
+
+CENTRE = np.array([10.0, -3.0, 2.0])
+
+
+def motion(seed=0):
+    rng = np.random.default_rng(seed)
+    pose = so3.exp(rng.normal(size=3)), *rng.normal(size=(3, 3))
+    angular, linear = rng.normal(size=(2, 3))
+    return Motion(*pose, angular_acceleration=angular, linear_acceleration=linear)
+
+
+def covariance(seed=1, size=18):
+    factor = np.random.default_rng(seed).normal(size=(size, size))
+    return factor @ factor.T / size + 0.1 * np.eye(size)
+
+
+def evaluate(terms, state, weight=1.0, size=18):
+    information, slope = np.zeros((size, size)), np.zeros(size)
+    return add_prior(*terms, state, weight, information, slope), information, slope
+
+
+NOTHING = motion_terms((0.0, 0.0), (0.0, 0.0))
+PRIORS = {
+    "zero": motion_terms((0.2, 0.1), (0.05, 0.03)),
+    "motion": with_motion(NOTHING, Prior(motion=motion(), covariance=covariance()), CENTRE),
+    "motion but for accelerations": with_motion(
+        NOTHING, Prior(motion=motion(), covariance=covariance(size=12)), CENTRE
+    ),
+    "gyroscope": with_measurements(
+        NOTHING, Prior(angular_velocity=[0.1, 0.2, 0.3], angular_velocity_deviation=0.01)
+    ),
+    "gravity": with_measurements(NOTHING, Prior(gravity=[1.0, 2.0, 0.5], gravity_deviation=0.05)),
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_the_slope_is_the_finite_difference_of_the_cost(name):
+    state = apply_step(state_in(motion(), CENTRE), 0.2 * np.random.default_rng(2).normal(size=18))
+    _, _, slope = evaluate(PRIORS[name], state, 3.0)
+    h = 1e-6
+    for k, e in enumerate(np.eye(18)):
+        ahead, behind = (
+            evaluate(PRIORS[name], apply_step(state, sign * h * e), 3.0)[0] for sign in (1, -1)
+        )
+        assert (ahead - behind) / (2 * h) == pytest.approx(2 * slope[k], rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_the_information_is_the_curvature_at_the_minimum(name):
+    state = state_in(motion(), CENTRE)
+    if name == "gravity":  # a rotation that sees gravity where it was measured
+        seen = np.array([1.0, 2.0, 0.5]) / np.linalg.norm([1.0, 2.0, 0.5])
+        axis = np.cross([0, 0, -1.0], seen)
+        angle = np.arccos(-seen[2])
+        state[:9] = so3.exp(angle * axis / np.linalg.norm(axis)).ravel()
+    elif not name.startswith("motion"):
+        state[12:] = PRIORS[name].references[-1][12:]
+    cost, information, slope = evaluate(PRIORS[name], state)
+    assert cost == pytest.approx(0.0, abs=1e-20)
+    np.testing.assert_allclose(slope, 0.0, atol=1e-10)
+    h = 1e-4
+    for k, e in enumerate(np.eye(18)):
+        bent = evaluate(PRIORS[name], apply_step(state, h * e))[0] / h**2
+        assert bent == pytest.approx(information[k, k], rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [12, 18])
+def test_a_motion_prior_costs_the_mahalanobis_distance(size):
+    mean, spread = motion(), covariance(size=size)
+    terms = with_motion(NOTHING, Prior(motion=mean, covariance=spread), CENTRE)
+    # Of (12,12) the accelerations are free.
+    step = 0.5 * np.random.default_rng(3).normal(size=18)
+    cost, _, _ = evaluate(terms, apply_step(state_in(mean, CENTRE), step))
+    step = step[:size]
+    assert cost == pytest.approx(step @ np.linalg.solve(spread, step), rel=1e-9)
+
+
+def test_infinite_variances_leave_parameters_free():
+    spread = np.diag(np.concatenate([np.full(6, np.inf), np.full(6, 0.01)]))
+    terms = with_motion(NOTHING, Prior(motion=motion(), covariance=spread), CENTRE)
+    _, information, _ = evaluate(terms, state_in(motion(5), CENTRE))
+    np.testing.assert_allclose(information, np.diag([0.0] * 6 + [100.0] * 6 + [0.0] * 6))
+
+
+def test_motion_terms_are_precisions_and_none_for_zero():
+    state = state_in(motion(), CENTRE)
+    _, information, slope = evaluate(motion_terms((0.2, 0.0), (0.0, 0.05)), state)
+    np.testing.assert_allclose(
+        information, np.diag([0.0] * 6 + [25.0] * 3 + [0.0] * 6 + [400.0] * 3)
+    )
+    np.testing.assert_allclose(slope[6:9], 25.0 * state[12:15])
+    np.testing.assert_allclose(slope[15:18], 400.0 * state[21:24])
+    assert evaluate(NOTHING, state)[0] == 0.0
+    assert evaluate(held_terms(), state)[0] > 1e15
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"motion": motion()}, "a prior motion and its covariance go together"),
+        ({"motion": motion(), "covariance": np.eye(6)},
+         r"must be \(12,12\) or \(18,18\), got \(6, 6\)"),
+        ({"motion": motion(), "covariance": np.zeros((12, 12))}, "must be positive definite"),
+        ({"motion": motion(), "covariance": np.full((12, 12), np.nan)}, "must be finite"),
+        ({"motion": motion(), "covariance": np.triu(np.ones((12, 12)))}, "must be symmetric"),
+        ({"motion": motion(), "covariance": np.ones((12, 12))}, "must be positive definite"),
+        ({"motion": replace(motion(), rotation=2 * np.eye(3)), "covariance": np.eye(12)},
+         "rotation is none"),
+        ({"motion": replace(motion(), translation=np.full(3, np.nan)), "covariance": np.eye(12)},
+         "translation is not finite"),
+        ({"angular_velocity": [1, 2]}, "angular_velocity must be three finite numbers"),
+        ({"angular_velocity": [0, 0, np.nan], "angular_velocity_deviation": 1}, "three finite"),
+        ({"angular_velocity": [0, 0, 0]}, "angular_velocity_deviation must be at least .* got nan"),
+        ({"gravity": [0, 0, 0], "gravity_deviation": 1}, "gravity has no direction"),
+        ({"gravity": [0, 0, 1], "gravity_deviation": -1}, "gravity_deviation must be at least"),
+    ],
+)  # fmt: skip
+def test_an_impossible_prior_is_refused_with_what_was_found(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        Prior(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("rotation", np.eye(3).ravel()),
+        ("translation", 0.0),
+        ("translation", np.zeros(2)),
+        ("angular_velocity", np.zeros((3, 1))),
+    ],
+)
+def test_a_prior_motion_of_the_wrong_shape_is_refused(part, value):
+    with pytest.raises(ValueError, match=f"the prior motion's {part} must be of shape"):
+        Prior(motion=replace(motion(), **{part: value}), covariance=np.eye(12))
+
+
+def test_a_motion_of_which_nothing_is_known_adds_nothing():
+    prior = Prior(motion=motion(), covariance=np.diag(np.full(12, np.inf)))
+    terms = with_motion(NOTHING, prior, CENTRE)
+    cost, information, _ = evaluate(terms, state_in(motion(5), CENTRE))
+    assert cost == 0.0
+    assert not information.any()
+
+
+def test_a_motion_may_be_given_in_lists():
+    names = (field.name for field in fields(Motion))
+    listed = Motion(**{name: getattr(motion(), name).tolist() for name in names})
+    np.testing.assert_array_equal(state_in(listed, CENTRE), state_in(motion(), CENTRE))
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_a_search_has_the_first_twelve_of_all_parameters(name):
+    """With the accelerations held where they are, at the same cost."""
+    state = apply_step(state_in(motion(), CENTRE), 0.2 * np.random.default_rng(2).normal(size=18))
+    cost, information, slope = evaluate(PRIORS[name], state, 2.0)
+    searched = evaluate(PRIORS[name], state, 2.0, size=12)
+    assert searched[0] == cost
+    np.testing.assert_array_equal(searched[1], information[:12, :12])
+    np.testing.assert_array_equal(searched[2], slope[:12])
+
+
+def test_a_prior_of_the_accelerations_replaces_that_of_the_configuration():
+    own = motion_terms((0.2, 0.1), (0.05, 0.03))
+    state = state_in(motion(), CENTRE)
+    for size, stays in ((12, True), (18, False)):
+        prior = Prior(motion=motion(), covariance=covariance(size=size))
+        both = evaluate(with_motion(own, prior, CENTRE), state)[1]
+        added = evaluate(with_motion(NOTHING, prior, CENTRE), state)[1]
+        left = np.diag(both - added)
+        np.testing.assert_allclose(left[6:12], np.repeat([25.0, 100.0], 3), rtol=1e-9)
+        assert np.allclose(left[12:], np.repeat([400.0, 1e4 / 9], 3) if stays else 0.0)
+    assert evaluate(own, state)[1][17, 17] > 0.0  # the terms themselves are left alone
+
+
+def test_a_slower_motion_is_a_narrower_prior_and_rest_the_narrowest():
+    own = with_measurements(
+        motion_terms((0.2, 0.1), (0.05, 0.03)), Prior(gravity=[0, 1, 0], gravity_deviation=0.1)
+    )
+    precisions = np.diag(own.informations[0])
+    # Who hardly turns may walk, at a tenth of the speed; that has all the jolts.
+    for part, walk, jolts in ((0.3, 0.3, 1.0), (0.01, 0.1, 0.1)):
+        slower = np.diag(slower_terms(own, part).informations[0])
+        np.testing.assert_allclose(slower[6:9], precisions[6:9] / part**2)
+        np.testing.assert_allclose(slower[9:12], precisions[9:12] / walk**2)
+        np.testing.assert_allclose(slower[12:], precisions[12:] / jolts**2)
+    resting = held_beside(own)
+    np.testing.assert_array_equal(resting.gravity, own.gravity)
+    assert np.diag(resting.informations[0])[6:].min() > 1e15

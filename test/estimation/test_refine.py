@@ -1,0 +1,181 @@
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.estimation.prior import held_terms, motion_terms
+from rs_localizer.estimation.refine import (
+    apply_step,
+    inverted,
+    refine,
+    smallest_eigenvalue,
+    solve_positive,
+    step_between,
+)
+from rs_localizer.estimation.residuals import squared_errors
+
+NO_PRIOR = motion_terms((0.0, 0.0), (0.0, 0.0))
+
+
+def distance(scene, state, motion):
+    """Largest difference of rotation (rad), translation, velocities and accelerations."""
+    found = scene.motion_of(state)
+    return max(
+        np.linalg.norm(so3.log(found.rotation @ motion.rotation.T)),
+        np.abs(found.translation - motion.translation).max(),
+        np.abs(found.angular_velocity - motion.angular_velocity).max(),
+        np.abs(found.linear_velocity - motion.linear_velocity).max(),
+        np.abs(found.angular_acceleration - motion.angular_acceleration).max(),
+        np.abs(found.linear_acceleration - motion.linear_acceleration).max(),
+    )
+
+
+def test_a_step_turns_and_moves_the_camera_in_its_own_axes(scene):
+    _, motion, *_ = scene.frame()
+    step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6, *np.linspace(0.01, 0.12, 12)])
+    moved = scene.motion_of(apply_step(scene.state_of(motion), step))
+    map_from_camera = motion.rotation.T
+    np.testing.assert_allclose(moved.rotation.T, map_from_camera @ so3.exp(step[:3]), atol=1e-14)
+    centre, new_centre = (-m.rotation.T @ m.translation for m in (motion, moved))
+    np.testing.assert_allclose(new_centre, centre + map_from_camera @ step[3:6], atol=1e-14)
+    np.testing.assert_allclose(moved.angular_velocity, motion.angular_velocity + step[6:9])
+    np.testing.assert_allclose(moved.linear_velocity, motion.linear_velocity + step[9:12])
+    np.testing.assert_allclose(moved.angular_acceleration, step[12:15])
+    np.testing.assert_allclose(moved.linear_acceleration, step[15:])
+    # A search's step leaves the accelerations as they are.
+    state = apply_step(scene.state_of(motion), step)
+    np.testing.assert_array_equal(apply_step(state, step[:12])[18:], state[18:])
+
+
+def test_the_truth_is_found_from_a_global_shutter_start(scene):
+    camera, motion, points, true, _ = scene.frame(speed=0.2, count=40, acceleration=0.1)
+    start = scene.state_of(motion)
+    start[12:] = 0.0
+    start = apply_step(start, 0.05 * np.random.default_rng(0).normal(size=18))
+    state, _, cost, converged = refine(
+        scene.pack(camera, points, true), start, camera.row_time_gradient, 1e3, 0.0, NO_PRIOR,
+        1e-3, 2, 30, 1e-6,
+    )  # fmt: skip
+    assert converged
+    assert cost < 1e-9
+    assert distance(scene, state, motion) < 1e-7
+
+
+def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
+    camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=60, seed=2)
+    measured[:15] = np.random.default_rng(1).uniform([0, 0], [639, 479], (15, 2))
+    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    start = apply_step(scene.state_of(motion), 0.003 * np.random.default_rng(3).normal(size=18))
+    previous = np.inf
+    for iterations in (0, 1, 2, 5, 20):
+        state, information, cost, _ = refine(
+            data, start, gradient, 4.0, 1.0, NO_PRIOR, 0.5, 2, iterations, 1e-6
+        )
+        assert cost <= previous
+        previous = cost
+    # Within the noise: the translation along the axis is known to centimetres here.
+    deviations = 0.5 * np.sqrt(np.diag(inverted(information)))
+    assert distance(scene, state, motion) < 4 * deviations.max()
+
+
+def test_the_noise_decides_between_prior_and_data(scene):
+    camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
+    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    start = scene.state_of(motion)
+    held = refine(data, start, gradient, 1e3, 0.0, held_terms(), 1.0, 2, 30, 1e-6)[0]
+    np.testing.assert_allclose(held[12:], 0.0, atol=1e-9)
+    prior = motion_terms((0.1, 0.1), (0.1, 0.1))
+    free, weak, strong = (
+        refine(data, start, gradient, 1e3, 0.0, p, noise, 2, 30, 1e-6)[0][12:]
+        for p, noise in ((NO_PRIOR, 1.0), (prior, 0.5), (prior, 50.0))
+    )
+    assert np.linalg.norm(weak) < np.linalg.norm(free)
+    assert np.linalg.norm(strong) < 0.8 * np.linalg.norm(weak)
+
+
+def test_the_minimum_has_no_slope_of_the_posterior(scene):
+    """The gradient of cost plus prior vanishes, by finite differences of the cost itself."""
+    camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
+    # Without the row's part the cost is exactly that of the residuals.
+    data, gradient = scene.pack(camera, points, measured), np.zeros(2)
+    prior, noise, h = motion_terms((0.2, 0.1), (0.1, 0.05)), 0.5, 1e-6
+    precisions = np.repeat([25.0, 100.0, 100.0, 400.0], 3)
+    state = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, prior, noise, 2, 50, 1e-6)[0]
+
+    def posterior(s):
+        changes = s[12:]
+        errors = squared_errors(data, len(points), s, gradient)
+        return errors.sum() + noise**2 * changes @ (precisions * changes)
+
+    for e in np.eye(18):
+        slope = (posterior(apply_step(state, h * e)) - posterior(apply_step(state, -h * e))) / (
+            2 * h
+        )
+        curvature = (
+            posterior(apply_step(state, 1e-4 * e)) + posterior(apply_step(state, -1e-4 * e))
+            - 2 * posterior(state)
+        ) / 1e-8  # fmt: skip
+        assert abs(slope) < 1e-3 * np.sqrt(curvature) * noise
+
+
+@pytest.mark.parametrize("size", [1, 3, 12])
+def test_cholesky_is_numpy_s_solve(size):
+    rng = np.random.default_rng(size)
+    factor = rng.normal(size=(size, size))
+    units = np.diag(10.0 ** rng.uniform(-6, 6, size))
+    matrix, right = units @ (factor @ factor.T + np.eye(size)) @ units, rng.normal(size=size)
+    solution, solved = solve_positive(matrix, right)
+    assert solved
+    np.testing.assert_allclose(solution, np.linalg.solve(matrix, right), rtol=1e-6)
+
+
+def test_a_matrix_that_is_not_positive_is_refused():
+    for matrix in (np.zeros((2, 2)), np.ones((2, 2)), -np.eye(2), np.diag([1.0, np.nan])):
+        assert not solve_positive(matrix, np.ones(2))[1]
+        assert not smallest_eigenvalue(matrix) > 1e-12
+        assert np.isnan(inverted(matrix)).all()
+
+
+def test_the_inverse_and_the_eigenvalue_do_not_depend_on_units():
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(12, 12))
+    matrix = factor @ factor.T
+    units = np.diag(10.0 ** rng.uniform(-5, 5, 12))
+    smallest = smallest_eigenvalue(matrix)
+    np.testing.assert_allclose(inverted(matrix) @ matrix, np.eye(12), atol=1e-8)
+    scaled = inverted(units @ matrix @ units)
+    np.testing.assert_allclose(units @ scaled @ units, inverted(matrix), rtol=1e-6)
+    assert smallest_eigenvalue(units @ matrix @ units) == pytest.approx(smallest, rel=1e-6)
+
+
+def test_a_step_between_states_leads_from_one_to_the_other(scene):
+    first = scene.state_of(scene.frame(seed=1)[1])
+    step = 0.3 * np.random.default_rng(0).normal(size=18)
+    second = apply_step(first, step)
+    np.testing.assert_allclose(step_between(first, second), step, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 12, 18, 54])
+def test_the_inverse_is_numpy_s_also_where_parameters_are_held(size):
+    rng = np.random.default_rng(size)
+    factor = rng.normal(size=(size, 2 * size))
+    matrix = factor @ factor.T
+    np.testing.assert_allclose(inverted(matrix), np.linalg.inv(matrix), rtol=1e-8, atol=1e-12)
+    held = np.arange(size) >= size // 2
+    matrix[held, held] += 1e18
+    free = np.linalg.inv(matrix[np.ix_(~held, ~held)])
+    found = inverted(matrix)
+    np.testing.assert_allclose(found[np.ix_(~held, ~held)], free, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(np.diag(found)[held], 1e-18, rtol=1e-9)
+    np.testing.assert_array_equal(found, found.T)
+
+
+def test_a_search_holds_the_accelerations(scene):
+    camera, motion, points, true, _ = scene.frame(speed=0.1, count=40)
+    start = apply_step(scene.state_of(motion), 0.01 * np.ones(12))
+    state, information, *_ = refine(
+        scene.pack(camera, points, true), start, camera.row_time_gradient, 1e3, 0.0, NO_PRIOR,
+        1e-3, 1, 30, 1e-6,
+    )  # fmt: skip
+    assert information.shape == (12, 12)
+    assert not state[18:].any()
+    assert distance(scene, state, motion) < 1e-7

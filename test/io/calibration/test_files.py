@@ -1,0 +1,184 @@
+"""Calibration files of other programs, and what is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.io.calibration.files import CalibrationError, read_calibration
+
+ROS = """
+image_width: 640
+image_height: 480
+camera_name: webcam
+camera_matrix: {rows: 3, cols: 3, data: [500.0, 0, 320.5, 0, 510.0, 240.5, 0, 0, 1]}
+distortion_model: rational_polynomial
+distortion_coefficients: {rows: 1, cols: 8, data: [1, 2, 3, 4, 5, 6, 7, 8]}
+"""
+BOOFCV = """
+pinhole: {fx: 500.0, fy: 510.0, cx: 320.5, cy: 240.5, width: 640, height: 480, skew: 0.0}
+model: pinhole_radial_tangential
+radial_tangential:
+  radial: [0.05, -0.16]
+  t1: 0.001
+  t2: 0.002
+"""
+
+
+KALIBR = """
+cam0:
+  camera_model: pinhole
+  intrinsics: [500.0, 510.0, 320.5, 240.5]
+  distortion_model: equidistant
+  distortion_coeffs: [0.1, 0.2, 0.3, 0.4]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+"""
+# What cv2.FileStorage writes, in both of its formats.
+OPENCV = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 500., 0., 320.5, 0., 510., 240.5, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ 0.1, -0.2, 1.0e-03, 2.0e-03, 0.3 ]
+"""
+XML = """<?xml version="1.0"?>
+<opencv_storage>
+<image_width>640</image_width>
+<image_height>480</image_height>
+<camera_matrix type_id="opencv-matrix">
+  <rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>500. 0. 320.5 0. 510. 240.5 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix">
+  <rows>1</rows><cols>5</cols><dt>d</dt>
+  <data>0.1 -0.2 1.0e-03 2.0e-03 0.3</data></distortion_coefficients>
+</opencv_storage>
+"""
+COLMAP = """# Camera list with one line of data per camera:
+#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+1 {} 640 480 {}
+"""
+JSON = '{"K": [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]], "D": [[0.1, 0.2, 0, 0]], %s}'
+FIVE = [0.1, -0.2, 1e-3, 2e-3, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("text", "model", "D"),
+    [
+        (KALIBR, "equidistant", [0.1, 0.2, 0.3, 0.4]),
+        (KALIBR.replace("equidistant", "radtan"), "plumb_bob", [0.1, 0.2, 0.3, 0.4]),
+        (OPENCV, "plumb_bob", FIVE),
+        (OPENCV.replace("image_width: 640", "fisheye_model: 1\nimage_width: 640")
+         .replace(", 0.3 ]", "]").replace("rows: 5", "rows: 4"), "equidistant", FIVE[:4]),
+        (XML, "plumb_bob", FIVE),
+        # COLMAP's first pixel has its corner at 0, 0; its order has the tangential ones third.
+        (COLMAP.format("OPENCV", "500 510 321 241 .1 .2 .3 .4"), "plumb_bob",
+         [0.1, 0.2, 0.3, 0.4, 0]),
+        (COLMAP.format("PINHOLE", "500 510 321 241"), "plumb_bob", []),
+        (COLMAP.format("OPENCV_FISHEYE", "500 510 321 241 .1 .2 .3 .4"), "equidistant",
+         [0.1, 0.2, 0.3, 0.4]),
+        (COLMAP.format("FULL_OPENCV", "500 510 321 241 1 2 3 4 5 6 7 8"), "rational_polynomial",
+         [1, 2, 3, 4, 5, 6, 7, 8]),
+        (JSON % '"width": 640, "height": 480', "plumb_bob", [0.1, 0.2, 0, 0]),
+        (JSON % '"image_size": [640, 480], "distortion_model": "fisheye"', "equidistant",
+         [0.1, 0.2, 0, 0]),
+        ('{"w": 640, "h": 480, "fx": 500, "fy": 510, "cx": 320.5, "cy": 240.5, "k1": 0.1, "p1": 1}',
+         "plumb_bob", [0.1, 0, 1, 0]),
+    ],
+)  # fmt: skip
+def test_other_programs(tmp_path: Path, text: str, model: str, D: list[float]) -> None:
+    (tmp_path / "camera").write_text(text)
+    camera = read_calibration(tmp_path / "camera")
+    assert (camera.width, camera.height, camera.distortion_model) == (640, 480, model)
+    np.testing.assert_allclose(camera.K, [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]])
+    np.testing.assert_allclose(camera.D, D)
+
+
+@pytest.mark.parametrize("ending", ["yaml", "xml", "json"])
+def test_what_opencv_writes(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"camera.{ending}"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("image_width", 640)
+    file.write("image_height", 480)
+    file.write("camera_matrix", np.array([[500.25, 0, 320.5], [0, 510, 240.5], [0, 0, 1]]))
+    file.write("distortion_coefficients", np.array([FIVE]))
+    file.release()
+    camera = read_calibration(path)
+    assert (camera.K[0, 0], camera.width) == (500.25, 640)
+    np.testing.assert_allclose(camera.D, FIVE)
+
+
+def test_one_of_several_cameras(tmp_path: Path) -> None:
+    other = KALIBR.replace("cam0", "cam1").replace("500.0", "600.0")
+    (tmp_path / "chain.yaml").write_text(KALIBR + other)
+    assert read_calibration(f"{tmp_path}/chain.yaml#cam1").K[0, 0] == 600.0
+    with pytest.raises(CalibrationError, match="the cameras cam0, cam1: choose one with #cam0"):
+        read_calibration(tmp_path / "chain.yaml")
+    with pytest.raises(CalibrationError, match="the cameras cam0, cam1"):
+        read_calibration(f"{tmp_path}/chain.yaml#cam2")
+    lines = "7 PINHOLE 640 480 500 510 321 241\n9 PINHOLE 640 480 700 510 321 241\n"
+    (tmp_path / "cameras.txt").write_text(lines)
+    assert read_calibration(f"{tmp_path}/cameras.txt#9").K[0, 0] == 700.0
+    with pytest.raises(CalibrationError, match="the cameras 7, 9: choose one with #7"):
+        read_calibration(tmp_path / "cameras.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "model", "D"),
+    [
+        (ROS, "rational_polynomial", [1, 2, 3, 4, 5, 6, 7, 8]),
+        # OpenCV's order: two radial, two tangential, the third radial.
+        (BOOFCV, "plumb_bob", [0.05, -0.16, 0.001, 0.002, 0.0]),
+    ],
+)
+def test_both_kinds(tmp_path: Path, text: str, model: str, D: list[float]) -> None:
+    (tmp_path / "camera.yaml").write_text(text)
+    camera = read_calibration(tmp_path / "camera.yaml")
+    assert (camera.width, camera.height, camera.distortion_model) == (640, 480, model)
+    np.testing.assert_array_equal(camera.K, [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]])
+    np.testing.assert_array_equal(camera.D, D)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a: [", r"camera.yaml is no YAML, JSON or XML file"),
+        ("just text", r"is no calibration: expected a calibration file of ROS' .* found neither"),
+        ("width: 3\nname: x", r"is no calibration: .* found name, width"),
+        (ROS.replace("image_width", "breite"), r"no usable calibration: no 'image_width'"),
+        (ROS.replace("500.0, 0, ", ""), r"no usable calibration: cannot reshape"),
+        (ROS.replace("rational_polynomial", "fov"), r"distortion_model must be .* got 'fov'"),
+        (BOOFCV.replace("skew: 0.0", "skew: 0.5"), r"skew must be 0, found 0.5"),
+        (BOOFCV.replace("-0.16", "1, 2, 3"), r"at most 3 radial coefficients .* found 4"),
+        (BOOFCV.replace("fx: 500.0", "fx: 0"), r"not calibrated"),
+        (KALIBR.replace("pinhole", "ds"), r"camera_model must be pinhole, found 'ds'"),
+        (KALIBR.replace("equidistant", "fov"), r"distortion_model must be one of radtan"),
+        (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),
+        (COLMAP.format("OPENCV", "500 510 321 241 1"), r"OPENCV has width, height, fx fy"),
+        (JSON % '"a": 1', r"does not say for which size of images"),
+        (JSON % '"width": 640', r"no usable calibration: no 'image_height'"),
+        (JSON % '"width": 300, "height": 480', r"principal point \(320.5, 240.5\) lies outside"),
+        (XML.replace("<opencv_storage>", "<opencv_storage"), "XML cannot be read"),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><x>&a;</x>', "the XML defines entities"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(CalibrationError, match=expected):
+        read_calibration(tmp_path / "camera.yaml")
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"absent.yaml cannot be read: No such file"):
+        read_calibration(tmp_path / "absent.yaml")

@@ -1,0 +1,444 @@
+"""Map files: what is written is read back, what COLMAP wrote is understood, hostile ones refused.
+
+The model in the folder colmap was written by pycolmap 4.2.1 (4 images, 14 points with noise, SIFT
+descriptors that differ from view to view); truth.json is what pycolmap's own reader says of it,
+with the medoids worked out beside it in plain loops.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import shutil
+import sqlite3
+import struct
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.landmarks import Map, MapError, make_map
+from rs_localizer.io.maps.ply import write_ply
+
+COLMAP = Path(__file__).parent / "colmap"
+
+
+def landmarks(ids: str | None, descriptors: str | None, count: int = 7) -> Map:
+    rng = np.random.default_rng(0)
+    numbers = {
+        None: None,
+        "unsigned": rng.permutation(2**32 - 1 - np.arange(count)),
+        "signed": rng.permutation(np.arange(count) - 2**31),
+    }[ids]
+    rows = {
+        None: None,
+        "binary": rng.integers(0, 256, (count, 32), dtype=np.uint8),
+        "float": rng.normal(size=(count, 5)).astype(np.float32),
+    }[descriptors]
+    return Map(rng.normal(size=(count, 3)) * 1e5, numbers, rows, "hall")
+
+
+def assert_same(one: Map, other: Map) -> None:
+    for name in ("points", "ids", "descriptors"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a is None) == (b is None)
+        if a is not None:
+            assert a.dtype == b.dtype
+            assert a.tolist() == b.tolist()
+    assert one.frame == other.frame
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".ply", "text.ply"])
+@pytest.mark.parametrize("ids", [None, "unsigned", "signed"])
+@pytest.mark.parametrize("descriptors", [None, "binary", "float"])
+def test_round_trip(tmp_path: Path, suffix: str, ids: str | None, descriptors: str | None) -> None:
+    written = landmarks(ids, descriptors)
+    path = tmp_path / f"map{suffix}"
+    if suffix == "text.ply":
+        write_ply(path, written, binary=False)
+    else:
+        write_map_file(path, written)
+    assert_same(read_map_file(path, "hall"), written)
+
+
+def test_archives_of_numpy_in_other_types(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    points = np.asfortranarray(np.arange(12).reshape(4, 3).astype(">f4"))
+    np.savez_compressed(
+        path, points=points, ids=np.arange(4, dtype=np.uint8), descriptors=np.eye(4), more=points
+    )
+    found = read_map_file(path, "map")
+    assert found.points.tolist() == points.tolist()
+    assert found.ids is not None
+    assert found.ids.tolist() == [0, 1, 2, 3]
+    assert found.descriptors is not None
+    assert found.descriptors.dtype == np.float32
+
+
+VERTICES = [(i, 9, -i, 7 + i, 2.5 * i, 3, i, 1, 2, -1) for i in range(4)]
+PLY = {
+    "big": b"".join(struct.pack(">fBfIdH3fb", *row) for row in VERTICES),
+    "little": b"".join(struct.pack("<fBfIdH3fb", *row) for row in VERTICES),
+    "ascii": b"".join(b"%d %d %d %d %g  %d %d %d %d %d\n" % row for row in VERTICES),
+}
+
+
+@pytest.mark.parametrize("form", list(PLY))
+def test_ply_of_another_author(tmp_path: Path, form: str) -> None:
+    """Properties in any order and type, an element before the vertices, faces after them."""
+    header = (
+        f"ply\nformat {form if form == 'ascii' else f'binary_{form}_endian'} 1.0\n"
+        "comment made by hand\nelement camera 2\nproperty uchar a\nproperty int8 b\n"
+        "element vertex 4\nproperty float x\nproperty uchar red\nproperty float32 y\n"
+        "property uint id\nproperty double z\nproperty list ushort float descriptor\n"
+        "property char more\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    before = b"1 2\n3 4\n" if form == "ascii" else b"\x01\x02\x03\x04"
+    path = tmp_path / "map.ply"
+    path.write_bytes(header.encode() + before + PLY[form] + b"and whatever follows")
+    found = read_map_file(path, "map")
+    assert found.points.tolist() == [[i, -i, 2.5 * i] for i in range(4)]
+    assert found.ids is not None
+    assert found.ids.tolist() == [7, 8, 9, 10]
+    assert found.descriptors is not None
+    assert found.descriptors.tolist() == [[i, 1, 2] for i in range(4)]
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_a_model_of_colmap(form: str) -> None:
+    truth = json.loads((COLMAP / "truth.json").read_text())
+    found = read_map_file(COLMAP / form, "map")  # the database lies one folder above
+    assert found.ids is not None
+    assert found.descriptors is not None
+    assert found.descriptors.dtype == np.float32
+    assert set(found.ids.tolist()) == {int(name) for name in truth}
+    for number, point, descriptor in zip(
+        found.ids.tolist(), found.points.tolist(), found.descriptors.tolist(), strict=True
+    ):
+        assert point == truth[str(number)]["xyz"]
+        assert descriptor == truth[str(number)]["medoid"]
+
+
+def test_a_model_without_a_database(tmp_path: Path) -> None:
+    model = tmp_path / "a" / "b" / "sparse"
+    shutil.copytree(COLMAP / "binary", model)
+    assert read_map_file(model, "map").descriptors is None
+    given = read_map_file(model, "map", COLMAP / "database.db")
+    assert given.descriptors is not None
+    assert given.descriptors.shape == (14, 128)
+
+
+def test_a_database_of_any_name(tmp_path: Path) -> None:
+    model = tmp_path / "sparse" / "0"
+    shutil.copytree(COLMAP / "binary", model)
+    shutil.copy(COLMAP / "database.db", tmp_path / "office.db")
+    sqlite3.connect(tmp_path / "thumbs.db").close()  # another program's
+    (tmp_path / "notes.db").write_text("no database")
+    found = read_map_file(model, "map")
+    assert found.equals(read_map_file(COLMAP / "binary", "map", COLMAP / "database.db"))
+    assert found.descriptors is not None
+    shutil.copy(COLMAP / "database.db", tmp_path / "attic.db")
+    with pytest.raises(MapError, match=r"several databases of COLMAP, attic.db, office.db: name"):
+        read_map_file(model, "map")
+
+
+def database(path: Path, *changes: str) -> Path:
+    shutil.copy(COLMAP / "database.db", path / "database.db")
+    with sqlite3.connect(path / "database.db") as tables:
+        for change in changes:
+            tables.execute(change)
+    tables.close()
+    return path / "database.db"
+
+
+def test_points_that_no_described_image_sees_are_left_out(tmp_path: Path) -> None:
+    truth = json.loads((COLMAP / "truth.json").read_text())
+    file = database(tmp_path, "DELETE FROM descriptors WHERE image_id > 2")
+    left = [n for n, point in truth.items() if any(image <= 2 for image, _ in point["track"])]
+    found = read_map_file(COLMAP / "binary", "map", file)
+    assert (len(found), found.dropped) == (len(left), 14 - len(left))
+
+
+def test_descriptors_of_other_extractors(tmp_path: Path) -> None:
+    # Binary ones that somebody imported: 32 of the 128 bytes.
+    cut = "UPDATE descriptors SET cols = 32, data = CAST(zeroblob(rows * 32) AS BLOB)"
+    found = read_map_file(COLMAP / "binary", "map", database(tmp_path, cut))
+    assert found.descriptors is not None
+    assert (found.descriptors.dtype, found.descriptors.shape) == (np.uint8, (14, 32))
+    # ALIKED and the like: bytes of floats.
+    floats = "UPDATE descriptors SET type = 1, data = CAST(zeroblob(rows * 128) AS BLOB)"
+    found = read_map_file(COLMAP / "binary", "map", database(tmp_path, floats))
+    assert found.descriptors is not None
+    assert (found.descriptors.dtype, found.descriptors.shape) == (np.float32, (14, 32))
+
+
+# Which no point of the model is seen by.
+FIRST_FEATURE_OF_IMAGE_2 = (
+    "DELETE FROM descriptors WHERE image_id <> 2;"
+    "UPDATE descriptors SET rows = 1, data = substr(data, 1, 128)"
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ("UPDATE descriptors SET rows = 4000000000000", "4000000000000 descriptors of 128 bytes"),
+        ("UPDATE descriptors SET cols = -1", "descriptors of -1 bytes"),
+        ("UPDATE descriptors SET data = NULL", "the descriptors of image 1 are none"),
+        ("UPDATE descriptors SET cols = 64, rows = 2 * rows WHERE image_id = 2", "64 x uint8"),
+        ("DELETE FROM descriptors", "no descriptors of the images"),
+        ("DROP TABLE descriptors", "no such table"),
+        (FIRST_FEATURE_OF_IMAGE_2, "no point of the model"),
+    ],
+)
+def test_a_bad_database(tmp_path: Path, change: str, text: str) -> None:
+    file = database(tmp_path, *change.split(";"))
+    with pytest.raises(MapError, match=text):
+        read_map_file(COLMAP / "binary", "map", file)
+    file.write_bytes(b"no database at all, but long enough to look like one" * 30)
+    with pytest.raises(MapError, match="cannot be read as a database"):
+        read_map_file(COLMAP / "binary", "map", file)
+
+
+def test_long_tracks(tmp_path: Path) -> None:
+    """The medoid of a point that 1000 images see is that of an even choice of them."""
+    rng = np.random.default_rng(0)
+    with (tmp_path / "points3D.txt").open("w") as file:
+        file.write("5 1 2 3 0 0 0 0.5 " + " ".join(f"{image} 0" for image in range(1, 1001)))
+    tables = sqlite3.connect(tmp_path / "database.db")
+    tables.execute("CREATE TABLE descriptors (image_id, rows, cols, data)")  # as before 3.12
+    for image in range(1, 1001):
+        data = np.clip(rng.normal(100, 10, 128), 0, 255).astype(np.uint8)
+        tables.execute("INSERT INTO descriptors VALUES (?, 1, 128, ?)", (image, data.tobytes()))
+    tables.commit()
+    tables.close()
+    found = read_map_file(tmp_path, "map").descriptors
+    assert found is not None
+    assert np.abs(found - 100).mean() < 11
+
+
+def npy(shape: tuple[int, ...], kind: str, data: bytes = b"") -> bytes:
+    header = f"{{'descr': {kind!r}, 'fortran_order': False, 'shape': {shape!r}, }}"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + data
+
+
+def archive(path: Path, compression: int = zipfile.ZIP_STORED, **members: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", compression) as file:
+        for name, data in members.items():
+            file.writestr(f"{name}.npy", data)
+    return path
+
+
+class Bomb:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (Path("/tmp/rs_localizer_was_here"),))
+
+
+def pickled() -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, np.array([Bomb(), None]), allow_pickle=True)
+    return stream.getvalue()
+
+
+ONE = np.ones(3).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("members", "text"),
+    [
+        ({"points": npy((10**12, 3), "<f8", ONE)}, "takes 24000000000\\d* bytes, found"),
+        ({"points": npy((2**62, 2**62), "<f8", ONE)}, "its shape takes"),
+        ({"points": npy((1, 3, 10**9, 0), "<f8")}, r"must be \(n,3\) numbers"),
+        ({"points": npy((-1, 3), "<f8", ONE)}, "the shape"),
+        ({"points": npy((1, 3), "|O", pickle.dumps(None))}, "must hold numbers, found object"),
+        ({"points": pickled()}, "must hold numbers, found object"),
+        ({"points": npy((3,), "<f8", ONE)}, r"must be \(n,3\) numbers, found \(3,\)"),
+        ({"points": npy((0, 3), "<f8")}, "no landmarks"),
+        ({"points": b"\x93NUMPY\x09\x00"}, "version 9.0"),
+        ({"points": b"not at all"}, "no readable NumPy archive"),
+        ({"points": npy((1, 3), "<f8", ONE)[:60]}, "no readable NumPy archive"),
+        ({"ids": npy((1,), "<i8", bytes(8))}, "no array 'points'; found ids.npy"),
+        ({"points": npy((1, 3), "<f8", ONE), "ids": npy((1,), "<f8", bytes(8))}, "ids must be"),
+        (
+            {"points": npy((1, 3), "<f8", ONE), "ids": npy((1,), "<i8", b"\xff" * 7 + b"\x7f")},
+            "ids must lie between",
+        ),
+        (
+            {"points": npy((1, 3), "<f8", ONE), "descriptors": npy((1, 2), "<i2", bytes(4))},
+            "descriptors must be uint8 or floats, found int16",
+        ),
+        (
+            {"points": npy((1, 3), "<f8", ONE), "descriptors": npy((2, 2), "|u1", bytes(4))},
+            r"descriptors must be \(1,d\), found \(2, 2\)",
+        ),
+    ],
+)
+def test_a_bad_archive(tmp_path: Path, members: dict[str, bytes], text: str) -> None:
+    path = archive(tmp_path / "map.npz", **members)
+    with pytest.raises(MapError, match=text) as caught:
+        read_map_file(path, "map")
+    assert str(caught.value).startswith(f"{path}: ")
+    assert not Path("/tmp/rs_localizer_was_here").exists()
+
+
+def changed_header(path: Path, offset: int, value: int) -> None:
+    """Change a field of the central directory's first entry."""
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, data.index(b"PK\x01\x02") + offset, value)
+    path.write_bytes(data)
+
+
+def test_sizes_that_an_archive_claims(tmp_path: Path) -> None:
+    path = archive(tmp_path / "a.npz", points=npy((1, 3), "<f8", ONE))
+    changed_header(path, 24, 2**32 - 2)  # the size unpacked
+    with pytest.raises(MapError, match="larger than 2 GiB"):
+        read_map_file(path, "map")
+    path = archive(tmp_path / "b.npz", zipfile.ZIP_DEFLATED, points=npy((1, 3), "<f8", ONE))
+    changed_header(path, 24, 2**30)
+    with pytest.raises(MapError, match="cannot unpack to"):
+        read_map_file(path, "map")
+    path = archive(tmp_path / "c.npz", zipfile.ZIP_LZMA, points=npy((1, 3), "<f8", ONE))
+    with pytest.raises(MapError, match="packed by method 14"):
+        read_map_file(path, "map")
+
+
+def ply(count: str = "1", properties: str = "", data: bytes = b"") -> bytes:
+    start = "ply\nformat binary_little_endian 1.0\n"
+    return f"{start}element vertex {count}\n{properties}end_header\n".encode() + data
+
+
+def text_ply(count: int, data: bytes, properties: str) -> bytes:
+    header = f"ply\nformat ascii 1.0\nelement vertex {count}\n{properties}end_header\n"
+    return header.encode() + data
+
+
+XYZ = "".join(f"property float {name}\n" for name in "xyz")
+LIST = XYZ + "property list uint float descriptor\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b"", "the first line is not 'ply'"),
+        (b"ply\nformat ascii 2.0\n", "not understood at 'format ascii 2.0'"),
+        (b"ply\nformat ascii 1.0\n", "not understood at the end of the file"),
+        (b"ply\nend_header\n", "not understood at 'end_header'"),
+        (b"ply\n" + b"comment\n" * 2000, "more than 1000 lines"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
+        (ply(str(10**12), XYZ), f"truncated: {10**12} x vertex take at least {12 * 10**12} bytes"),
+        (ply("9" * 4000, XYZ), "truncated: 99999999999999999999 x vertex"),
+        (ply("-1", XYZ), "not understood at 'element vertex -1'"),
+        (ply("1", XYZ, bytes(11)), "truncated"),
+        (ply("5", ""), "the vertices have no properties"),
+        (ply("1", "property float x\n" * 3, bytes(12)), "make no table"),
+        (ply("1", XYZ[:-17], bytes(8)), "no property z; found x, y"),
+        (ply("0", XYZ), "no landmarks"),
+        (ply("1", LIST, bytes(12) + struct.pack("<I", 2**32 - 1)), "1 to 65535 values, found"),
+        (ply("1", LIST, bytes(12) + struct.pack("<I", 2**15)), "truncated: 1 x vertex"),
+        (ply("1", LIST, bytes(16)), "1 to 65535 values, found 0"),
+        (
+            ply("2", LIST, bytes(12) + struct.pack("<If", 1, 0) + bytes(12) + bytes(8)),
+            "must be equally long, found 0 to 1 values",
+        ),
+        (
+            ply("1", XYZ + "property list uchar double id\n", bytes(12) + b"\x01" + bytes(8)),
+            "property id must be one number",
+        ),
+        (ply("1", XYZ + "property float id\n", bytes(16)), "ids must be .* integers"),
+        (ply("2", XYZ + "property int id\n", bytes(32)), "1 ids stand for several .* first .* 0"),
+        (ply("1", XYZ, struct.pack("<3f", np.nan, 0, 0)), "no landmarks; 1 with NaN"),
+        (ply("1", XYZ, struct.pack("<3f", 1e30, 0, 0)), "within 1e\\+09 m"),
+        (
+            ply().replace(b"vertex 1\n", b"face 1\nproperty list uchar int v\nelement vertex 1\n"),
+            "face with lists stands before",
+        ),
+        (text_ply(2, b"1 2 30\n1   2", XYZ), "vertex 2 of 2 must have 3 numbers, found 2"),
+        (text_ply(1, b"1 two 3\n", XYZ), "vertex 1 is no line of numbers: '1 two 3'"),
+        (text_ply(1, b"1 2 3 4\n", XYZ), "must have 3 numbers, found 4"),
+        (text_ply(1, b"1 2 256\n", XYZ.replace("float z", "uchar z")), "z holds what is no uchar"),
+        (text_ply(10**12, b"1 2 3\n", XYZ), "truncated"),
+    ],
+)
+def test_a_bad_ply(tmp_path: Path, data: bytes, text: str) -> None:
+    path = tmp_path / "map.ply"
+    path.write_bytes(data)
+    with pytest.raises(MapError, match=text):
+        read_map_file(path, "map")
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "text"),
+    [
+        ("points3D.bin", b"", "truncated"),
+        ("points3D.bin", struct.pack("<Q", 10**12), "truncated: 1000000000000 points"),
+        ("points3D.bin", struct.pack("<Q", 1) + bytes(43) + b"\xff" * 8, "truncated at point 1"),
+        (
+            "points3D.bin",
+            struct.pack("<Q", 1) + b"\xff" * 8 + bytes(43),
+            "the id 18446744073709551615",
+        ),
+        ("points3D.bin", struct.pack("<Q", 0), "no landmarks"),
+        ("points3D.txt", b"1 2 3\n", "line 1: expected ID X Y Z"),
+        ("points3D.txt", b"#\n1 2 3 4 0 0 0 0 5\n", "line 2: expected"),
+        ("points3D.txt", b"1 2 3 4 0 0 0 0 5 -6\n", "line 1: expected"),
+        ("points3D.txt", b"x 2 3 4 0 0 0 0 5 6\n", "line 1: expected"),
+        ("cameras.bin", b"", "neither points3D.bin nor points3D.txt"),
+    ],
+)
+def test_a_bad_model(tmp_path: Path, name: str, data: bytes, text: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(MapError, match=text):
+        read_map_file(tmp_path, "map")
+
+
+def test_hostile_sizes_allocate_nothing(tmp_path: Path) -> None:
+    files: dict[str, Callable[[Path], Any]] = {
+        "a.npz": lambda p: archive(p, points=npy((10**12, 3), "<f8", ONE)),
+        "b.ply": lambda p: p.write_bytes(ply(str(10**12), XYZ)),
+        "c.ply": lambda p: p.write_bytes(ply("1", LIST, bytes(12) + b"\xff\xff\x00\x00")),
+        "d": lambda p: (p.mkdir(), (p / "points3D.bin").write_bytes(struct.pack("<Q", 10**12))),
+    }
+    for name, make in files.items():
+        make(tmp_path / name)
+        tracemalloc.start()
+        with pytest.raises(MapError):
+            read_map_file(tmp_path / name, "map")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 2**20, name
+
+
+def test_other_files(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        read_map_file(tmp_path / "nothing.npz", "map")
+    (tmp_path / "map.obj").touch()
+    with pytest.raises(MapError, match=r"expected a folder of COLMAP or a file ending in .npz"):
+        read_map_file(tmp_path / "map.obj", "map")
+    (tmp_path / "map.npz").touch()
+    with pytest.raises(MapError, match="alone has a database"):
+        read_map_file(tmp_path / "map.npz", "map", tmp_path / "database.db")
+    with pytest.raises(MapError, match=r"maps are written to files ending in .npz, .ply"):
+        write_map_file(tmp_path / "map.pcd", landmarks(None, None))
+    write_map_file(tmp_path / "map.npz", landmarks("signed", None))
+    with pytest.raises(MapError, match="has no name"):
+        read_map_file(tmp_path / "map.npz", "")
+
+
+def test_what_is_not_finite_is_dropped_and_counted() -> None:
+    points, floats = np.zeros((4, 3)), np.zeros((4, 2))
+    points[1, 2], floats[3, 0] = np.nan, np.inf
+    found = make_map(points, np.arange(4), floats, "map")
+    assert found.ids is not None
+    assert (found.ids.tolist(), found.dropped) == ([0, 2], 2)
+
+
+def test_a_long_descriptor_does_not_fit_into_ply(tmp_path: Path) -> None:
+    wide = Map(np.zeros((1, 3)), None, np.zeros((1, 2**16), np.uint8), "map")
+    with pytest.raises(MapError, match="65536 values does not fit"):
+        write_map_file(tmp_path / "map.ply", wide)

@@ -1,0 +1,193 @@
+"""The frames of a recording: the same numbers as tf2, and what cannot be answered is said."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from rs_localizer.io.transforms.rigid import TransformError, from_numbers
+from rs_localizer.io.transforms.tree import TransformTree
+
+Numbers = tuple[float, ...]
+HALF_TURN = (0.0, 0.0, 1.0, 0.0)
+NO_TURN = (0.0, 0.0, 0.0, 1.0)
+
+
+def tf(parent: str, child: str, t: Numbers, q: Numbers, stamp_ns: int = 0) -> SimpleNamespace:
+    """A TFMessage of one transform."""
+    stamped = SimpleNamespace(
+        header=SimpleNamespace(
+            stamp=SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9),
+            frame_id=parent,
+        ),
+        child_frame_id=child,
+        transform=SimpleNamespace(
+            translation=SimpleNamespace(**dict(zip("xyz", t, strict=True))),
+            rotation=SimpleNamespace(**dict(zip("xyzw", q, strict=True))),
+        ),
+    )
+    return SimpleNamespace(transforms=[stamped])
+
+
+@pytest.fixture
+def tree() -> TransformTree:
+    tree = TransformTree()
+    for parent, child, t, q in (
+        ("base", "mast", (0.4, 0.3, 0.9), (0.1, -0.2, 0.3, 0.927361849549570)),
+        ("mast", "camera", (0.0, 0.1, 0.25), (-0.5, 0.5, -0.5, 0.5)),
+        ("/base", "/lidar", (-0.2, 0.0, 1.3), (0.9, 0.1, -0.4, -0.141421356237309)),
+    ):
+        tree.add(tf(parent, child, t, q), static=True)
+    for t, q, stamp_ns in (
+        ((1.1, 2.1, 0.1), (0.0, 0.1, -0.6, -0.793725393319377), 1_033_333_333),
+        ((1.0, 2.0, 0.1), (0.0, 0.0, 0.6, 0.8), 1_000_000_000),
+    ):
+        tree.add(tf("odom", "base", t, q, stamp_ns), static=False)
+    return tree
+
+
+# What tf2_ros.Buffer of geometry2 (branch jazzy, compiled by g++ 12 on x86-64) answers for the tree
+# above: translation x y z, rotation x y z w.
+OF_TF2 = [
+    ("base", "camera", None,
+     ("0x1.0ceccf10c8f41p-2 0x1.36eb486353472p-2 0x1.21ad1468c1667p+0 "
+     "-0x1.dacf2c1ebf387p-2 0x1.0e025f51f26b9p-2 "
+     "-0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1")),
+    ("camera", "base", None,
+     ("0x1.4869ed381bd5cp-3 0x1.b01e32b5a6d3ep-1 -0x1.ad73f814b3092p-1 "
+     "0x1.dacf2c1ebf387p-2 -0x1.0e025f51f26b9p-2 "
+     "0x1.7468c5b858d1fp-2 0x1.87012fa8f935dp-1")),
+    ("lidar", "camera", None,
+     ("0x1.058f26dd8371ap-1 -0x1.95c243c5db8c6p-3 -0x1.7b9ed7defea10p-3 "
+     "0x1.61b62338b334cp-1 0x1.40bd30c22726cp-1 "
+     "-0x1.2bec9be4333f4p-4 0x1.69f4de5ba11bep-2")),
+    ("odom", "camera", 1012345678,
+     ("0x1.80895f396d818p-1 0x1.295b1a30633a5p+1 0x1.3aff8e8fc4167p+0 "
+     "-0x1.07c9073ebeb0dp-1 -0x1.8a5ebbfb2411dp-4 "
+     "0x1.357831c718c02p-3 0x1.ad1f2ce418002p-1")),
+    ("camera", "odom", 1000000000,
+     ("-0x1.771824254abc0p+0 0x1.7d056681c9c84p-2 -0x1.26d2a236d665ep+1 "
+     "0x1.0eed2e3e7b9d5p-1 0x1.138338dd2995dp-4 "
+     "-0x1.568e693b6197dp-3 0x1.a886c7d81536dp-1")),
+    ("odom", "base", None,
+     ("0x1.199999999999ap+0 0x1.0cccccccccccdp+1 0x1.999999999999ap-4 "
+     "0x0.0p+0 -0x1.999999999999cp-4 "
+     "0x1.3333333333334p-1 0x1.96632cbc9f77ep-1")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("target", "source", "stamp_ns", "text"), OF_TF2)
+def test_the_same_as_tf2(
+    tree: TransformTree, target: str, source: str, stamp_ns: int | None, text: str
+) -> None:
+    x, y, z, *quaternion = map(float.fromhex, text.split())
+    expected = from_numbers((x, y, z), tuple(quaternion))
+    found = tree.lookup(target, source, stamp_ns)
+    # Between samples there are sines, which each C library rounds in its own way.
+    tolerance = 1e-15 if stamp_ns == 1_012_345_678 else 0.0
+    assert np.allclose(found.translation, expected.translation, rtol=0.0, atol=tolerance)
+    assert np.allclose(found.rotation, expected.rotation, rtol=0.0, atol=tolerance)
+
+
+def test_between_two_samples(tree: TransformTree) -> None:
+    # By scipy: positions on a line, rotations by slerp, the shorter way round.
+    found = tree.lookup("odom", "base", 1_012_345_678)
+    share = 0.012345678 / 0.033333333
+    quaternions = [(0.0, 0.0, 0.6, 0.8), (0.0, 0.1, -0.6, -0.793725393319377)]
+    slerp = Slerp([0.0, 1.0], Rotation.from_quat(quaternions))
+    assert np.allclose(found.rotation, slerp(share).as_matrix(), atol=1e-12)
+    assert np.allclose(found.translation, [1.0 + 0.1 * share, 2.0 + 0.1 * share, 0.1], atol=1e-12)
+
+
+def test_there_and_back(tree: TransformTree) -> None:
+    there = tree.lookup("lidar", "camera", 1_020_000_000)
+    back = tree.lookup("camera", "lidar", 1_020_000_000)
+    assert np.allclose((there @ back).rotation, np.eye(3), atol=1e-12)
+    assert np.allclose((there @ back).translation, 0.0, atol=1e-12)
+    with_slashes = tree.lookup("/lidar", "/camera", 1_020_000_000)
+    assert np.array_equal(with_slashes.rotation, there.rotation)
+    nothing = tree.lookup("camera", "/camera", 7)
+    assert np.array_equal(nothing.rotation, np.eye(3))
+
+
+def test_what_moves(tree: TransformTree) -> None:
+    assert not tree.moves("base", "camera")
+    assert not tree.moves("lidar", "camera")  # through the base, which moves with both
+    assert tree.moves("odom", "camera")
+    assert not tree.moves("camera", "camera")
+    # Static by the last word on it.
+    tree.add(tf("odom", "base", (0.0, 0.0, 0.0), NO_TURN), static=True)
+    assert not tree.moves("odom", "camera")
+    assert tree.lookup("odom", "base", 5).translation.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("target", "source", "stamp_ns", "text"),
+    [
+        ("nowhere", "camera", None, "frame 'nowhere' does not exist; there are base, camera, isl"),
+        ("camera", "", None, "frame '' does not exist"),
+        ("island", "camera", None, "'island' and 'camera' are not connected"),
+        ("island", "camera", 5, "frame 'base' is known from 1.000 s to 1.033 s, not at 0.000 s"),
+        ("odom", "camera", 2 * 10**9, "is known from 1.000 s to 1.033 s, not at 2.000 s"),
+        ("camera", "odom", 10**9 - 1, "frame 'base' is known from 1.000 s to 1.033 s"),
+        ("island", "palm", 6 * 10**9, "frame 'palm' is known from 5.000 s to 5.000 s, not at 6"),
+    ],
+)
+def test_what_cannot_be_answered(
+    tree: TransformTree, target: str, source: str, stamp_ns: int | None, text: str
+) -> None:
+    tree.add(tf("island", "palm", (0.0, 0.0, 3.0), NO_TURN, 5 * 10**9), static=False)
+    with pytest.raises(TransformError, match=text):
+        tree.lookup(target, source, stamp_ns)
+
+
+def test_an_unknown_time_above_does_no_harm_below(tree: TransformTree) -> None:
+    assert tree.lookup("base", "camera", 99 * 10**9).translation[2] == pytest.approx(
+        1.1316, abs=1e-4
+    )
+
+
+def test_a_frame_that_changes_its_parent(tree: TransformTree) -> None:
+    for stamp, parent in enumerate(("camera", "camera", "lidar", "lidar")):
+        shift = (float(stamp), 0.0, 0.0)
+        tree.add(tf(parent, "cup", shift, NO_TURN, (stamp + 1) * 10**9), static=False)
+    assert tree.lookup("camera", "cup", 1_500_000_000).translation.tolist() == [0.5, 0.0, 0.0]
+    # Between two parents it stays with the older one, where it was.
+    assert tree.lookup("camera", "cup", 2_500_000_000).translation.tolist() == [1.0, 0.0, 0.0]
+    assert tree.lookup("lidar", "cup", None).translation.tolist() == [3.0, 0.0, 0.0]
+
+
+def test_loops_end() -> None:
+    tree = TransformTree()
+    for parent, child in (("a", "b"), ("b", "c"), ("c", "a")):
+        tree.add(tf(parent, child, (1.0, 0.0, 0.0), NO_TURN), static=True)
+    tree.add(tf("d", "e", (0.0, 0.0, 0.0), NO_TURN), static=True)
+    for stamp_ns in (None, 5):
+        with pytest.raises(TransformError, match="loop"):
+            tree.lookup("e", "a", stamp_ns)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        tf("a", "b", (float("nan"), 0.0, 0.0), NO_TURN),
+        tf("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)),
+        tf("a", "b", (0.0, 0.0, 0.0), (float("nan"), 0.0, 0.0, 1.0)),
+        tf("a", "b", (0.0, 0.0, 0.0), (0.0, 0.0, 0.1, 1.1)),
+        tf("", "b", (0.0, 0.0, 0.0), NO_TURN),
+        tf("a", "", (0.0, 0.0, 0.0), NO_TURN),
+        tf("b", "/b", (0.0, 0.0, 0.0), NO_TURN),
+    ],
+)
+def test_garbage_is_left_out(wrong: Any) -> None:
+    tree = TransformTree()
+    tree.add(wrong, static=True)
+    with pytest.raises(TransformError, match="there are none"):
+        tree.lookup("a", "b", None)
+    tree.add(tf("a", "b", (0.0, 0.0, 1.0), HALF_TURN), static=True)
+    tree.add(wrong, static=True)
+    assert tree.lookup("a", "b", None).translation.tolist() == [0.0, 0.0, 1.0]

@@ -1,0 +1,480 @@
+"""Every published quantity of a body that carries a camera, against a hand-written chain of frames.
+
+The chain is of 4x4 matrices, from the map to the body; velocities are differences of it, and
+covariances come from differences of it and from a Monte Carlo simulation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rs_localizer.pipeline.frames
+from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.types import Estimate
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.outputs import Frame, Pose, Twist, messages
+from rs_localizer.io.transforms.rigid import Transform, TransformError, read_transform
+from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
+from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
+from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+
+Make = Callable[..., SimpleNamespace]
+READOUT_TIME = 0.03
+STAMP_NS = 5_000_000_000
+# Axes of the optical frame (right, down, forward) in a body's (forward, left, up): REP-103.
+OPTICAL = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+
+
+def matrix(translation: Any, rotation: Any) -> Array:
+    result = np.eye(4)
+    result[:3, 3], result[:3, :3] = translation, rotation
+    return result
+
+
+def turned(axis: str, degrees: float) -> Array:
+    result: Array = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    return result
+
+
+# A mast to the front left, tilted; on it a camera that looks to the left and a little down.
+BASE_FROM_MAST = matrix([0.4, 0.3, 0.9], turned("y", 5.0))
+MAST_FROM_CAMERA_LINK = matrix([0.0, 0.1, 0.25], turned("z", 90.0) @ turned("y", 12.0))
+CAMERA_LINK_FROM_CAMERA = matrix([0.01, 0.02, 0.0], OPTICAL)
+CAMERA_FROM_BASE = np.linalg.inv(BASE_FROM_MAST @ MAST_FROM_CAMERA_LINK @ CAMERA_LINK_FROM_CAMERA)
+
+
+def tf(parent: str, child: str, pose: Array, seconds: float = 0.0) -> SimpleNamespace:
+    """A TFMessage with one transform, written from its definition."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    px, py, pz = pose[:3, 3].tolist()
+    stamp = round(seconds * 1e9)
+    stamped = SimpleNamespace(
+        header=SimpleNamespace(
+            stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id=parent
+        ),
+        child_frame_id=child,
+        transform=SimpleNamespace(
+            translation=SimpleNamespace(x=px, y=py, z=pz),
+            rotation=SimpleNamespace(x=x, y=y, z=z, w=w),
+        ),
+    )
+    return SimpleNamespace(transforms=[stamped])
+
+
+@pytest.fixture
+def robot() -> TransformTree:
+    tree = TransformTree()
+    tree.add(tf("base_link", "mast", BASE_FROM_MAST), static=True)
+    tree.add(tf("mast", "camera_link", MAST_FROM_CAMERA_LINK), static=True)
+    tree.add(tf("camera_link", "camera", CAMERA_LINK_FROM_CAMERA), static=True)
+    return tree
+
+
+def estimate() -> Estimate:
+    rng = np.random.default_rng(0)
+    deviations = np.repeat([0.003, 0.01, 0.02, 0.05, 0.01, 0.02], 3)
+    root = rng.normal(size=(18, 18)) * deviations[:, None]
+    return Estimate(
+        rotation=Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(),
+        translation=np.array([0.1, -0.2, 2.0]),
+        angular_velocity=np.array([0.05, -0.1, 0.2]),
+        linear_velocity=np.array([0.02, 0.05, -0.01]),
+        inliers=np.ones(8, dtype=bool),
+        residuals=np.ones(8),
+        joint_covariance=root @ root.T,
+        global_shutter_inliers=4,
+        iterations=10,
+    )
+
+
+def disturbed(motion: Motion, error: Array) -> Motion:
+    """The motion with errors in the order of ``Estimate.covariance``, by its definition."""
+    phi, rho, d_omega, d_v, d_alpha, d_a = error.reshape(6, 3)
+    map_from_camera = motion.rotation.T
+    centre = -map_from_camera @ motion.translation + map_from_camera @ rho
+    rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
+    return Motion(
+        rotation,
+        -rotation @ centre,
+        motion.angular_velocity + d_omega,
+        motion.linear_velocity + d_v,
+        angular_acceleration=motion.angular_acceleration + d_alpha,
+        linear_acceleration=motion.linear_acceleration + d_a,
+    )
+
+
+class Chain:
+    """Map to body as a function of time: the truth."""
+
+    def __init__(self, motion: Motion, middle: float) -> None:
+        self.motion = motion
+        self.middle = middle  # s: when the middle row is exposed
+
+    def camera_from_base(self, seconds: float) -> Array:
+        return CAMERA_FROM_BASE
+
+    def map_from_base(self, motion: Motion, seconds: float) -> Array:
+        rotation, translation = motion.at((seconds - self.middle) / READOUT_TIME)
+        map_from_camera = np.linalg.inv(matrix(translation, rotation))
+        result: Array = map_from_camera @ self.camera_from_base(seconds)
+        return result
+
+    def twist(self, motion: Motion, seconds: float) -> Array:
+        """Linear and angular velocity in body axes: the derivative of the body's pose."""
+        step = 1e-5
+        now = self.map_from_base(motion, seconds)
+        before = self.map_from_base(motion, seconds - step)
+        after = self.map_from_base(motion, seconds + step)
+        linear = now[:3, :3].T @ (after - before)[:3, 3] / (2 * step)
+        angular = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec() / (2 * step)
+        return np.concatenate([linear, angular])
+
+    def pose_error(self, seconds: float, error: Array) -> Array:
+        """Displacement, and rotation about the fixed axes of the map."""
+        right = self.map_from_base(self.motion, seconds)
+        wrong = self.map_from_base(disturbed(self.motion, error), seconds)
+        about = Rotation.from_matrix(wrong[:3, :3] @ right[:3, :3].T).as_rotvec()
+        return np.concatenate([(wrong - right)[:3, 3], about])
+
+    def twist_error(self, seconds: float, error: Array) -> Array:
+        wrong = self.twist(disturbed(self.motion, error), seconds)
+        return wrong - self.twist(self.motion, seconds)
+
+
+class Panning(Chain):
+    """The mast turns by the hour hand's way, at half a radian per second."""
+
+    RATE = -0.5
+
+    def base_from_mast(self, seconds: float) -> Array:
+        turn = Rotation.from_rotvec([0.0, 0.0, self.RATE * seconds]).as_matrix()
+        return matrix([0.4, 0.3, 0.9], turn @ turned("y", 5.0))
+
+    def camera_from_base(self, seconds: float) -> Array:
+        chain = self.base_from_mast(seconds) @ MAST_FROM_CAMERA_LINK @ CAMERA_LINK_FROM_CAMERA
+        return np.linalg.inv(chain)
+
+
+class KnowsTheMotion:
+    """Stands in for the localizer."""
+
+    def __init__(self, camera: Camera, config: LocalizerConfig) -> None:
+        self.camera, self.config = camera, config
+
+    def localize(self, *given: Any, **more: Any) -> Estimate:
+        return estimate()
+
+
+@pytest.fixture(autouse=True)
+def known_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", KnowsTheMotion)
+
+
+@pytest.fixture
+def localize(
+    make_cloud_message: Make, make_camera_info: Make
+) -> Callable[..., tuple[Frame | Refusal, NodeConfig]]:
+    fields = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]
+
+    def run(
+        transforms: Any, stamp: tuple[int, int] = (5, 0), roi: Any = None, **settings: Any
+    ) -> tuple[Frame | Refusal, NodeConfig]:
+        config = NodeConfig(
+            **({"readout_time": READOUT_TIME, "base_frame": "base_link"} | settings)
+        )
+        frames = FrameLocalizer(config, transforms=transforms)
+        frames.take_camera_info(make_camera_info(**({} if roi is None else {"roi": roi})))
+        rows = [[1.0, 2.0, 3.0, 100.0, 200.0]] * 8
+        return frames.localize(make_cloud_message(rows, fields, point_step=40, stamp=stamp)), config
+
+    return run
+
+
+def localized(result: tuple[Frame | Refusal, NodeConfig]) -> Frame:
+    assert result[0], result[0]
+    return result[0]
+
+
+def covariance(function: Callable[[Array], Array], of: Array, step: float) -> Array:
+    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(18)]
+    jacobian = np.array(columns).T
+    result: Array = jacobian @ of @ jacobian.T
+    return result
+
+
+@pytest.mark.parametrize("direction", list(ScanDirection))
+@pytest.mark.parametrize("pose_time", list(PoseTime))
+def test_every_quantity(
+    localize: Any, robot: TransformTree, pose_time: str, direction: str
+) -> None:
+    # Of a region of the sensor (x 40 to 359, y 100 to 399), the stamp is that of its first line.
+    lines = {
+        "top_to_bottom": (239.5 - 100) / 479,
+        "bottom_to_top": (399 - 239.5) / 479,
+        "left_to_right": (319.5 - 40) / 639,
+        "right_to_left": (359 - 319.5) / 639,
+    }[direction]
+    truth = Chain(estimate(), middle=5.0 + 0.004 + READOUT_TIME * lines)
+    # Odometry that has drifted: where it believes the robot at a time, from a motion of its own.
+    drift = matrix([3.0, -1.0, 0.2], Rotation.from_rotvec([0.05, -0.02, 0.7]).as_matrix())
+    for index in range(16):
+        seconds = 4.99 + 0.0041 * index
+        odom_from_base = np.linalg.inv(drift) @ truth.map_from_base(truth.motion, seconds)
+        robot.add(tf("odom", "base_link", odom_from_base, seconds), static=False)
+    settings = {
+        "stamp_offset": 0.004,
+        "scan_direction": direction,
+        "pose_time": pose_time,
+        "roi": SimpleNamespace(x_offset=40, y_offset=100, width=320, height=300),
+    }
+    result = localize(robot, **settings, publish_tf="map_to_odom")
+    frame = localized(result)
+
+    published = truth.middle if pose_time == PoseTime.MID_FRAME else 5.0
+    assert abs(frame.stamp_ns - published * 1e9) <= 1.0
+    published = frame.stamp_ns * 1e-9
+    pose, twist = truth.map_from_base(truth.motion, published), truth.twist(truth.motion, published)
+    assert frame.twist is not None
+    assert np.allclose(frame.pose.position, pose[:3, 3], atol=1e-12)
+    assert np.allclose(frame.pose.rotation, pose[:3, :3], atol=1e-12)
+    assert np.allclose([*frame.twist.linear, *frame.twist.angular], twist, atol=2e-6)
+    expected = covariance(
+        lambda error: truth.pose_error(published, error), estimate().joint_covariance, 1e-5
+    )
+    assert np.allclose(frame.pose.covariance, expected, rtol=1e-6, atol=1e-9)
+    expected = covariance(
+        lambda error: truth.twist_error(published, error), estimate().joint_covariance, 1e-3
+    )
+    assert np.allclose(frame.twist.covariance, expected, atol=1e-5 * np.abs(expected).max())
+
+    made = messages(frame, make_message)
+    for name, message in made.items():
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        assert stamp == (STAMP_NS if name == "inliers" else frame.stamp_ns)
+        in_base = name in ("twist", "twist_with_covariance")
+        assert message.header.frame_id == ("base_link" if in_base else "map")
+    odometry = made["odometry"]
+    assert odometry.child_frame_id == "base_link"
+    position, linear = odometry.pose.pose.position, odometry.twist.twist.linear
+    assert np.allclose([position.x, position.y, position.z], pose[:3, 3], atol=1e-12)
+    assert np.allclose([linear.x, linear.y, linear.z], twist[:3], atol=2e-6)
+    assert np.array_equal(odometry.pose.covariance.reshape(6, 6), frame.pose.covariance)
+    assert np.array_equal(odometry.twist.covariance.reshape(6, 6), frame.twist.covariance)
+
+    # TF: the drift is what the localizer finds. Odometry between its samples is interpolated.
+    correction = broadcast(*result, robot)
+    assert (correction.parent, correction.child) == ("map", "odom")
+    assert correction.stamp_ns == frame.stamp_ns + 200_000_000
+    assert np.allclose(as_matrix(correction), drift, atol=2e-4)
+    interpolated = robot.lookup("odom", "base_link", frame.stamp_ns)
+    chain = as_matrix(correction) @ matrix(interpolated.translation, interpolated.rotation)
+    assert np.allclose(chain, pose, atol=1e-12)
+    frame, config = localize(robot, **settings, publish_tf="map_to_camera")
+    direct = broadcast(frame, config, robot)
+    assert (direct.parent, direct.child) == ("map", "base_link")
+    assert direct.stamp_ns == frame.stamp_ns
+    assert np.allclose(as_matrix(direct), pose, atol=1e-12)
+
+
+def as_matrix(item: Broadcast) -> Array:
+    return matrix(item.parent_from_child.translation, item.parent_from_child.rotation)
+
+
+def test_covariances_cover_what_is_published(localize: Any, robot: TransformTree) -> None:
+    # No derivative at all: the scatter of poses and twists of many disturbed motions.
+    frame = localized(localize(robot))
+    truth = Chain(estimate(), middle=5.0 + 0.5 * READOUT_TIME)
+    errors = np.random.default_rng(3).multivariate_normal(
+        np.zeros(18), 0.01 * estimate().joint_covariance, size=3000
+    )
+    assert frame.twist is not None
+    for function, found in (
+        (truth.pose_error, 0.01 * frame.pose.covariance),
+        (truth.twist_error, 0.01 * frame.twist.covariance),
+    ):
+        scatter = np.array([function(5.0, error) for error in errors])
+        squares = np.einsum("ni,ij,nj->n", scatter, np.linalg.inv(found), scatter)
+        # Chi-square of six degrees of freedom: mean 6, and 5 % beyond 12.59.
+        assert np.mean(squares) == pytest.approx(6.0, abs=0.3)
+        assert np.mean(squares > 12.59) == pytest.approx(0.05, abs=0.016)
+        assert np.array_equal(found, found.T)
+
+
+@pytest.mark.parametrize("pose_time", list(PoseTime))
+def test_a_camera_on_a_moving_head(localize: Any, robot: TransformTree, pose_time: str) -> None:
+    truth = Panning(estimate(), middle=5.0 + 0.5 * READOUT_TIME)
+    for index in range(-5, 30):
+        seconds = 5.0 + 0.005 * index
+        robot.add(tf("base_link", "mast", truth.base_from_mast(seconds), seconds), static=False)
+    frame = localized(localize(robot, pose_time=pose_time))
+    published = truth.middle if pose_time == PoseTime.MID_FRAME else 5.0
+    pose, twist = truth.map_from_base(truth.motion, published), truth.twist(truth.motion, published)
+    assert frame.twist is not None
+    assert np.allclose(frame.pose.position, pose[:3, 3], atol=1e-9)
+    assert np.allclose(frame.pose.rotation, pose[:3, :3], atol=1e-9)
+    # The head's velocity is a difference over one readout: exact to second order in its turn.
+    assert np.allclose([*frame.twist.linear, *frame.twist.angular], twist, atol=1e-4)
+    still = Chain(estimate(), truth.middle).twist(truth.motion, published)
+    assert np.abs(twist - still).max() > 0.1  # the head's turn does count
+    # A time without samples on both sides has no velocity: better no frame than a wrong one.
+    refused, _ = localize(robot, stamp=(5, 140_000_000))
+    assert isinstance(refused, Refusal)
+    assert refused.reason == "no_transform"
+    assert "'mast' is known from 4.975 s to 5.145 s, not at 5.155 s" in refused.detail
+
+
+def test_laws() -> None:
+    rng = np.random.default_rng(5)
+
+    def transform() -> Transform:
+        return Transform(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+
+    def mounted(pose: Pose, twist: Twist, by: Transform) -> tuple[Pose, Twist]:
+        tree = TransformTree()
+        tree.add(tf("a", "b", matrix(by.translation, by.rotation)), static=True)
+        mounting = find_mounting(tree, "a", "b", None, 0)
+        return base_pose(pose, mounting), base_twist(twist, mounting)
+
+    def same(a: Any, b: Any) -> bool:
+        return all(
+            np.allclose(getattr(a, item.name), getattr(b, item.name), atol=1e-12)
+            for item in dataclasses.fields(a)
+        )
+
+    root = rng.normal(size=(6, 6))
+    pose = Pose(rng.normal(size=3), transform().rotation, root @ root.T)
+    twist = Twist(rng.normal(size=3), rng.normal(size=3), root.T @ root)
+    assert same(mounted(pose, twist, Transform(np.eye(3), np.zeros(3)))[0], pose)
+    first, second = transform(), transform()
+    there = mounted(pose, twist, first)
+    at_once, one_by_one = mounted(pose, twist, first @ second), mounted(*there, second)
+    back = mounted(*there, first.inverse())
+    for index, original in enumerate((pose, twist)):
+        assert same(at_once[index], one_by_one[index])
+        assert same(back[index], original)
+        assert not same(there[index], original)
+
+
+def test_the_twist_is_the_screw_of_the_motion() -> None:
+    # expm of the body's twist is the motion of the body: another way to the same velocities.
+    twist = Twist(np.array([0.3, -0.1, 0.2]), np.array([0.4, 0.5, -0.6]), np.eye(6))
+    by = Transform(turned("x", 40.0), np.array([0.2, -0.3, 0.5]))
+    tree = TransformTree()
+    tree.add(tf("camera", "base", matrix(by.translation, by.rotation)), static=True)
+    found = base_twist(twist, find_mounting(tree, "camera", "base", None, 0))
+
+    def screw(linear: Array, angular: Array) -> Array:
+        result = np.zeros((4, 4))
+        result[:3, 3] = linear
+        result[:3, :3] = logm(Rotation.from_rotvec(angular).as_matrix())
+        return result
+
+    mounting = matrix(by.translation, by.rotation)
+    expected = np.linalg.inv(mounting) @ expm(screw(twist.linear, twist.angular)) @ mounting
+    assert np.allclose(expm(screw(found.linear, found.angular)), expected, atol=1e-12)
+
+
+def test_a_missing_transform_refuses_the_frame_only(localize: Any) -> None:
+    tree = TransformTree()
+    refused, _ = localize(tree)
+    assert refused == Refusal(
+        "no_transform",
+        "from the camera 'camera' to base_frame 'base_link': "
+        "frame 'camera' does not exist; there are none",
+    )
+    tree.add(tf("base_link", "mast", BASE_FROM_MAST), static=True)
+    tree.add(tf("head", "camera", np.eye(4)), static=True)
+    refused, _ = localize(tree)
+    assert "'camera' and 'base_link' are not connected" in refused.detail
+    # The next frame finds what has come meanwhile, and what has changed.
+    for offset in (0.0, 0.5):
+        tree.add(tf("mast", "head", matrix([offset, 0.0, 0.0], np.eye(3))), static=True)
+        frame = localized(localize(tree))
+        chain = Chain(estimate(), 5.0 + 0.5 * READOUT_TIME)
+        chain.camera_from_base = lambda _, offset=offset: np.linalg.inv(
+            BASE_FROM_MAST @ matrix([offset, 0.0, 0.0], np.eye(3))
+        )
+        expected = chain.map_from_base(estimate(), 5.0)
+        assert np.allclose(frame.pose.position, expected[:3, 3], atol=1e-12)
+
+
+def test_without_a_base_frame_nothing_is_looked_up(localize: Any) -> None:
+    for name in ("", "camera"):
+        frame = localized(localize(None, base_frame=name))
+        assert frame.body_frame == "camera"
+    frame, config = localize(None, base_frame="", publish_tf="map_to_camera")
+    direct = broadcast(frame, config, TransformTree())
+    assert (direct.parent, direct.child) == ("map", "camera")
+    assert np.allclose(direct.parent_from_child.translation, frame.pose.position)
+    assert broadcast(frame, NodeConfig(), TransformTree()) is None
+
+
+def test_odometry_straight_to_the_camera(localize: Any, robot: TransformTree) -> None:
+    robot.add(
+        tf("odom", "base_link", matrix([1.0, 2.0, 0.0], turned("z", 30.0)), 5.0), static=False
+    )
+    results = [localize(robot, base_frame=n, publish_tf="map_to_odom") for n in ("", "base_link")]
+    corrections = [broadcast(frame, config, robot) for frame, config in results]
+    assert np.allclose(*map(as_matrix, corrections), atol=1e-12)
+
+
+def test_odometry_that_is_missing_costs_no_pose(localize: Any, robot: TransformTree) -> None:
+    frame, config = localize(robot, publish_tf="map_to_odom")
+    assert frame
+    with pytest.raises(TransformError, match="frame 'odom' does not exist; there are base_link"):
+        broadcast(frame, config, robot)
+
+
+@pytest.mark.parametrize("pose_time", list(PoseTime))
+def test_a_stamp_of_zero(localize: Any, robot: TransformTree, pose_time: str) -> None:
+    # The mounting is the latest, the pose goes out, and TF, which needs a time, gets nothing.
+    robot.add(tf("base_link", "mast", matrix([9.0, 0.0, 0.0], np.eye(3)), 7.0), static=False)
+    robot.add(tf("base_link", "mast", BASE_FROM_MAST, 8.0), static=False)
+    expected = localized(localize(robot, stamp=(8, 0), readout_time=0.0))
+    settings = {"readout_time": 0.0, "pose_time": pose_time, "stamp_offset": -0.01}
+    frame, config = localize(robot, stamp=(0, 0), publish_tf="map_to_camera", **settings)
+    if pose_time == PoseTime.STAMP:
+        assert np.allclose(frame.pose.position, expected.pose.position, atol=1e-12)
+    assert frame.stamp_ns == (0 if pose_time == PoseTime.STAMP else -10_000_000)
+    with pytest.raises(TransformError, match=r"header.stamp of the input is zero"):
+        broadcast(frame, config, robot)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"base_frame": "/base_link"}, "base_frame must not start with '/'"),
+        ({"odom_frame": "/odom"}, "odom_frame must not start with '/'"),
+        ({"odom_frame": ""}, "odom_frame must not be empty"),
+        ({"base_frame": "odom"}, "base_frame and odom_frame are both 'odom'"),
+        ({"publish_tf": "map_to_base"}, "none, map_to_camera, map_to_odom; got 'map_to_base'"),
+        ({"transform_tolerance": -0.1}, "transform_tolerance must lie between 0.0 and 10.0"),
+    ],
+)
+def test_settings_that_make_no_sense(settings: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        NodeConfig(**settings)
+
+
+def test_transforms_that_are_none() -> None:
+    good = tf("a", "b", BASE_FROM_MAST).transforms[0].transform
+    read = read_transform(good)
+    assert np.allclose(matrix(read.translation, read.rotation), BASE_FROM_MAST, atol=1e-15)
+    good.rotation.w = float("nan")
+    with pytest.raises(TransformError, match="no rotation"):
+        read_transform(good)
+    good.rotation.w, good.translation.x = 1.0, float("inf")
+    with pytest.raises(TransformError, match="not finite"):
+        read_transform(good)

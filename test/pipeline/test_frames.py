@@ -1,0 +1,363 @@
+"""From message to pose: refusals and their reasons, times, changes of camera and settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rs_localizer.pipeline.frames
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Frame
+from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import ConstantVelocity
+from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+
+Make = Callable[..., SimpleNamespace]
+
+FIELDS = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]
+READOUT_TIME = 0.03
+MOTION = Motion(
+    rotation=Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(),
+    translation=np.array([0.1, -0.2, 2.0]),
+    angular_velocity=np.array([0.05, -0.1, 0.2]),
+    linear_velocity=np.array([0.02, 0.05, -0.01]),
+)
+
+
+class MockLocalizer:
+    """Knows one motion, keeps every second point, and remembers how it was made."""
+
+    made: list[MockLocalizer]
+
+    def __init__(self, camera: Camera, config: LocalizerConfig) -> None:
+        if config.solver == "r9p":
+            raise ValueError("nine are too many")
+        self.camera, self.config = camera, config
+        self.priors: list[Prior | None] = []
+        MockLocalizer.made.append(self)
+
+    def warm_up(self) -> None:
+        pass
+
+    def localize(
+        self,
+        points: Array,
+        pixels: Array,
+        scores: Array | None = None,
+        prior: Prior | None = None,
+        expected_share: float = 0.5,
+    ) -> Estimate | Failure:
+        self.priors.append(prior)
+        if len(points) < 4:
+            return Failure(Reason.TOO_FEW_POINTS, f"{len(points)} points")
+        return Estimate(
+            rotation=MOTION.rotation,
+            translation=MOTION.translation,
+            angular_velocity=MOTION.angular_velocity,
+            linear_velocity=MOTION.linear_velocity,
+            inliers=np.arange(len(points)) % 2 == 0,
+            residuals=pixels[:, 0] - 100.0,
+            joint_covariance=np.eye(18),
+            global_shutter_inliers=4,
+            iterations=10,
+        )
+
+
+@pytest.fixture
+def mock(monkeypatch: pytest.MonkeyPatch) -> type[MockLocalizer]:
+    MockLocalizer.made = []
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", MockLocalizer)
+    return MockLocalizer
+
+
+@pytest.fixture
+def cloud(make_cloud_message: Make) -> SimpleNamespace:
+    rows = [[i, i, i, 100.0 + i, 200.0] for i in range(8)]
+    return make_cloud_message(rows, FIELDS, point_step=40, stamp=(5, 0))
+
+
+def localized(result: Frame | Refusal) -> Frame:
+    assert result, result
+    return result
+
+
+def refused(result: Frame | Refusal) -> tuple[str, str]:
+    assert isinstance(result, Refusal)
+    assert not result
+    return result.reason, result.detail
+
+
+@pytest.mark.usefixtures("mock")
+def test_reasons_of_refusals(cloud: SimpleNamespace, make_camera_info: Make) -> None:
+    frames = FrameLocalizer(NodeConfig())
+    assert refused(frames.localize(cloud))[0] == "no_camera_info"
+    with pytest.raises(MessageError, match="not calibrated"):
+        frames.take_camera_info(make_camera_info(k=np.zeros(9)))
+    assert refused(frames.localize(cloud))[0] == "no_camera_info"
+    frames.take_camera_info(make_camera_info())
+    assert localized(frames.localize(cloud)).map_frame == "map"
+    cloud.width = 3
+    assert refused(frames.localize(cloud)) == ("too_few_points", "3 points")
+    cloud.width = 0
+    reason, detail = refused(frames.localize(cloud))
+    assert reason == "empty_cloud"
+    assert "width 0" in detail
+    cloud.width = 9
+    reason, detail = refused(frames.localize(cloud))
+    assert reason == "bad_cloud"
+    assert "truncated" in detail
+    # A refused frame leaves no trace.
+    cloud.width = 8
+    assert localized(frames.localize(cloud)).body_frame == "camera"
+
+
+@pytest.mark.usefixtures("mock")
+def test_inliers_are_the_rows_that_were_kept(
+    make_cloud_message: Make, make_camera_info: Make
+) -> None:
+    rows = [[i, i, i, 100.0 + i, 200.0] for i in range(8)]
+    rows[0][1] = rows[3][4] = float("nan")
+    frames = FrameLocalizer(NodeConfig())
+    frames.take_camera_info(make_camera_info())
+    message = make_cloud_message(rows, FIELDS, point_step=40)
+    frame = localized(frames.localize(message))
+    assert frame.dropped == 2
+    # Of 1, 2, 4, 5, 6, 7 every second one.
+    assert frame.inliers["x"].tolist() == [1.0, 4.0, 6.0]
+    assert frame.inliers["residual"].tolist() == [1.0, 4.0, 6.0]
+
+
+@pytest.mark.usefixtures("mock")
+@pytest.mark.parametrize("stamp", [(5, 0), (0, 0)])
+@pytest.mark.parametrize("stamp_offset", [0.0, 0.004, -0.02])
+@pytest.mark.parametrize("pose_time", list(PoseTime))
+@pytest.mark.parametrize("direction", list(ScanDirection))
+@pytest.mark.parametrize("region", [None, (40, 100, 320, 300)])
+def test_pose_and_twist_are_those_of_the_published_time(
+    make_cloud_message: Make,
+    make_camera_info: Make,
+    stamp: tuple[int, int],
+    stamp_offset: float,
+    pose_time: str,
+    direction: str,
+    region: tuple[int, int, int, int] | None,
+) -> None:
+    frames = FrameLocalizer(
+        NodeConfig(
+            readout_time=READOUT_TIME,
+            scan_direction=direction,
+            stamp_offset=stamp_offset,
+            pose_time=pose_time,
+        )
+    )
+    x, y, width, height = region or (0, 0, 0, 0)
+    roi = SimpleNamespace(x_offset=x, y_offset=y, width=width, height=height)
+    frames.take_camera_info(make_camera_info(roi=roi))
+    rows = [[1.0, 2.0, 3.0, 100.0, 200.0]] * 8
+    message = make_cloud_message(rows, FIELDS, point_step=40, stamp=stamp)
+    frame = localized(frames.localize(message))
+
+    # Lines that the shutter passes from the first one that is delivered to the middle of the
+    # sensor, whose exposure is tau = 0.
+    width, height = (width, height) if region else (640, 480)
+    lines = {
+        "top_to_bottom": (239.5 - y) / 479,
+        "bottom_to_top": (y + height - 1 - 239.5) / 479,
+        "left_to_right": (319.5 - x) / 639,
+        "right_to_left": (x + width - 1 - 319.5) / 639,
+    }[direction]
+    middle = stamp[0] + stamp_offset + READOUT_TIME * lines
+    published = frame.stamp_ns * 1e-9
+    if pose_time == PoseTime.STAMP:
+        assert frame.stamp_ns == frame.input_stamp_ns == stamp[0] * 1_000_000_000
+    else:
+        assert published == pytest.approx(middle, abs=1e-9)
+
+    def pose(seconds: float) -> tuple[Array, Array]:
+        rotation, translation = MOTION.at((seconds - middle) / READOUT_TIME)
+        return rotation.T, -rotation.T @ translation
+
+    rotation, position = pose(published)
+    assert np.allclose(frame.pose.rotation, rotation, atol=1e-6)
+    assert np.allclose(frame.pose.position, position, atol=1e-6)
+    step = 1e-5
+    before, after = pose(published - step), pose(published + step)
+    assert frame.twist is not None
+    linear = rotation.T @ (after[1] - before[1]) / (2 * step)
+    angular = Rotation.from_matrix(before[0].T @ after[0]).as_rotvec() / (2 * step)
+    assert np.allclose(frame.twist.linear, linear, atol=1e-5)
+    assert np.allclose(frame.twist.angular, angular, atol=1e-5)
+
+
+@pytest.mark.usefixtures("mock")
+@pytest.mark.parametrize("pose_time", list(PoseTime))
+def test_without_a_readout_time_there_is_a_pose_but_no_twist(
+    cloud: SimpleNamespace, make_camera_info: Make, pose_time: str
+) -> None:
+    frames = FrameLocalizer(NodeConfig(stamp_offset=0.5, pose_time=pose_time))
+    frames.take_camera_info(make_camera_info())
+    frame = localized(frames.localize(cloud))
+    assert frame.twist is None
+    # Row times need no readout time: the stamp is that of the first row.
+    tau, delay = (-0.5, 0) if pose_time == PoseTime.STAMP else (0.0, 500_000_000)
+    assert frame.stamp_ns == 5_000_000_000 + delay
+    rotation, translation = MOTION.at(tau)
+    assert np.allclose(frame.pose.rotation, rotation.T)
+    assert np.allclose(frame.pose.position, -rotation.T @ translation)
+
+
+@pytest.mark.usefixtures("mock")
+def test_a_solver_that_sees_no_motion_gives_no_twist(
+    cloud: SimpleNamespace, make_camera_info: Make
+) -> None:
+    frames = FrameLocalizer(NodeConfig(solver="p3p", readout_time=READOUT_TIME))
+    frames.take_camera_info(make_camera_info())
+    assert localized(frames.localize(cloud)).twist is None
+
+
+def test_a_new_camera_counts_from_the_next_frame_on(
+    cloud: SimpleNamespace, make_camera_info: Make, mock: type[MockLocalizer]
+) -> None:
+    notices: list[tuple[str, str]] = []
+    frames = FrameLocalizer(
+        NodeConfig(readout_time=READOUT_TIME, scan_direction="left_to_right"),
+        lambda *words: notices.append(words),
+    )
+    frames.take_camera_info(make_camera_info())
+    made = len(mock.made)
+    frames.take_camera_info(make_camera_info())  # the same again
+    assert len(mock.made) == made
+    assert notices == []
+    other = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="right_eye")
+    frames.take_camera_info(make_camera_info(header=other, width=320))
+    assert [name for name, _ in notices] == ["camera_changed"]
+    assert "to 'right_eye', 320 x 480" in notices[0][1]
+    assert mock.made[-1].camera.width == 320
+    assert mock.made[-1].camera.readout_time == READOUT_TIME
+    assert mock.made[-1].camera.scan_direction == "left_to_right"
+    assert localized(frames.localize(cloud)).body_frame == "right_eye"
+    with pytest.raises(MessageError):
+        frames.take_camera_info(make_camera_info(height=0))
+    assert localized(frames.localize(cloud)).body_frame == "right_eye"
+
+
+def test_new_settings_count_from_the_next_frame_on(
+    cloud: SimpleNamespace, make_camera_info: Make, mock: type[MockLocalizer]
+) -> None:
+    frames = FrameLocalizer(NodeConfig())
+    frames.take_camera_info(make_camera_info(width=320))
+    assert localized(frames.localize(cloud)).twist is None
+    frames.config = NodeConfig(readout_time=READOUT_TIME, inlier_threshold=5.0)
+    assert mock.made[-1].camera.width == 320
+    assert mock.made[-1].config.inlier_threshold == 5.0
+    assert localized(frames.localize(cloud)).twist is not None
+    with pytest.raises(ValueError, match="nine are too many"):
+        frames.config = NodeConfig(solver="r9p")
+    assert frames.config.inlier_threshold == 5.0
+    assert localized(frames.localize(cloud)).twist is not None
+
+
+def test_a_jump_of_time_and_another_map_start_afresh(
+    mock: type[MockLocalizer], cloud: SimpleNamespace, make_camera_info: Make
+) -> None:
+    notices: list[tuple[str, str]] = []
+    frames = FrameLocalizer(
+        NodeConfig(readout_time=READOUT_TIME), lambda *words: notices.append(words)
+    )
+    frames.take_camera_info(make_camera_info())
+
+    def tracked(second: int, hundredths: int, frame: str = "map") -> bool:
+        """Whether the previous frame helped."""
+        cloud.header.stamp.sec, cloud.header.stamp.nanosec = second, hundredths * 10_000_000
+        cloud.header.frame_id = frame
+        localized(frames.localize(cloud))
+        return mock.made[-1].priors[-1] is not None
+
+    assert [tracked(5, 0), tracked(5, 3), tracked(5, 6)] == [False, True, True]
+    assert notices == []
+    # A recording that starts over.
+    assert [tracked(1, 0), tracked(1, 3)] == [False, True]
+    text = "the stamp 1.000 s lies 4.060 s before the last one; the previous frames are forgotten"
+    assert notices == [("time_went_back", text)]
+    # Another map at the next instant.
+    assert [tracked(1, 6, "cellar"), tracked(1, 9, "cellar")] == [False, True]
+    forgotten = "the previous frames are forgotten"
+    text = f"the points are in frame 'cellar', the last ones were in 'map'; {forgotten}"
+    assert notices[1:] == [("map_changed", text)]
+    frames.reset()  # who asks for it is not told
+    assert not tracked(1, 0, "map")
+    assert len(notices) == 2
+
+
+def test_points_in_the_frame_of_the_camera_are_said(
+    mock: type[MockLocalizer], cloud: SimpleNamespace, make_camera_info: Make
+) -> None:
+    notices: list[tuple[str, str]] = []
+    frames = FrameLocalizer(NodeConfig(), lambda *words: notices.append(words))
+    frames.take_camera_info(make_camera_info())
+    localized(frames.localize(cloud))
+    assert notices == []
+    cloud.header.frame_id = frames.camera_frame  # a header that was copied from the image
+    localized(frames.localize(cloud))
+    assert [name for name, _ in notices] == ["map_changed", "map_is_camera"]
+
+
+def simulated(direction: str, **settings: Any) -> list[tuple[Any, Any]]:
+    """Messages and truth of frames of a fast camera, without noise."""
+    camera = Camera(
+        640,
+        480,
+        np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]]),
+        readout_time=READOUT_TIME,
+        scan_direction=direction,
+    )
+    motion = ConstantVelocity(np.array([1.0, -2.0, 3.0]), np.array([1.0, 0.5, -1.5]), 0.3)
+    world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
+    clean = FrameSettings(points=150, noise=0.0, outliers=0.0)
+    result = []
+    for frame in simulate_frames(camera, motion, world, clean):
+        rows = np.zeros(len(frame.points), [(name, "<f8") for name in "xyzuv"])
+        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
+            rows[name] = column
+        result.append((make_cloud(make_message, frame.stamp_ns, "map", rows), motion))
+    return result
+
+
+@pytest.mark.parametrize("pose_time", list(PoseTime))
+@pytest.mark.parametrize("direction", list(ScanDirection))
+def test_signs_and_frames_against_the_true_motion(
+    make_camera_info: Make, direction: str, pose_time: str
+) -> None:
+    """The real localizer on simulated messages; velocities by differences of true poses."""
+    frames = FrameLocalizer(
+        NodeConfig(readout_time=READOUT_TIME, scan_direction=direction, pose_time=pose_time)
+    )
+    frames.take_camera_info(make_camera_info())
+    for message, motion in simulated(direction)[:4]:
+        frame = localized(frames.localize(message))
+        delay = 0 if pose_time == PoseTime.STAMP else 15_000_000
+        assert frame.stamp_ns == frame.input_stamp_ns + delay
+        step = 1e-4
+        truth = motion.state(frame.stamp_ns, np.array([-step, 0.0, step]))
+        before, now, after = truth.rotations
+        assert np.allclose(frame.pose.rotation, now, atol=1e-9)
+        assert np.allclose(frame.pose.position, truth.positions[1], atol=1e-9)
+        linear = now.T @ (truth.positions[2] - truth.positions[0]) / (2 * step)
+        angular = Rotation.from_matrix(before.T @ after).as_rotvec() / (2 * step)
+        assert frame.twist is not None
+        assert np.allclose(frame.twist.linear, linear, atol=1e-6)
+        assert np.allclose(frame.twist.angular, angular, atol=1e-6)

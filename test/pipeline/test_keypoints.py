@@ -1,0 +1,315 @@
+"""From keypoints to a pose: maps that are late, missing, replaced or unfit, and what is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rs_localizer.pipeline.frames
+
+from rs_localizer.config import Matching, NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.maps.files import write_map_file
+from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Frame
+from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.lab.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import ConstantVelocity
+from rs_localizer.matching import Matcher
+from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+
+READOUT_TIME = 0.03
+POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=4000)
+IDS = np.random.default_rng(1).permutation(100_000)[:4000]
+LANDMARKS = Map(POINTS, IDS, random_descriptors(4000, np.random.default_rng(2)), "map")
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[SimulatedFrame]:
+    camera = Camera(
+        640,
+        480,
+        np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]]),
+        readout_time=READOUT_TIME,
+    )
+    motion = ConstantVelocity(np.array([0.5, -1.0, 1.0]), np.array([0.5, 0.5, -0.5]), 0.4)
+    seen = FrameSettings(points=70, noise=0.5, outliers=0.3)
+    return list(simulate_frames(camera, motion, POINTS, seen))
+
+
+def keypoints(frame: SimulatedFrame, *names: str, landmarks: Map = LANDMARKS) -> Any:
+    rows = keypoint_rows(frame, landmarks, np.random.default_rng(frame.stamp_ns))
+    chosen = rows[["u", "v", *names]]
+    packed = np.empty(len(rows), [(n, rows.dtype[n]) for n in chosen.dtype.names or ()])
+    for name in packed.dtype.names or ():
+        packed[name] = rows[name]
+    return make_cloud(make_message, frame.stamp_ns, "camera", packed)
+
+
+def map_cloud(landmarks: Map) -> Any:
+    return make_cloud(make_message, 0, landmarks.frame, map_rows(landmarks))
+
+
+class Notices(list[tuple[str, str]]):
+    def __call__(self, *words: str) -> None:
+        self.append((words[0], words[1]))
+
+
+def localizer(
+    make_camera_info: Any, notices: Notices | None = None, **settings: Any
+) -> FrameLocalizer:
+    given = NodeConfig(**{"readout_time": READOUT_TIME, **settings})
+    result = FrameLocalizer(given, Notices() if notices is None else notices)
+    result.take_camera_info(make_camera_info())
+    return result
+
+
+def refused(result: Frame | Refusal) -> tuple[str, str]:
+    assert isinstance(result, Refusal), result
+    return result.reason, result.detail
+
+
+def localized(result: Frame | Refusal, truth: SimulatedFrame) -> Frame:
+    assert result, result
+    assert np.allclose(result.pose.position, truth.first_row.positions[0], atol=0.02)
+    return result
+
+
+@pytest.mark.parametrize("tracking", [True, False])
+@pytest.mark.parametrize("names", [("id",), ("descriptor",), ("id", "descriptor")])
+def test_the_true_pose(
+    frames: list[SimulatedFrame], make_camera_info: Any, names: tuple[str, ...], tracking: bool
+) -> None:
+    node = localizer(make_camera_info, tracking=tracking)
+    node.take_map(map_cloud(LANDMARKS))
+    for frame in frames:
+        result = localized(node.localize_keypoints(keypoints(frame, *names)), frame)
+        assert result.map_frame == "map"
+        assert result.body_frame == "camera"
+        good = frame.inliers.sum()
+        assert 0.8 * good < len(result.inliers) <= good + 2
+        # The inliers are rows of the map, with the pixels that came.
+        rows = {int(number): k for k, number in enumerate(IDS)}
+        for inlier in result.inliers[:20]:
+            point = POINTS[rows[int(inlier["id"])]]
+            assert [inlier[name] for name in "xyz"] == point.astype(np.float32).tolist()
+            assert inlier["u"] in frame.pixels[:, 0].astype(np.float32)
+        assert result.estimate.tracked == (tracking and frame is not frames[0])
+
+
+def test_by_id_and_by_correspondences_is_the_same(
+    frames: list[SimulatedFrame], make_camera_info: Any
+) -> None:
+    """Keypoints by id are correspondences that are put together here."""
+    one, other = localizer(make_camera_info), localizer(make_camera_info)
+    one.take_map(map_cloud(LANDMARKS))
+    for frame in frames[:4]:
+        rows = np.zeros(len(frame.ids), [(n, "<f8") for n in "xyz"] + [("u", "<f4"), ("v", "<f4")])
+        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
+            rows[name] = column
+        expected = localized(
+            other.localize(make_cloud(make_message, frame.stamp_ns, "map", rows)), frame
+        )
+        found = localized(one.localize_keypoints(keypoints(frame, "id")), frame)
+        assert found.pose.position.tolist() == expected.pose.position.tolist()
+        assert found.pose.covariance.tolist() == expected.pose.covariance.tolist()
+        assert found.inliers["residual"].tolist() == expected.inliers["residual"].tolist()
+
+
+def test_a_map_that_is_missing_and_comes_late(
+    frames: list[SimulatedFrame], make_camera_info: Any
+) -> None:
+    notices = Notices()
+    node = localizer(make_camera_info, notices)
+    assert node.missing == ()
+    reason, detail = refused(node.localize_keypoints(keypoints(frames[0], "id")))
+    assert (reason, detail) == (
+        "no_map", "no usable map has come yet, on map_points or as map_file"
+    )  # fmt: skip
+    assert node.missing == ("a map",)
+    assert node.map is None
+    node.take_map(map_cloud(LANDMARKS))
+    assert node.missing == ()
+    assert node.map is not None
+    assert len(node.map) == 4000
+    localized(node.localize_keypoints(keypoints(frames[1], "id")), frames[1])
+    assert notices == []
+
+
+def test_correspondences_need_no_map(
+    frames: list[SimulatedFrame], make_camera_info: Any
+) -> None:
+    node = localizer(make_camera_info)
+    assert refused(node.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_map"
+    assert node.missing == ("a map",)
+    rows = np.empty(len(frames[1].points), [(name, "<f8") for name in "xyzuv"])
+    for name, column in zip("xyzuv", [*frames[1].points.T, *frames[1].pixels.T], strict=True):
+        rows[name] = column
+    localized(node.localize(make_cloud(make_message, frames[1].stamp_ns, "map", rows)), frames[1])
+    assert node.missing == ()
+
+
+def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
+    notices = Notices()
+    node = localizer(make_camera_info, notices)
+    node.take_map(map_cloud(LANDMARKS))
+    localized(node.localize_keypoints(keypoints(frames[0], "id")), frames[0])
+    # The same again says nothing and keeps the track.
+    node.take_map(map_cloud(LANDMARKS))
+    assert localized(
+        node.localize_keypoints(keypoints(frames[1], "id")), frames[1]
+    ).estimate.tracked
+    assert notices == []
+    # A part of it in the same frame: the track goes on.
+    half = Map(POINTS[::2], IDS[::2], None, "map")
+    node.take_map(map_cloud(half))
+    assert localized(
+        node.localize_keypoints(keypoints(frames[2], "id")), frames[2]
+    ).estimate.tracked
+    text = "a map of 2000 landmarks in frame 'map' replaces the one of 4000 in frame 'map'"
+    assert notices == [("map_replaced", text)]
+    # Another frame: everything starts afresh.
+    node.take_map(map_cloud(Map(POINTS, IDS, None, "cellar")))
+    found = localized(node.localize_keypoints(keypoints(frames[3], "id")), frames[3])
+    assert found.map_frame == "cellar"
+    assert not found.estimate.tracked
+    assert [name for name, _ in notices] == ["map_replaced", "map_replaced", "map_changed"]
+    # One that cannot be used changes nothing.
+    bad = map_cloud(LANDMARKS)
+    bad.width = 10**6
+    with pytest.raises(MessageError, match="truncated"):
+        node.take_map(bad)
+    assert (
+        localized(node.localize_keypoints(keypoints(frames[4], "id")), frames[4]).map_frame
+        == "cellar"
+    )
+    assert len(notices) == 3
+
+
+def test_landmarks_that_are_left_out_are_said(make_camera_info: Any) -> None:
+    notices = Notices()
+    node = localizer(make_camera_info, notices)
+    rows = map_rows(LANDMARKS)
+    rows["y"][:7] = np.nan
+    node.take_map(make_cloud(make_message, 0, "map", rows))
+    text = "7 landmarks are left out: they hold NaN or infinity, or no descriptor"
+    assert notices == [("map_incomplete", text)]
+
+
+def test_keypoints_that_give_no_pose(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
+    node = localizer(make_camera_info)
+    node.take_map(map_cloud(LANDMARKS))
+    message = keypoints(frames[0], "id")
+    message.width = 0
+    assert refused(node.localize_keypoints(message))[0] == "empty_cloud"
+    message.width = 10**6
+    reason, detail = refused(node.localize_keypoints(message))
+    assert (reason, "truncated" in detail) == ("bad_keypoints", True)
+    wide = Map(POINTS, None, random_descriptors(4000, np.random.default_rng(0), 64), "map")
+    message = keypoints(frames[0], "descriptor", landmarks=wide)
+    reason, detail = refused(node.localize_keypoints(message))
+    assert reason == "bad_keypoints"
+    assert detail == (
+        "the keypoints have descriptors of 64 x uint8, the map has descriptors of 32 x uint8"
+    )
+    strangers = Map(POINTS, IDS + 200_000, None, "map")
+    message = keypoints(frames[0], "id", landmarks=strangers)
+    reason, detail = refused(node.localize_keypoints(message))
+    assert reason == "no_matches"
+    assert detail == "none of 70 keypoints matches one of 4000 landmarks by id"
+    few = keypoints(frames[0], "id")
+    few.width = 5
+    assert refused(node.localize_keypoints(few))[0] == "too_few_points"
+    unknown = FrameLocalizer(NodeConfig())
+    unknown.take_map(map_cloud(LANDMARKS))
+    assert refused(unknown.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_camera_info"
+    # None of this left a trace.
+    localized(node.localize_keypoints(keypoints(frames[0], "id")), frames[0])
+
+
+def test_a_wrong_prediction_is_found_out(
+    frames: list[SimulatedFrame], make_camera_info: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The camera is carried elsewhere between two frames: nothing is where it is predicted."""
+    asked: list[bool] = []
+
+    class Asked(Matcher):
+        def match(self, *arguments: Any) -> Any:
+            asked.append(arguments[3] is not None)
+            return super().match(*arguments)
+
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Matcher", Asked)
+    node = localizer(make_camera_info)
+    node.take_map(map_cloud(LANDMARKS))
+    for frame in frames[:3]:
+        localized(node.localize_keypoints(keypoints(frame, "descriptor")), frame)
+    assert asked == [False, True, True]
+    away = Map(
+        POINTS @ np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), None, LANDMARKS.descriptors, "map"
+    )
+    node.take_map(map_cloud(away))
+    asked.clear()
+    for frame in frames[3:5]:
+        result = node.localize_keypoints(keypoints(frame, "descriptor"))
+        assert result, result
+        assert len(result.inliers) > 40
+    assert asked == [True, False, True]
+
+
+def test_settings_of_matching(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
+    notices = Notices()
+    node = localizer(
+        make_camera_info, notices, matching=Matching(max_keypoints=50, by="descriptor")
+    )
+    node.take_map(map_cloud(LANDMARKS))
+    result = localized(node.localize_keypoints(keypoints(frames[0], "id", "descriptor")), frames[0])
+    assert len(result.estimate.inliers) <= 50
+    text = "70 keypoints have come, matching.max_keypoints of them, 50, are matched"
+    assert notices == [("too_many_keypoints", text)]
+    assert refused(node.localize_keypoints(keypoints(frames[1], "id")))[0] == "bad_keypoints"
+    node.config = NodeConfig(readout_time=READOUT_TIME)
+    localized(node.localize_keypoints(keypoints(frames[1], "id")), frames[1])
+
+
+def test_map_files(tmp_path: Path, frames: list[SimulatedFrame], make_camera_info: Any) -> None:
+    path = tmp_path / "map.npz"
+    write_map_file(path, LANDMARKS)
+    node = localizer(make_camera_info, map_file=str(path), map_frame="hall")
+    node.load_map()
+    found = localized(node.localize_keypoints(keypoints(frames[0], "descriptor")), frames[0])
+    assert found.map_frame == "hall"
+    write_map_file(path, Map(POINTS, None, None, "map"))
+    with pytest.raises(MapError, match="neither ids nor descriptors"):
+        node.load_map()
+    with pytest.raises(MapError, match=r"map_file: .* No such file"):
+        localizer(make_camera_info, map_file=str(tmp_path / "none.ply")).load_map()
+    localizer(make_camera_info).load_map()
+    with pytest.raises(ValueError, match="map_frame must not be empty"):
+        NodeConfig(map_frame="")
+
+
+def test_coordinates_far_from_the_origin_keep_their_digits(
+    frames: list[SimulatedFrame], make_camera_info: Any
+) -> None:
+    away = np.array([4e6, 5e5, 100.0])
+    node = localizer(make_camera_info)
+    node.take_map(map_cloud(Map(POINTS + away, IDS, LANDMARKS.descriptors, "utm")))
+    for frame in frames[:3]:
+        result = node.localize_keypoints(keypoints(frame, "descriptor"))
+        assert result, result
+        assert np.allclose(result.pose.position - away, frame.first_row.positions[0], atol=0.02)
+        assert result.inliers["x"].dtype == np.float64
+
+
+def test_any_message_is_answered(make_camera_info: Any) -> None:
+    node = localizer(make_camera_info)
+    node.take_map(map_cloud(LANDMARKS))
+    empty = SimpleNamespace(**vars(map_cloud(LANDMARKS)) | {"fields": []})
+    assert refused(node.localize_keypoints(empty))[0] == "bad_keypoints"

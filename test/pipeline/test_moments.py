@@ -1,0 +1,231 @@
+"""Pose, twist and covariances at a moment, against finite differences of the motion model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.types import Estimate
+from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
+
+READOUT_TIME = 0.03
+TAUS = [-0.5, 0.0, 0.3, -7.0]
+# Per readout: none, nearly none, fast, and around half a turn.
+RATES = [0.0, 1e-6, 0.5, 3.0]
+
+
+# Polynomials of the shaking.
+SHAKING = 3
+DEVIATIONS = [0.003, 0.01, 0.02, 0.05, 0.01, 0.02, *[0.002] * SHAKING]
+
+
+def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float = 0.0) -> Estimate:
+    rng = np.random.default_rng(seed)
+    size = 3 * len(DEVIATIONS)
+    root = rng.normal(size=(size, size)) / np.sqrt(size) * np.repeat(DEVIATIONS, 3)[:, None]
+    direction = rng.normal(size=3)
+    return Estimate(
+        rotation=Rotation.from_rotvec(rng.normal(size=3)).as_matrix(),
+        translation=rng.normal(size=3),
+        angular_velocity=rate * direction / np.linalg.norm(direction),
+        linear_velocity=rate * rng.normal(size=3),
+        angular_acceleration=acceleration * rng.normal(size=3),
+        linear_acceleration=acceleration * rng.normal(size=3),
+        shake=shake * rng.normal(size=(SHAKING, 3)),
+        inliers=np.ones(20, dtype=bool),
+        residuals=np.ones(20),
+        joint_covariance=root @ root.T,
+        global_shutter_inliers=10,
+        iterations=100,
+    )
+
+
+def disturbed(motion: Estimate, error: Array) -> Estimate:
+    """The motion with errors in the order of its joint covariance, by its definition."""
+    phi, rho, d_omega, d_v, d_alpha, d_a = error[:18].reshape(6, 3)
+    map_from_camera = motion.rotation.T
+    centre = -map_from_camera @ motion.translation + map_from_camera @ rho
+    rotation = Rotation.from_rotvec(-phi).as_matrix() @ motion.rotation
+    return replace(
+        motion,
+        rotation=rotation,
+        translation=-rotation @ centre,
+        angular_velocity=motion.angular_velocity + d_omega,
+        linear_velocity=motion.linear_velocity + d_v,
+        angular_acceleration=motion.angular_acceleration + d_alpha,
+        linear_acceleration=motion.linear_acceleration + d_a,
+        shake=motion.shake + error[18:].reshape(-1, 3),
+    )
+
+
+def shake(motion: Estimate, tau: float) -> Array:
+    """Legendre polynomials of 2 tau, the smaller the higher, less value and slope at 0."""
+    turn = np.zeros(3)
+    for degree, coefficients in enumerate(motion.shake, start=2):
+        series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
+        value, slope = legendre.legval(0.0, series), legendre.legval(0.0, legendre.legder(series))
+        turn += (legendre.legval(2 * tau, series) - value - slope * 2 * tau) * coefficients
+    return turn
+
+
+def pose(motion: Estimate, tau: float) -> tuple[Array, Array]:
+    """Rotation map_from_camera and camera centre."""
+    angle = tau * motion.angular_velocity + 0.5 * tau**2 * motion.angular_acceleration
+    way = tau * motion.linear_velocity + 0.5 * tau**2 * motion.linear_acceleration
+    map_from_camera = motion.rotation.T
+    turned = Rotation.from_rotvec(angle) * Rotation.from_rotvec(shake(motion, tau))
+    centre = map_from_camera @ (way - motion.translation)
+    return map_from_camera @ turned.as_matrix(), centre
+
+
+def pose_error(motion: Estimate, tau: float, error: Array) -> Array:
+    """Displacement, and rotation about fixed map axes, that an error brings."""
+    rotation, position = pose(motion, tau)
+    turned, moved = pose(disturbed(motion, error), tau)
+    about_fixed_axes = Rotation.from_matrix(turned @ rotation.T).as_rotvec()
+    return np.concatenate([moved - position, about_fixed_axes])
+
+
+def twist(motion: Estimate, tau: float) -> Array:
+    """Linear and angular velocity in body axes, by central differences of the poses."""
+    step = 1e-5
+    before, after, now = pose(motion, tau - step), pose(motion, tau + step), pose(motion, tau)
+    seconds = 2.0 * step * READOUT_TIME
+    linear = now[0].T @ (after[1] - before[1]) / seconds
+    angular = Rotation.from_matrix(before[0].T @ after[0]).as_rotvec() / seconds
+    return np.concatenate([linear, angular])
+
+
+def numerical_jacobian(
+    function: Callable[[Array], Array], step: float, size: int = 3 * len(DEVIATIONS)
+) -> Array:
+    columns = [
+        (function(step * unit) - function(-step * unit)) / (2.0 * step) for unit in np.eye(size)
+    ]
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_pose(rate: float, tau: float) -> None:
+    motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
+    rotation, position = pose(motion, tau)
+    result = pose_at(motion, tau)
+    assert np.allclose(result.rotation, rotation, atol=1e-13)
+    assert np.allclose(result.position, position, atol=1e-13)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_twist_is_the_rate_of_change_of_the_pose(rate: float, tau: float) -> None:
+    motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
+    result = twist_at(motion, tau, READOUT_TIME)
+    expected = twist(motion, tau)
+    assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
+
+
+def test_many_rows_are_single_rows() -> None:
+    motion, taus = estimate(0.5, acceleration=0.1, shake=0.003), np.array([-0.5, 0.0, 0.37])
+    rotations, translations = motion.at_rows(taus)
+    for tau, rotation, translation in zip(taus, rotations, translations, strict=True):
+        map_from_camera, position = pose(motion, tau)
+        assert np.allclose(rotation.T, map_from_camera, atol=1e-13)
+        assert np.allclose(-rotation.T @ translation, position, atol=1e-13)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_pose_covariance(rate: float, tau: float) -> None:
+    motion = estimate(rate)
+    jacobian = numerical_jacobian(lambda error: pose_error(motion, tau, error), 1e-5)
+    expected = jacobian @ motion.joint_covariance @ jacobian.T
+    assert np.allclose(pose_at(motion, tau).covariance, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.parametrize("rate", RATES)
+def test_twist_covariance(rate: float, tau: float) -> None:
+    motion = estimate(rate)
+    # Polynomials far outside the readout are no shaking.
+    covariance = motion.joint_covariance[:18, :18]
+    motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=covariance)
+    jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-4, 18)
+    expected = jacobian @ motion.joint_covariance @ jacobian.T
+    found = twist_at(motion, tau, READOUT_TIME).covariance
+    assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("tau", [-0.5, 0.2, 0.5])
+@pytest.mark.parametrize(("acceleration", "shake"), [(0.01, 0.0), (0.0, 0.001), (0.05, 0.001)])
+def test_covariances_of_an_uneven_motion(acceleration: float, shake: float, tau: float) -> None:
+    """To first order of acceleration (the default deviation is 0.01) and shaking."""
+    motion = estimate(0.2, acceleration=acceleration, shake=shake)
+    for found, function, step in (
+        (pose_at(motion, tau).covariance, lambda error: pose_error(motion, tau, error), 1e-5),
+        (twist_at(motion, tau, READOUT_TIME).covariance,
+         lambda error: twist(disturbed(motion, error), tau), 1e-4),
+    ):  # fmt: skip
+        jacobian = numerical_jacobian(function, step)
+        expected = jacobian @ motion.joint_covariance @ jacobian.T
+        scale = np.sqrt(np.diag(expected))
+        assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale),
+                           atol=0.005)  # fmt: skip
+
+
+def test_covariances_cover_what_is_published() -> None:
+    # No derivative at all: the scatter of poses and twists of many disturbed motions.
+    motion, tau = estimate(0.5, acceleration=0.01, shake=0.003), -0.5
+    rng = np.random.default_rng(3)
+    errors = rng.multivariate_normal(np.zeros(27), 0.01 * motion.joint_covariance, size=4000)
+    poses = np.array([pose_error(motion, tau, error) for error in errors])
+    now = twist(motion, tau)
+    twists = np.array([twist(disturbed(motion, error), tau) - now for error in errors])
+    for scatter, covariance in (
+        (poses, 0.01 * pose_at(motion, tau).covariance),
+        (twists, 0.01 * twist_at(motion, tau, READOUT_TIME).covariance),
+    ):
+        squares = np.einsum("ni,ij,nj->n", scatter, np.linalg.inv(covariance), scatter)
+        # Chi-square of six degrees of freedom: mean 6, and 5 % beyond 12.59.
+        assert np.mean(squares) == pytest.approx(6.0, abs=0.25)
+        assert np.mean(squares > 12.59) == pytest.approx(0.05, abs=0.015)
+
+
+@pytest.mark.parametrize("tau", TAUS)
+def test_covariances_are_symmetric(tau: float) -> None:
+    motion = estimate(0.5)
+    for covariance in (
+        pose_at(motion, tau).covariance,
+        twist_at(motion, tau, READOUT_TIME).covariance,
+    ):
+        assert np.array_equal(covariance, covariance.T)
+        assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
+
+
+def test_an_uncertain_readout_time_enters_both_covariances():
+    motion = estimate(0.5, acceleration=0.1)
+    deviation = 0.001
+    pose, twist = pose_at(motion, 0.0), twist_at(motion, 0.0, READOUT_TIME)
+    later = twist_at(motion, 0.0, READOUT_TIME + 1e-7)
+    by_time = np.concatenate([later.linear - twist.linear, later.angular - twist.angular]) / 1e-7
+    doubted_pose, doubted_twist = with_timing(
+        pose, twist, deviation / READOUT_TIME, 0.5 * deviation
+    )
+    np.testing.assert_allclose(
+        doubted_twist.covariance - twist.covariance,
+        deviation**2 * np.outer(by_time, by_time), rtol=1e-4, atol=1e-12,
+    )  # fmt: skip
+    # The middle row comes half of the doubt later: the camera has moved on by then.
+    soon = 1e-5  # readouts
+    ahead = pose_at(motion, soon)
+    turn = Rotation.from_matrix(ahead.rotation @ pose.rotation.T).as_rotvec()
+    way = np.concatenate([ahead.position - pose.position, turn]) / (soon * READOUT_TIME)
+    np.testing.assert_allclose(
+        doubted_pose.covariance - pose.covariance,
+        (0.5 * deviation) ** 2 * np.outer(way, way), rtol=1e-3, atol=1e-9,
+    )  # fmt: skip

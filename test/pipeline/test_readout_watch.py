@@ -1,0 +1,142 @@
+"""Alarms of a wrong readout time, and finding it, while frames are localized; hand motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace as changed
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer import data
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import make_message, open_bag
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.recording import make_camera_info
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.offline.replay import find_topics, replay
+from rs_localizer.pipeline.frames import FrameLocalizer
+
+READOUT = 0.02
+CAMERA = Camera(
+    640, 480, np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]]),
+    readout_time=READOUT,
+)  # fmt: skip
+FRAMES = 80
+START = 600  # frames into the recording, where the hand is on its way
+
+
+@cache
+def clouds() -> list[Any]:
+    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    world = room(sampled_way(motion).positions, np.random.default_rng(0), count=3000)
+    first = motion.intervals_ns[0][0]
+    stamps = [first + round((START + k) * 1e9 / 30) for k in range(FRAMES)]
+    seen = FrameSettings(points=80, noise=0.5, outliers=0.1)
+    messages = []
+    for frame in simulate_frames(CAMERA, motion, world, seen, stamps_ns=stamps):
+        rows = np.zeros(len(frame.points), [(name, "<f8") for name in "xyzuv"])
+        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
+            rows[name] = column
+        messages.append(make_cloud(make_message, frame.stamp_ns, "map", rows))
+    return messages
+
+
+def watched(count: int = FRAMES, **settings: Any) -> tuple[FrameLocalizer, list[str]]:
+    notices: list[str] = []
+
+    def notice(name: str, text: str) -> None:
+        if name == "readout_time":
+            notices.append(text)
+
+    frames = FrameLocalizer(NodeConfig(**settings), notice)
+    frames.take_camera_info(make_camera_info(CAMERA, 0))
+    for message in clouds()[:count]:
+        frames.localize(message)
+    return frames, notices
+
+
+@pytest.mark.parametrize("tracking", [True, False])
+@pytest.mark.parametrize("factor", [0.8, 1.2])
+def test_a_wrong_readout_time_is_said_once(factor: float, tracking: bool) -> None:
+    frames, notices = watched(readout_time=factor * READOUT, tracking=tracking)
+    assert len(notices) == 1
+    assert notices[0].startswith("the camera's motion says a readout time of ")
+    assert notices[0].endswith(f" ms; readout_time is {factor * READOUT:g}")
+    found = frames.readout_watch.measured
+    assert found is not None
+    assert abs(found.readout_time - READOUT) < 4.0 * found.deviation < 0.1 * READOUT
+    assert frames.readout_watch.fault
+
+
+def test_the_right_one_is_confirmed() -> None:
+    frames, notices = watched(readout_time=READOUT)
+    assert notices == []
+    assert frames.readout_watch.fault == ""
+    found = frames.readout_watch.measured
+    assert found is not None
+    assert abs(found.readout_time - READOUT) < 4.0 * found.deviation
+
+
+def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm() -> None:
+    # Its images were exposed 5 ms rms beside their stamps; `calibrate` says 12.9 +- 1.1 ms.
+    notices: list[str] = []
+    frames = FrameLocalizer(NodeConfig(readout_time=0.0129), lambda name, _: notices.append(name))
+    with open_bag(data.path(data.WEBCAM)) as bag:
+        assert sum(bool(result) for _, result in replay(bag, find_topics(bag), frames)) > 100
+    assert frames.readout_watch.measured is not None
+    assert "readout_time" not in notices
+
+
+def test_a_reversed_scan_is_said() -> None:
+    _, (text,) = watched(readout_time=READOUT, scan_direction="bottom_to_top")
+    assert "against scan_direction bottom_to_top" in text
+    assert text.endswith("is it top_to_bottom?")
+
+
+@pytest.mark.parametrize("change", ["reset", "settings", "camera", "map"])
+def test_what_changes_starts_afresh(change: str) -> None:
+    frames, notices = watched(40, readout_time=0.8 * READOUT)
+    assert notices
+    if change == "reset":
+        frames.reset()
+    elif change == "settings":
+        frames.config = changed(frames.config, seed=1)
+    elif change == "camera":
+        frames.take_camera_info(make_camera_info(changed(CAMERA, width=641), 0))
+    else:
+        message = clouds()[40]
+        header = changed(message.header, frame_id="another map")
+        frames.localize(changed(message, header=header))
+    assert frames.readout_watch.measured is None
+    assert frames.readout_watch.fault == ""
+
+
+@pytest.mark.parametrize("settings", [{}, {"solver": "p3p", "readout_time": READOUT}])
+def test_nothing_is_measured_that_nobody_uses(settings: dict[str, Any]) -> None:
+    frames, notices = watched(30, **settings)
+    assert frames.readout_watch.measured is None
+    assert notices == []
+
+
+@pytest.mark.parametrize("direction", ["top_to_bottom", "bottom_to_top"])
+def test_the_readout_time_from_nothing(direction: str) -> None:
+    given = {"estimate_readout_time": True, "scan_direction": direction}
+    frames, notices = watched(FRAMES - 1, **given)
+    assert len(notices) == 1
+    assert notices[0].startswith("estimated: ")
+    assert frames.config.scan_direction == "top_to_bottom"
+    assert frames.config.readout_time == pytest.approx(READOUT, rel=0.06)
+    assert frames.config.readout_time_deviation < 0.02 * READOUT * 1.06
+    last = frames.localize(clouds()[-1])
+    assert last
+    assert last.twist is not None
+    assert last.estimate.tracked
+    # Of another camera nothing is known yet.
+    frames.take_camera_info(make_camera_info(changed(CAMERA, width=641), 0))
+    assert frames.config == NodeConfig(**given)

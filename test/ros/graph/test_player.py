@@ -1,0 +1,192 @@
+"""``rs_localizer replay --ros``: the recording's messages in the graph, paced, with /clock."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.recording import make_camera_info, write_frame, write_image
+
+FRAMES = 8
+PERIOD_NS = 100_000_000
+START_NS = 1_700_000_000_000_000_000
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / "bag") as bag:
+        for i in range(FRAMES):
+            points, pixels = rng.normal(size=(20, 3)), rng.uniform(0, 400, size=(20, 2))
+            stamp_ns = START_NS + i * PERIOD_NS
+            write_frame(bag, Camera(640, 480, K), stamp_ns, points, pixels, np.arange(20))
+    return tmp_path / "bag"
+
+
+def play(recording: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", "replay", str(recording), "--ros", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def test_everything_arrives_in_scaled_time(recording: Path, peer: Any) -> None:
+    clouds: list[PointCloud2] = []
+    infos: list[CameraInfo] = []
+    clocks: list[tuple[float, int]] = []
+    subscribe = peer.node.create_subscription
+    subscribe(PointCloud2, "/correspondences", clouds.append, qos_profile_sensor_data)
+    subscribe(CameraInfo, "/camera_info", infos.append, qos_profile_sensor_data)
+    subscribe(
+        Clock,
+        "/clock",
+        lambda message: clocks.append((time.monotonic(), nanoseconds(message.clock))),
+        qos_profile_sensor_data,
+    )
+    player = play(recording, "--rate", "0.5")
+    assert peer.spin_until(lambda: player.poll() is not None)
+    output, errors = player.communicate()
+    assert re.fullmatch(
+        rf"{FRAMES} frames published in 1\.[45] s\nno node rs_localizer was there .*\n", output
+    )
+    assert (player.returncode, errors) == (0, "")
+    peer.spin_until(lambda: len(clouds) == FRAMES, 1.0)
+
+    with open_bag(recording) as bag:
+        recorded = [message for _, _, message in bag.messages(["/correspondences"])]
+    assert [nanoseconds(c.header.stamp) for c in clouds] == [
+        nanoseconds(message.header.stamp) for message in recorded
+    ]
+    assert all(bytes(c.data) == m.data.tobytes() for c, m in zip(clouds, recorded, strict=True))
+    assert len(infos) == FRAMES
+    assert infos[0].k.tolist() == K.ravel().tolist()
+    times, stamps = np.array([t for t, _ in clocks]), np.array([s for _, s in clocks])
+    assert np.all(np.diff(stamps) >= 0)
+    assert stamps[-1] == START_NS + (FRAMES - 1) * PERIOD_NS
+    assert len(stamps) > 5 * FRAMES
+    assert (stamps[-1] - stamps[0]) * 1e-9 / (times[-1] - times[0]) == pytest.approx(0.5, abs=0.1)
+
+
+def test_poses_of_a_node_are_counted(tmp_path: Path, start_node: Callable[..., Any]) -> None:
+    simulate = [sys.executable, "-m", "rs_localizer", "simulate", str(tmp_path / "flight")]
+    subprocess.run([*simulate, "--duration", "1", "--rate", "10"], check=True)
+    node = start_node("-p", "readout_time:=0.03", "-r", "__ns:=/cam")
+    node.wait_for_log("active with solver")
+    player = play(tmp_path / "flight")
+    output, errors = player.communicate(timeout=60)
+    # It listens to /cam/correspondences: nobody hears the recording.
+    assert (player.returncode, output) == (1, "")
+    assert errors.startswith(
+        "rs_localizer replay: nobody listens to /camera_info and /correspondences: start the node"
+    )
+    assert errors.count("\n") == 1
+    remapped = [f"{topic}:=/{topic}" for topic in ("camera_info", "correspondences")]
+    node = start_node("-p", "readout_time:=0.03", "-r", remapped[0], "-r", remapped[1])
+    node.wait_for_log("active with solver")
+    output, errors = play(tmp_path / "flight", "--rate", "0.5").communicate(timeout=60)
+    assert errors == ""
+    lines = output.splitlines()
+    assert re.fullmatch(r"10 frames published in 1\.[89] s", lines[0])
+    counts = {line.split()[-1]: int(line.split()[0]) for line in lines[1:]}
+    # Best effort, and the very first may be missed.
+    assert 8 <= counts["/rs_localizer/pose"] <= 10
+    assert counts.get("/cam/rs_localizer/pose", 0) == 0
+
+
+def test_images_are_played_for_a_detector(tmp_path: Path, peer: Any) -> None:
+    """A recording of a camera alone: there is nothing for the localizer yet."""
+    with BagWriter(tmp_path / "bag") as bag:
+        for k in range(FRAMES):
+            stamp_ns = START_NS + k * PERIOD_NS
+            bag.write("/cam/camera_info", make_camera_info(Camera(640, 480, K), stamp_ns), stamp_ns)
+            write_image(bag, "/cam/image/compressed", stamp_ns, "png", bytes([k]) * 100)
+    images: list[CompressedImage] = []
+    infos: list[CameraInfo] = []
+    subscribe = peer.node.create_subscription
+    subscribe(CompressedImage, "/cam/image/compressed", images.append, qos_profile_sensor_data)
+    subscribe(CameraInfo, "/cam/camera_info", infos.append, qos_profile_sensor_data)
+    player = play(tmp_path / "bag", "--rate", "2")
+    assert peer.spin_until(lambda: player.poll() is not None)
+    output, errors = player.communicate()
+    assert (player.returncode, errors) == (0, "")
+    assert output.startswith(f"{FRAMES} images published in 0.")
+    peer.spin_until(lambda: len(images) == FRAMES, 1.0)
+    assert [bytes(image.data) for image in images] == [bytes([k]) * 100 for k in range(FRAMES)]
+    assert len(infos) == FRAMES
+
+
+def test_ctrl_c_ends_it_in_one_line(recording: Path, peer: Any) -> None:
+    heard: list[PointCloud2] = []
+    for kind, topic in ((PointCloud2, "/correspondences"), (CameraInfo, "/camera_info")):
+        peer.node.create_subscription(kind, topic, heard.append, qos_profile_sensor_data)
+    player = play(recording, "--rate", "0.01")
+    assert peer.spin_until(lambda: len(heard) > 1)
+    time.sleep(0.2)
+    player.send_signal(signal.SIGINT)
+    player.send_signal(signal.SIGINT)
+    output, errors = player.communicate(timeout=30)
+    assert (player.returncode, output, errors) == (130, "", "rs_localizer replay: interrupted\n")
+
+
+def test_without_ros_it_says_what_is_missing(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "rclpy.py").write_text("raise ImportError(\"No module named 'rclpy'\")")
+    done = subprocess.run(
+        [sys.executable, "-m", "rs_localizer", "replay", str(recording), "--ros"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    text = "rs_localizer replay: --ros needs ROS 2 (No module named 'rclpy')"
+    assert done.stderr.startswith(text)
+    assert done.stderr.count("\n") == 1
+
+
+def test_transforms_are_left_out_where_their_type_is_missing(
+    recording: Path, tmp_path: Path, peer: Any
+) -> None:
+    with open_bag(recording) as bag, BagWriter(tmp_path / "with_tf") as copy:
+        copy.write("/tf", make_message("tf2_msgs/msg/TFMessage", transforms=[]), START_NS)
+        for topic, stamp_ns, message in bag.messages(tuple(bag.topics)):
+            copy.write(topic, message, stamp_ns)
+    (tmp_path / "tf2_msgs.py").write_text("raise ImportError")
+    clouds: list[PointCloud2] = []
+    subscribe = peer.node.create_subscription
+    subscribe(PointCloud2, "/correspondences", clouds.append, qos_profile_sensor_data)
+    subscribe(CameraInfo, "/camera_info", lambda _: None, qos_profile_sensor_data)
+    arguments = ["replay", str(tmp_path / "with_tf"), "--ros", "--rate", "2"]
+    player = subprocess.Popen(
+        [sys.executable, "-m", "rs_localizer", *arguments],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert peer.spin_until(lambda: player.poll() is not None)
+    output, _ = player.communicate()
+    assert output.startswith("not played: /tf, tf2_msgs is not installed (ros-jazzy-tf2-msgs)\n")
+    assert player.returncode == 0
+    assert clouds

@@ -1,0 +1,302 @@
+"""The diagnosis of a node: what a user reads first when there are no poses."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.ros.localizer.health import Condition, Level, diagnose, of_interest
+from rs_localizer.ros.node.inputs import Silence
+from rs_localizer.ros.node.refusals import Refusals
+from rs_localizer.ros.node.statistics import Statistics
+from rs_localizer.trajectory.online import MeasuredReadout
+
+COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
+FRAMES = replace(COMES, topic="/correspondences")
+GOOD = Condition(
+    "active", False, (), ("correspondences",), {"camera_info": COMES, "correspondences": FRAMES}
+)
+
+
+def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
+    """Three inliers of four points, 3, 4 and 0 px off."""
+    estimate = SimpleNamespace(
+        inliers=np.array([True, True, False, True]),
+        residuals=np.array([3.0, 4.0, 100.0, 0.0]),
+        global_shutter_inliers=2,
+        iterations=64,
+        model_error=0.0,
+        tracked=tracked,
+    )
+    return SimpleNamespace(input_stamp_ns=round(stamp * 1e9), estimate=estimate)
+
+
+class World:
+    """Statistics with clocks that are set by hand."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+        self.refusals = Refusals(lambda text: None)
+        self.statistics = Statistics(self.refusals, lambda: round(self.now * 1e9), lambda: self.now)
+
+    def receive(self) -> None:
+        seconds, nanoseconds = divmod(round(self.now * 1e9), 1_000_000_000)
+        stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+        message = SimpleNamespace(header=SimpleNamespace(stamp=stamp))
+        self.statistics.received("correspondences", message)
+
+    def pass_frames(self, count: int, rate: float, latency: float = 0.0) -> None:
+        for _ in range(count):
+            self.receive()
+            self.now += latency
+            self.statistics.answered(frame(self.now - latency), self.now - latency)
+            self.now += 1.0 / rate - latency
+
+    def refuse(self, count: int, reason: str = "too_few_inliers") -> None:
+        for _ in range(count):
+            self.receive()
+            self.statistics.refused(Refusal(reason, "7 of 100"))
+            self.now += 0.01
+
+    def diagnose(self, condition: Condition = GOOD) -> Any:
+        return diagnose(condition, self.statistics.summary())
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+def test_numbers_of_a_working_node(world: World) -> None:
+    world.pass_frames(100, rate=50.0, latency=0.004)
+    health = world.diagnose()
+    assert (health.level, health.state) == (Level.OK, "localized")
+    assert health.message == "localized with 3 of 4 points"
+    expected = {
+        "State": "localized",
+        "Frames in (Hz)": "50.0",
+        "Poses out (Hz)": "50.0",
+        "Latency p50 (ms)": "4.00",
+        "Latency p95 (ms)": "4.00",
+        "Delay of the stamp p50 (ms)": "4.00",
+        "Delay of the stamp p95 (ms)": "4.00",
+        "Points": "4",
+        "Inliers with rolling shutter": "3",
+        "Inliers with global shutter": "2",
+        "Residual RMS (px)": f"{np.sqrt(25.0 / 3.0):.3f}",
+        "Model error (px)": "0.000",
+        "Iterations": "64",
+        "Frames received": "100",
+        "Poses published": "100",
+        "Frames replaced": "0",
+        "Frames refused": "0",
+        "Topic /camera_info": "messages come, best effort",
+        "Topic /correspondences": "messages come, best effort",
+    }
+    assert health.values == expected
+    world.now += 6.0  # the window is over: nothing of it is said to be so now
+    values = world.diagnose().values
+    assert values["Poses out (Hz)"] == "0.0"
+    assert "Latency p50 (ms)" not in values
+    assert values["Poses published"] == "100"
+
+
+def test_stamps_of_another_clock_have_no_delay(world: World) -> None:
+    for stamp in (0.0, world.now + 5.0, world.now - 60.0):
+        world.statistics.answered(frame(stamp), world.now)
+    values = world.diagnose().values
+    assert "Latency p50 (ms)" in values
+    assert "Delay of the stamp p50 (ms)" not in values
+
+
+def test_tracking_is_said(world: World) -> None:
+    world.statistics.answered(frame(tracked=True), world.now)
+    assert world.diagnose().state == "tracking"
+
+
+def test_lost_after_some_frames_and_found_by_one(world: World) -> None:
+    world.pass_frames(10, rate=50.0)
+    world.refuse(4)
+    assert world.diagnose().level == Level.WARN
+    assert world.diagnose().message == "4 frames were refused in the last 5 s"
+    world.refuse(1)
+    health = world.diagnose()
+    assert (health.level, health.state) == (Level.ERROR, "lost")
+    assert health.message == "the last 5 frames gave no pose, mostly for too_few_inliers"
+    assert health.values["Refused: too_few_inliers"] == "5"
+    world.pass_frames(1, rate=50.0)
+    assert world.diagnose().state == "localized"
+
+
+def test_a_few_refused_frames_are_normal(world: World) -> None:
+    world.pass_frames(100, rate=50.0)
+    world.refuse(4)
+    world.pass_frames(1, rate=50.0)
+    assert world.diagnose().level == Level.OK
+    for _ in range(20):
+        world.statistics.replaced()
+    assert world.diagnose().level == Level.WARN
+    assert world.diagnose().message.startswith("20 frames came while another was localized")
+    assert world.diagnose().values["Frames replaced"] == "20"
+
+
+def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
+    for index in range(150):
+        if index % 10 < 6:
+            world.pass_frames(1, rate=30.0)
+        else:
+            world.now += 1.0 / 30.0
+    health = world.diagnose()
+    assert health.level == Level.WARN
+    assert re.match(
+        r"messages are lost: by their stamps, 5\d of 14\d have not come", health.message
+    )
+    assert int(health.values["Frames missing by their stamps, recently"]) in range(50, 61)
+
+
+def test_the_readout_time_that_the_motion_shows() -> None:
+    summary, name = Statistics(Refusals(print)).summary(), "Readout time seen (ms)"
+    assert name not in diagnose(GOOD, summary).values
+    seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100))
+    assert diagnose(seen, summary).values[name] == "-20.04 +- 0.12"
+
+
+def test_what_is_odd_is_a_warning(world: World) -> None:
+    odd = replace(GOOD, oddities={"pixels_outside": "7 of 100 pixels"})
+    world.pass_frames(10, rate=50.0)
+    health = world.diagnose(odd)
+    assert (health.level, health.state) == (Level.WARN, "localized")
+    assert health.message == "pixels_outside: 7 of 100 pixels"
+    assert health.values["Odd: pixels_outside"] == "7 of 100 pixels"
+    world.refuse(5)
+    health = world.diagnose(odd)
+    assert health.level == Level.ERROR
+    assert health.message.endswith("for too_few_inliers; pixels_outside: 7 of 100 pixels")
+
+
+def test_what_was_odd_is_forgotten() -> None:
+    now = [0.0]
+    refusals = Refusals(lambda text: None, lambda: now[0])
+    refusals.notice("map_is_camera", "first")
+    refusals.notice("map_is_camera", "second")
+    refusals.notice("another", "text")
+    assert refusals.recent(("map_is_camera", "nothing"), 5.0) == {"map_is_camera": "second"}
+    now[0] = 5.1
+    assert refusals.recent(("map_is_camera",), 5.0) == {}
+
+
+def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) -> Silence:
+    return Silence(topic, 7.0, heard, cause, mismatch)
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "state", "message"),
+    [
+        ({"life_cycle": "inactive"}, Level.OK, "inactive", "the node is inactive: activate it"),
+        ({"life_cycle": "configuring"}, Level.WARN, "compiling", "the node is being configured"),
+        (
+            {"life_cycle": "unconfigured"},
+            Level.OK,
+            "inactive",
+            "the node is unconfigured: configure and activate it",
+        ),
+        ({"changing": True}, Level.WARN, "compiling", "the kernels for the new settings are"),
+        # Frames come, so that the other one is what is wrong.
+        (
+            {
+                "missing": ("camera_info",),
+                "silence": {
+                    "camera_info": silent("/camera_info", "it has no publisher"),
+                    "correspondences": FRAMES,
+                },
+            },
+            Level.ERROR,
+            "waiting for camera_info",
+            "waiting for camera_info; /camera_info: it has no publisher",
+        ),
+        (
+            {
+                "missing": ("camera_info", "a map"),
+                "silence": {"camera_info": COMES, "correspondences": silent("/c", "")},
+            },
+            Level.WARN,
+            "waiting for camera_info and a map",
+            "waiting for camera_info and a map",
+        ),
+        (
+            {"silence": {"camera_info": COMES, "correspondences": silent("/c", "no publisher")}},
+            Level.WARN,
+            "waiting for frames",
+            "no frame has come; /c: no publisher",
+        ),
+        (
+            {"silence": {"correspondences": silent("/c", "no publisher", heard=True)}},
+            Level.STALE,
+            "waiting for frames",
+            "no frame has come for 7 s; /c: no publisher",
+        ),
+        (
+            {"silence": {"correspondences": silent("/c", "QoS", mismatch=True)}},
+            Level.ERROR,
+            "waiting for frames",
+            "no frame has come; /c: QoS",
+        ),
+        # One of two frame topics is enough.
+        (
+            {
+                "frame_topics": ("correspondences", "keypoints"),
+                "silence": {"correspondences": FRAMES, "keypoints": silent("/k", "no publisher")},
+            },
+            Level.OK,
+            "localized",
+            "localized with 3 of 4 points",
+        ),
+    ],
+)
+def test_what_is_missing_comes_first(
+    world: World, change: dict[str, Any], level: Level, state: str, message: str
+) -> None:
+    world.pass_frames(3, rate=50.0)
+    health = world.diagnose(replace(GOOD, **change))
+    assert (health.level, health.state) == (level, state)
+    assert health.message.startswith(message)
+
+
+def test_what_is_missing_came_and_cannot_be_used(world: World) -> None:
+    for _ in range(3):
+        world.refusals.add("bad_camera_info", "the camera is not calibrated: K[0] is 0")
+    health = world.diagnose(replace(GOOD, missing=("camera_info",)))
+    assert health.message == (
+        "waiting for camera_info; 3 came and cannot be used: bad_camera_info in the log says why"
+    )
+
+
+def test_a_frame_that_takes_long(world: World) -> None:
+    world.statistics.started()
+    world.now += 3.0
+    health = world.diagnose()
+    assert (health.level, health.state) == (Level.WARN, "busy")
+    assert health.message == "a frame has been worked on for 3.0 s"
+    world.statistics.ended()
+    assert world.diagnose().state == "waiting for frames"
+
+
+def test_topics_that_nothing_waits_for_are_left_out() -> None:
+    nobody = replace(COMES, seconds=9.0, heard=False, cause="it has no publisher")
+    deaf = replace(nobody, cause="the QoS of /x does not fit", mismatch=True)
+    kinds = ("correspondences", "keypoints")
+
+    def names(missing: tuple[str, ...] = (), **silence: Silence) -> set[str]:
+        return set(of_interest(silence, kinds, missing))
+
+    assert names(correspondences=nobody, keypoints=nobody) == set(kinds)
+    assert names(correspondences=COMES, keypoints=nobody) == {"correspondences"}
+    assert names(correspondences=COMES, keypoints=deaf) == set(kinds)
+    assert names(keypoints=COMES, map_points=nobody) == {"keypoints"}
+    assert names(("a map",), keypoints=COMES, map_points=nobody) == {"keypoints", "map_points"}

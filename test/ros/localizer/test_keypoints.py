@@ -1,0 +1,221 @@
+"""Keypoints and maps over live DDS: latched, late, replaced, bad; said in the diagnostics."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.maps.files import write_map_file
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.lab.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
+from rs_localizer.lab.simulation.recording import write_simulated
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import ConstantVelocity
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.ros.node.conversion import copy_message, make_message
+
+READOUT_TIME = 0.03
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=8000)
+LANDMARKS = Map(POINTS, np.arange(8000), random_descriptors(8000, np.random.default_rng(2)), "map")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, list[SimulatedFrame]]:
+    """The camera's message and frames with their truth."""
+    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
+    motion = ConstantVelocity(
+        np.array([0.5, -1.0, 1.0]), np.array([0.5, 0.5, -0.5]), 1.0, start_ns=10**9
+    )
+    seen = FrameSettings(points=80, noise=0.5, outliers=0.3)
+    frames = list(simulate_frames(camera, motion, POINTS, seen))
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    with BagWriter(path) as bag:
+        write_simulated(bag, camera, frames[0])
+    with open_bag(path) as bag:
+        _, _, info = next(iter(bag.messages(("/camera_info",))))
+    return copy_message(info, "sensor_msgs/msg/CameraInfo"), frames
+
+
+class Talk:
+    """Publishes a camera, maps and keypoints, and hears poses and diagnostics."""
+
+    def __init__(self, peer: Any, info: Any) -> None:
+        self.peer, self.info = peer, info
+        node = peer.node
+        self._infos = node.create_publisher(CameraInfo, "camera_info", 1)
+        self._maps = node.create_publisher(PointCloud2, "map_points", LATCHED)
+        self._keypoints = node.create_publisher(PointCloud2, "keypoints", qos_profile_sensor_data)
+        self.poses: dict[int, Any] = {}
+        self.status: dict[str, str] = {}
+        self._subscriptions = [
+            node.create_subscription(
+                PoseStamped, "/rs_localizer/pose", lambda m: self.poses.update({stamp_ns(m): m}), 10
+            ),
+            node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10),
+        ]
+
+    def _hear(self, message: Any) -> None:
+        for status in message.status:
+            if "rs_localizer" in status.name:
+                self.status = {item.key: item.value for item in status.values}
+                self.status["message"] = status.message
+
+    def send_map(self, landmarks: Map) -> Any:
+        message = make_cloud(make_message, 0, landmarks.frame, map_rows(landmarks))
+        self._maps.publish(message)
+        return message
+
+    def send_raw_map(self, message: Any) -> None:
+        self._maps.publish(message)
+
+    def connect(self) -> None:
+        publishers = (self._infos, self._maps, self._keypoints)
+        assert self.peer.spin_until(
+            lambda: (
+                all(p.get_subscription_count() for p in publishers)
+                and self.peer.node.count_publishers("/rs_localizer/pose")
+            )
+        )
+        self.peer.spin_until(lambda: False, 0.2)  # the other side has to find us, too
+
+    def keypoints(self, frame: SimulatedFrame, landmarks: Map = LANDMARKS) -> Any:
+        rows = keypoint_rows(frame, landmarks, np.random.default_rng(frame.stamp_ns))
+        return make_cloud(make_message, frame.stamp_ns, "camera", rows)
+
+    def send(self, message: Any, timeout: float = 1.0) -> bool:
+        """Send a camera and keypoints: whether a pose with their stamp came."""
+        self._infos.publish(self.info)
+        self.peer.spin_until(lambda: False, 0.02)
+        self._keypoints.publish(message)
+        return bool(self.peer.spin_until(lambda: stamp_ns(message) in self.poses, timeout))
+
+    def localize(self, frame: SimulatedFrame, landmarks: Map = LANDMARKS) -> Any:
+        """Send a frame until it is answered: the pose, which is compared with the truth."""
+        message = self.keypoints(frame, landmarks)
+        assert any(self.send(message) for _ in range(20)), f"no answer; {self.status}"
+        pose = self.poses.pop(frame.stamp_ns)
+        found = [getattr(pose.pose.position, name) for name in "xyz"]
+        assert np.allclose(found, frame.first_row.positions[0], atol=0.02)
+        return pose
+
+
+def test_maps_that_are_late_replaced_and_bad(
+    start_node: Callable[..., Any], peer: Any, flight: tuple[Any, list[SimulatedFrame]]
+) -> None:
+    info, frames = flight
+    node = start_node("-p", f"readout_time:={READOUT_TIME}")
+    talk = Talk(peer, info)
+    talk.connect()
+    # Without a map.
+    assert not talk.send(talk.keypoints(frames[0]), 0.3)
+    assert peer.spin_until(lambda: talk.status.get("State") == "waiting for a map")
+    assert peer.spin_until(lambda: "/map_points: it has 1 publisher" in talk.status["message"])
+    node.wait_for_log("no_map: no usable map has come yet, on map_points or as map_file")
+    # It comes.
+    talk.send_map(LANDMARKS)
+    assert talk.localize(frames[1]).header.frame_id == "map"
+    node.wait_for_log("the map has 8000 landmarks in frame 'map'")
+    # Bad ones leave it in place.
+    bad = talk.send_map(LANDMARKS)  # the same again is no news
+    bad.width = 2**31
+    talk.send_raw_map(bad)
+    node.wait_for_log("bad_map: the data are truncated")
+    talk.localize(frames[2])
+    # Descriptors of another width, and then unknown ids only.
+    wide = Map(POINTS, None, random_descriptors(8000, np.random.default_rng(0), 64), "map")
+    assert not talk.send(talk.keypoints(frames[3], wide), 0.3)
+    node.wait_for_log("bad_keypoints: the keypoints have descriptors of 64 x uint8, the map has")
+    strangers = Map(POINTS, LANDMARKS.ids + 10**6, None, "map")
+    assert not talk.send(talk.keypoints(frames[3], strangers), 0.3)
+    node.wait_for_log("no_matches: none of")
+    # Another map while frames come.
+    talk.send_map(Map(POINTS[:6000], LANDMARKS.ids[:6000], LANDMARKS.descriptors[:6000], "hall"))
+    assert talk.send(talk.keypoints(frames[4]), 5.0) or talk.localize(frames[4])
+    assert peer.spin_until(lambda: talk.localize(frames[5]).header.frame_id == "hall")
+    node.wait_for_log("map_replaced: a map of 6000 landmarks in frame 'hall' replaces the one of")
+    node.wait_for_log("map_changed")
+    assert "internal_error" not in node.log
+    assert node.stop() == 0
+
+
+def test_a_latched_map_and_a_map_file(
+    tmp_path: Path,
+    start_node: Callable[..., Any],
+    peer: Any,
+    flight: tuple[Any, list[SimulatedFrame]],
+) -> None:
+    info, frames = flight
+    talk = Talk(peer, info)
+    talk.send_map(LANDMARKS)  # before there is anybody to hear it
+    start_node("-p", f"readout_time:={READOUT_TIME}")
+    talk.connect()
+    talk.localize(frames[0])
+    assert peer.spin_until(lambda: talk.status.get("State") in ("tracking", "localized"))
+
+
+def test_a_map_that_is_not_latched(
+    start_node: Callable[..., Any], peer: Any, flight: tuple[Any, list[SimulatedFrame]]
+) -> None:
+    info, frames = flight
+    start_node("-p", f"readout_time:={READOUT_TIME}")
+    talk = Talk(peer, info)
+    volatile = peer.node.create_publisher(PointCloud2, "map_points", 1)
+    talk.connect()
+    assert peer.spin_until(volatile.get_subscription_count)
+    volatile.publish(make_cloud(make_message, 0, LANDMARKS.frame, map_rows(LANDMARKS)))
+    talk.localize(frames[0])
+
+
+def test_a_map_file(
+    tmp_path: Path,
+    start_node: Callable[..., Any],
+    peer: Any,
+    flight: tuple[Any, list[SimulatedFrame]],
+) -> None:
+    info, frames = flight
+    path = tmp_path / "map.npz"
+    write_map_file(path, LANDMARKS)
+    given = ("-p", f"map_file:={path}", "-p", "map_frame:=hall")
+    node = start_node("-p", f"readout_time:={READOUT_TIME}", *given)
+    talk = Talk(peer, info)
+    talk.connect()
+    # What replay says of the same messages, to the last bit.
+    replay = FrameLocalizer(
+        NodeConfig(readout_time=READOUT_TIME, map_file=str(path), map_frame="hall")
+    )
+    replay.load_map()
+    replay.take_camera_info(info)
+    for frame in frames[:6]:
+        found = talk.localize(frame)
+        assert found.header.frame_id == "hall"
+        expected = replay.localize_keypoints(talk.keypoints(frame))
+        assert expected
+        position = [getattr(found.pose.position, name) for name in "xyz"]
+        assert position == expected.pose.position.tolist()
+        assert expected.estimate.tracked == (frame is not frames[0])
+    node.wait_for_log("the map has 8000 landmarks in frame 'hall'")
+    assert node.stop() == 0
+    os.truncate(path, 1000)
+    broken = start_node(*given)
+    assert broken.process.wait(60) == 1
+    assert f"not configured: map_file: {path}: no readable NumPy archive" in broken.log
+    assert "Traceback" not in broken.log

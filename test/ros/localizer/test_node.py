@@ -1,0 +1,562 @@
+"""The node as its users meet it: its own process, real DDS, signals, parameters, life cycle."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from rs_localizer.cli.main import main as command_line
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, open_bag, typestore
+from rs_localizer.io.outputs import TYPES
+from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.recording import write_simulated
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import ConstantVelocity
+from rs_localizer.ros.localizer import node as localizer_node
+from rs_localizer.ros.localizer.node import LocalizerNode
+from rs_localizer.ros.node.conversion import copy_message, message_class
+from rs_localizer.ros.node.inputs import Inputs
+
+READOUT_TIME = 0.03
+SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+Start = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    camera = Camera(640, 480, K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=READOUT_TIME)
+    motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
+    world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
+    settings = FrameSettings(points=100, noise=0.7, outliers=0.3)
+    with BagWriter(path) as bag:
+        for frame in simulate_frames(camera, motion, world, settings):
+            write_simulated(bag, camera, frame)
+    return path
+
+
+def inputs(recording: Path) -> list[tuple[Any, Any]]:
+    """Pairs of camera_info and correspondences as rclpy's messages."""
+    with open_bag(recording) as bag:
+        found: dict[str, list[Any]] = {"/camera_info": [], "/correspondences": []}
+        for topic, _, message in bag.messages(tuple(found)):
+            found[topic].append(copy_message(message, message.__msgtype__))
+    return list(zip(*found.values(), strict=True))
+
+
+class Talk:
+    """Publishes inputs and collects outputs."""
+
+    def __init__(self, peer: Any, inputs_prefix: str = "", node: str = "/rs_localizer") -> None:
+        self.peer = peer
+        self.received: dict[str, list[bytes]] = {name: [] for name in TYPES}
+        reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+        create = peer.node.create_subscription
+        self._subscriptions = [
+            create(message_class(kind), f"{node}/{name}", self._keep(name), reliable, raw=True)
+            for name, kind in TYPES.items()
+        ]
+        self._infos = peer.node.create_publisher(CameraInfo, f"{inputs_prefix}/camera_info", 1)
+        self._clouds = peer.node.create_publisher(
+            PointCloud2, f"{inputs_prefix}/correspondences", 1
+        )
+
+    def _keep(self, name: str) -> Callable[[bytes], None]:
+        return lambda data: self.received[name].append(data)
+
+    def connect(self) -> None:
+        def connected() -> bool:
+            listening = min(p.get_subscription_count() for p in (self._infos, self._clouds))
+            topics = [subscription.topic_name for subscription in self._subscriptions]
+            return bool(listening) and all(self.peer.node.count_publishers(t) for t in topics)
+
+        assert self.peer.spin_until(connected), "the node was not found"
+        time.sleep(0.2)  # the other side has to find us, too
+
+    def send(self, info: Any, cloud: Any, timeout: float = 1.0) -> bool:
+        """Send a frame; whether the node answered."""
+        before = len(self.received["inliers"])
+        if info is not None:
+            self._infos.publish(info)
+            self.peer.spin_until(lambda: False, 0.02)
+        if cloud is not None:
+            self._clouds.publish(cloud)
+        return bool(self.peer.spin_until(lambda: len(self.received["inliers"]) > before, timeout))
+
+    def localize(self, info: Any, cloud: Any) -> None:
+        """Send a frame until the node has answered."""
+        assert any(self.send(info, cloud) for _ in range(20)), "no answer"
+
+
+def state(peer: Any) -> int:
+    return int(peer.call(GetState, "/rs_localizer/get_state", GetState.Request()).current_state.id)
+
+
+def change_state(peer: Any, transition: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return bool(peer.call(ChangeState, "/rs_localizer/change_state", request).success)
+
+
+def set_parameter(peer: Any, name: str, value: object) -> tuple[bool, str]:
+    parameter = Parameter(name, value=value).to_parameter_msg()
+    request = SetParameters.Request(parameters=[parameter])
+    result = peer.call(SetParameters, "/rs_localizer/set_parameters", request).results[0]
+    return result.successful, result.reason
+
+
+@pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
+def test_node_and_replay_say_the_same_to_the_last_byte(
+    recording: Path, tmp_path: Path, start_node: Start, peer: Any, pose_time: str
+) -> None:
+    settings = [*SHUTTER, "-p", f"pose_time:={pose_time}", "-p", "solver:=joint"]
+    out = tmp_path / "out"
+    assert command_line(["replay", str(recording), "--out", str(out), *settings]) == 0
+    start_node(*settings)
+    talk = Talk(peer)
+    talk.connect()
+    frames = inputs(recording)
+    for info, cloud in frames:
+        talk.localize(info, cloud)
+
+    def by_stamp(messages: list[Any], kind: str) -> dict[int, bytes]:
+        # Sent through one serializer: DDS may pad differently.
+        return {
+            message.header.stamp.sec * 10**9 + message.header.stamp.nanosec: bytes(
+                typestore().serialize_cdr(message, kind)
+            )
+            for message in messages
+        }
+
+    with open_bag(out / "result") as bag:
+        for name, kind in TYPES.items():
+            offline = by_stamp([m for _, _, m in bag.messages([f"/rs_localizer/{name}"])], kind)
+            received = [typestore().deserialize_cdr(d, kind) for d in talk.received[name]]
+            assert len(offline) == len(frames)
+            assert by_stamp(received, kind) == offline
+
+
+def test_it_survives_what_is_wrong(recording: Path, start_node: Start, peer: Any) -> None:
+    node = start_node(*SHUTTER)
+    talk = Talk(peer)
+    talk.connect()
+    info, cloud = inputs(recording)[0]
+    kept = bytes(cloud.data)
+
+    def bad(**changes: Any) -> PointCloud2:
+        fields = {name: getattr(cloud, name) for name in cloud.get_fields_and_field_types()}
+        return PointCloud2(**(fields | changes))
+
+    def refuse(info: Any, cloud: Any, text: str) -> None:
+        # Best effort, as all sensor data: a busy machine may lose one.
+        for _ in range(20):
+            assert not talk.send(info, cloud, 0.3)
+            if text in node.log:
+                return
+        raise AssertionError(f"no {text!r} in:\n{node.log}")
+
+    refuse(None, cloud, "no_camera_info: no usable camera_info has come yet")
+    uncalibrated = CameraInfo(header=info.header, width=640, height=480)
+    refuse(uncalibrated, cloud, "bad_camera_info: the camera is not calibrated: K[0] is 0")
+    talk.localize(info, cloud)
+    for wrong, text in (
+        (bad(data=kept[:-1]), "the data are truncated"),
+        (bad(width=2**31), "the data are truncated"),
+    ):
+        refuse(None, wrong, text)
+    refuse(None, bad(width=0, row_step=0, data=b""), "empty_cloud: the cloud has no points")
+    # All NaN: the rows are dropped, and none is left.
+    nothing = np.frombuffer(kept, np.uint8).copy()
+    nothing[:] = 0xFF
+    refuse(None, bad(data=nothing.tobytes()), "too_few_points: ")
+    # A bad camera_info does not replace the good one.
+    talk.send(uncalibrated, None, 0.1)
+    # Time may go backwards: a recording that is played in a loop.
+    for wanted in (5_000_000_000, 1_000_000_000):
+        cloud.header.stamp.sec, cloud.header.stamp.nanosec = divmod(wanted, 10**9)
+        talk.localize(None, cloud)
+    node.wait_for_log("time_went_back: the stamp 1.000 s lies 4.000 s before the last one")
+    assert node.process.poll() is None
+    assert "Traceback" not in node.log
+    assert node.stop() == 0
+
+
+def test_parameters_of_a_running_node(recording: Path, start_node: Start, peer: Any) -> None:
+    node = start_node()
+    talk = Talk(peer)
+    talk.connect()
+    info, cloud = inputs(recording)[0]
+    talk.localize(info, cloud)
+    assert talk.received["odometry"] == []
+    assert set_parameter(peer, "readout_time", READOUT_TIME) == (True, "")
+    talk.localize(None, cloud)
+    assert len(talk.received["odometry"]) > 0
+    for name, value, reason in (
+        ("solver", "p4p", "solver must be one of"),
+        ("readout_time", 1.0, "out of range"),
+        ("autostart", False, "read-only"),
+    ):
+        successful, text = set_parameter(peer, name, value)
+        assert not successful
+        assert re.search(reason, text)
+    # The old ones are still there and work.
+    before = len(talk.received["odometry"])
+    talk.localize(None, cloud)
+    assert len(talk.received["odometry"]) > before
+    changes = [
+        Parameter("solver", value="p3p").to_parameter_msg(),
+        # A single pose fits this motion badly.
+        Parameter("inlier_threshold", value=10.0).to_parameter_msg(),
+        Parameter("pose_time", value="mid_frame").to_parameter_msg(),
+    ]
+    request = SetParametersAtomically.Request(parameters=changes)
+    service = "/rs_localizer/set_parameters_atomically"
+    assert peer.call(SetParametersAtomically, service, request).result.successful
+    before = len(talk.received["odometry"])
+    talk.localize(None, cloud)
+    assert len(talk.received["odometry"]) == before  # p3p knows no twist
+    assert node.stop() == 0
+
+
+def test_life_cycle(recording: Path, start_node: Start, peer: Any) -> None:
+    node = start_node("-p", "autostart:=false", *SHUTTER)
+    info, cloud = inputs(recording)[0]
+    assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
+    talk = Talk(peer)
+    assert peer.node.count_subscribers("/correspondences") == 0
+    assert change_state(peer, Transition.TRANSITION_CONFIGURE)
+    assert state(peer) == State.PRIMARY_STATE_INACTIVE
+    assert peer.node.count_subscribers("/correspondences") == 0
+    assert change_state(peer, Transition.TRANSITION_ACTIVATE)
+    talk.connect()
+    talk.localize(info, cloud)
+    assert change_state(peer, Transition.TRANSITION_DEACTIVATE)
+    assert peer.spin_until(lambda: peer.node.count_subscribers("/correspondences") == 0)
+    assert not talk.send(info, cloud, 0.3)
+    assert change_state(peer, Transition.TRANSITION_CLEANUP)
+    assert peer.spin_until(lambda: peer.node.count_publishers("/rs_localizer/pose") == 0)
+    # Once more from the start.
+    assert change_state(peer, Transition.TRANSITION_CONFIGURE)
+    assert change_state(peer, Transition.TRANSITION_ACTIVATE)
+    talk.connect()
+    talk.localize(info, cloud)
+    assert change_state(peer, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert state(peer) == State.PRIMARY_STATE_FINALIZED
+    assert node.stop() == 0
+    assert "Traceback" not in node.log
+
+
+def test_what_is_fixed_can_be_set_while_it_is_unconfigured(
+    start_node: Start, peer: Any, tmp_path: Path
+) -> None:
+    node = start_node("-p", "autostart:=false")
+
+    def set_one(name: str, value: str) -> Any:
+        wanted = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[wanted])
+        return peer.call(SetParameters, "/rs_localizer/set_parameters", request).results[0]
+
+    assert set_one("map_file", str(tmp_path / "no.npz")).successful
+    assert not change_state(peer, Transition.TRANSITION_CONFIGURE)
+    node.wait_for_log("not configured: map_file: ")
+    for name, value in (("map_file", ""), ("map_frame", "hall"), ("odom_frame", "wheels")):
+        assert set_one(name, value).successful
+    assert change_state(peer, Transition.TRANSITION_CONFIGURE)
+    refused = set_one("map_frame", "cellar")
+    assert not refused.successful
+    assert refused.reason == (
+        "map_frame cannot be changed while the node is inactive: clean it up first"
+    )
+    assert set_one("map_frame", "hall").successful  # as it is
+    assert change_state(peer, Transition.TRANSITION_CLEANUP)
+    assert set_one("map_frame", "cellar").successful
+    assert node.stop() == 0
+
+
+def test_impossible_transitions_are_refused(recording: Path, start_node: Start, peer: Any) -> None:
+    node = start_node(*SHUTTER)
+    talk = Talk(peer)
+    talk.connect()
+    for transition in (
+        Transition.TRANSITION_ACTIVATE,
+        Transition.TRANSITION_CONFIGURE,
+        Transition.TRANSITION_ACTIVATE,
+        99,
+    ):
+        assert not change_state(peer, transition)
+    node.wait_for_log("transition 99 is refused: the node is active")
+    assert state(peer) == State.PRIMARY_STATE_ACTIVE
+    talk.localize(*inputs(recording)[0])
+    assert node.stop() == 0
+    assert "Traceback" not in node.log
+
+
+def test_a_failing_callback_does_not_end_the_node(
+    recording: Path, start_node: Start, peer: Any
+) -> None:
+    # A bug, for once: the first frame raises.
+    broken = (
+        "import sys; from rs_localizer.pipeline.frames import FrameLocalizer as F\n"
+        "localize = F.localize\n"
+        "def fail(self, message): F.localize = localize; raise TypeError('a bug')\n"
+        "F.localize = fail\n"
+        "from rs_localizer.ros.main import main; sys.exit(main())"
+    )
+    node = start_node(*SHUTTER, run=broken)
+    talk = Talk(peer)
+    talk.connect()
+    info, cloud = inputs(recording)[0]
+    assert not talk.send(info, cloud)
+    node.wait_for_log("internal_error: TypeError('a bug') in fail")
+    talk.localize(info, cloud)
+    assert node.stop() == 0
+
+
+def test_names_can_be_remapped_and_qos_overridden(
+    recording: Path, start_node: Start, peer: Any
+) -> None:
+    override = "qos_overrides./cam/camera_info.subscription.reliability"
+    start_node("-r", "__ns:=/cam", "-p", f"{override}:=best_effort", *SHUTTER)
+    talk = Talk(peer, "/cam", "/cam/rs_localizer")
+    talk.connect()
+    talk.localize(*inputs(recording)[0])
+
+    def reliability(topic: str, infos: Any) -> Any:
+        return next(
+            info.qos_profile.reliability for info in infos(topic) if info.node_name != "peer"
+        )
+
+    subscriptions = peer.node.get_subscriptions_info_by_topic
+    # Where nothing is overridden, that of the publisher.
+    reliable = ReliabilityPolicy.RELIABLE
+    assert peer.spin_until(lambda: reliability("/cam/correspondences", subscriptions) == reliable)
+    assert reliability("/cam/camera_info", subscriptions) == ReliabilityPolicy.BEST_EFFORT
+    publishers = peer.node.get_publishers_info_by_topic
+    for name in TYPES:
+        assert reliability(f"/cam/rs_localizer/{name}", publishers) == ReliabilityPolicy.RELIABLE
+
+
+def test_best_effort_publishers_are_heard(recording: Path, start_node: Start, peer: Any) -> None:
+    """As camera drivers publish; a reliable subscription would hear nothing."""
+    start_node(*SHUTTER)
+    answers: list[Odometry] = []
+    peer.node.create_subscription(Odometry, "/rs_localizer/odometry", answers.append, 10)
+    create = peer.node.create_publisher
+    publishers = (
+        create(CameraInfo, "/camera_info", qos_profile_sensor_data),
+        create(PointCloud2, "/correspondences", qos_profile_sensor_data),
+    )
+    messages = inputs(recording)[0]
+
+    def answered() -> bool:
+        for publisher, message in zip(publishers, messages, strict=True):
+            publisher.publish(message)
+        return bool(peer.spin_until(lambda: answers, 0.5))
+
+    assert peer.spin_until(answered)
+    assert answers[0].child_frame_id == messages[0].header.frame_id
+    assert answers[0].header.frame_id == messages[1].header.frame_id
+
+
+@pytest.mark.parametrize(
+    "signals",
+    [
+        (signal.SIGINT,),
+        (signal.SIGTERM,),
+        (signal.SIGINT, signal.SIGINT),
+        (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGTERM),
+    ],
+)
+def test_signals_end_it_in_order(start_node: Start, signals: tuple[int, ...]) -> None:
+    node = start_node()
+    node.wait_for_log("active with solver")
+    assert node.stop(*signals) == 0
+    assert "Traceback" not in node.log
+    assert "rror" not in node.log
+
+
+# A module that tells that it is being imported, and takes its time.
+SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("slow", ["numba", "rclpy", "cv2"])
+def test_signals_while_it_imports(
+    start_node: Start, tmp_path: Path, number: int, slow: str
+) -> None:
+    (tmp_path / f"{slow}.py").write_text(SLOW)
+    node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    while not (tmp_path / f"{slow}.seen").exists():
+        assert node.process.poll() is None, node.log
+        time.sleep(0.02)
+    assert node.stop(number) == 0
+    assert node.log == ""
+
+
+def test_missing_ros_is_said_in_one_line(start_node: Start, tmp_path: Path) -> None:
+    text = "No module named 'rclpy'"
+    (tmp_path / "rclpy.py").write_text(f"raise ModuleNotFoundError({text!r}, name='rclpy')")
+    node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    assert node.process.wait(60.0) == 1
+    assert node.log.startswith(f"localizer: {text}; source a ROS 2 workspace")
+    assert node.log.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_while_it_compiles(start_node: Start, tmp_path: Path, number: int) -> None:
+    cache = tmp_path / "cache"
+    node = start_node(XDG_CACHE_HOME=str(cache))
+    deadline = time.monotonic() + 60.0
+    # The first kernel in the cache: the second is being compiled, and there are many.
+    while not list(cache.rglob("*.nbc")):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    start = time.monotonic()
+    assert node.stop(number, number) == 0
+    assert time.monotonic() - start < 10.0
+    assert "active" not in node.log
+    assert "Traceback" not in node.log
+
+
+def test_a_signal_before_it_compiles(start_node: Start, tmp_path: Path) -> None:
+    # In the last moment before compiling, which then must not begin.
+    signalled = (
+        "import os, signal, sys, rs_localizer.ros.node.parameters as p\n"
+        "read = p.read\n"
+        "def kill(*a, **k): os.kill(os.getpid(), signal.SIGTERM); return read(*a, **k)\n"
+        "p.read = kill\n"
+        "from rs_localizer.ros.main import main; sys.exit(main())"
+    )
+    node = start_node(run=signalled, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert node.process.wait(60.0) == 0
+    assert "kernels are ready" not in node.log
+    assert "Traceback" not in node.log
+    assert not list(tmp_path.rglob("*.nbc"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_frame_takes_long(
+    recording: Path, start_node: Start, peer: Any, number: int
+) -> None:
+    slow = (
+        "import sys, time; from rs_localizer.pipeline.frames import FrameLocalizer as F\n"
+        "def wait(self, message): print('a slow frame', flush=True); time.sleep(100)\n"
+        "F.localize = wait\n"
+        "from rs_localizer.ros.main import main; sys.exit(main())"
+    )
+    node = start_node(*SHUTTER, run=slow)
+    talk = Talk(peer)
+    talk.connect()
+    while "a slow frame" not in node.log:
+        talk.send(*inputs(recording)[0], timeout=0.1)
+    start = time.monotonic()
+    assert node.stop(number, number) == 0
+    assert time.monotonic() - start < 10.0
+    assert "Traceback" not in node.log
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("-p", "solver:=p4p"), "solver must be one of p3p, r6p, .*; got 'p4p'"),
+        (("-p", "readout_time:=0"), r"readout_time must be of type float, got 0 \(write 0\.0\)"),
+        (("-p", "inlier_threshold:=-1.0"), "inlier_threshold out of range"),
+        (("--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
+    ],
+)
+def test_started_with_bad_parameters(
+    start_node: Start, arguments: tuple[str, ...], text: str
+) -> None:
+    node = start_node(*arguments)
+    assert node.process.wait(60.0) == 1
+    fatal = [line for line in node.log.splitlines() if line.startswith("[FATAL]")]
+    assert len(fatal) == 1
+    assert re.search(text, fatal[0])
+    assert "Traceback" not in node.log
+
+
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [
+        ("/correspondences.subscription.reliability:=foo", "not activated: .*reliability.*foo"),
+        ("/correspondences.subscription.depth:=ten", "not activated: .*ten"),
+        ("/rs_localizer/pose.publisher.depth:=ten", "not configured:"),
+    ],
+)
+def test_qos_overrides_that_make_no_qos(start_node: Start, override: str, text: str) -> None:
+    node = start_node("-p", f"qos_overrides.{override}")
+    assert node.process.wait(60.0) == 1
+    errors = [line for line in node.log.splitlines() if line.startswith("[ERROR]")]
+    assert len(errors) == 1
+    assert re.search(text, errors[0], re.IGNORECASE)
+
+
+def test_publishers_are_active_before_a_frame_can_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    active: list[bool] = []
+
+    class Early(Inputs):
+        def __init__(self, node: LocalizerNode, *arguments: Any) -> None:
+            publishers = node._outputs._publishers.values()
+            active.extend(publisher.is_activated for publisher in publishers)
+            super().__init__(node, *arguments)
+
+    monkeypatch.setattr(localizer_node, "Inputs", Early)
+    context = Context()
+    rclpy.init(context=context)
+    node = LocalizerNode(context=context)
+    try:
+        node.trigger_configure()
+        node.trigger_activate()
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+    assert active == [True] * len(TYPES)
+
+
+def test_what_it_says_at_start(start_node: Start, tmp_path: Path) -> None:
+    file = tmp_path / "params.yaml"
+    file.write_text("/**:\n  ros__parameters: {min_inlier: 9, use_sim_time: false}\n")
+    node = start_node("--params-file", str(file), "-p", "readout_tim:=0.1")
+    node.wait_for_log("active with solver")
+    lines = [line.partition("]: ")[2] for line in node.log.splitlines()]
+    compiling = lines.index("compiling kernels (once on this machine, up to a minute)")
+    assert re.fullmatch(r"kernels are ready after \d+\.\d s", lines[compiling + 1])
+    ignored = "a parameter is ignored: {} is no setting; did you mean {}?"
+    assert [line for line in lines if "ignored" in line] == [
+        ignored.format("'min_inlier'", "'min_inliers'"),
+        ignored.format("'readout_tim'", "'readout_time'"),
+    ]
+    silent = "readout_time is 0 (unknown): no twist is published and frames are not tracked"
+    assert lines.count(silent) == 1
+    node = start_node(*SHUTTER)
+    node.wait_for_log("active with solver")
+    assert silent not in node.log
+    assert "ignored" not in node.log
+
+
+def test_the_shipped_params_file_is_taken(start_node: Start, tmp_path: Path) -> None:
+    shipped = Path(__file__).parents[3] / "config" / "rs_localizer.yaml"
+    changed = tmp_path / "mine.yaml"
+    changed.write_text(shipped.read_text().replace("solver: r6p_vcwt", "solver: r9p"))
+    for namespace in ("/", "/robot/front"):
+        node = start_node("--params-file", str(changed), "-r", f"__ns:={namespace}")
+        node.wait_for_log("active with solver r9p")
+        assert node.stop() == 0

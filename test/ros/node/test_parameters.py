@@ -1,0 +1,159 @@
+"""Parameters are the settings: declared with description and range, refused with the reason."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rs_localizer.config import NodeConfig, VelocityPrior
+from rs_localizer.ros.node import parameters
+from rs_localizer.settings import settings
+
+
+@pytest.fixture
+def context() -> Iterator[Context]:
+    context = Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.shutdown(context=context)
+
+
+class Recorder:
+    """A node with the parameters, that refuses one seed and keeps what is applied."""
+
+    def __init__(self, context: Context, *arguments: str) -> None:
+        self.node = Node("some_node", context=context, cli_args=["--ros-args", *arguments])
+        self.config = parameters.declare(self.node)
+        self.applied: list[NodeConfig] = []
+        parameters.on_change(self.node, self.check, self.applied.append)
+
+    def check(self, config: NodeConfig) -> None:
+        if config.seed == 13:
+            raise ValueError("13 brings bad luck")
+
+    def set_all(self, **values: object) -> tuple[bool, str]:
+        changes = [
+            Parameter(name.replace("__", "."), value=value) for name, value in values.items()
+        ]
+        result = self.node.set_parameters_atomically(changes)
+        return result.successful, result.reason
+
+
+@pytest.fixture
+def recorder(context: Context) -> Iterator[Recorder]:
+    recorder = Recorder(context)
+    yield recorder
+    recorder.node.destroy_node()
+
+
+def test_every_setting_is_a_parameter_with_its_default(recorder: Recorder) -> None:
+    assert recorder.config == NodeConfig()
+    for name, setting in settings().items():
+        value = recorder.node.get_parameter(name).value
+        assert value == setting.default
+        assert type(value) is type(setting.default)
+
+
+def test_descriptions_ranges_and_choices(recorder: Recorder) -> None:
+    def describe(name: str) -> ParameterDescriptor:
+        return recorder.node.describe_parameter(name)
+
+    for name, setting in settings().items():
+        assert describe(name).description == setting.description
+        assert describe(name).read_only == setting.read_only
+    threshold = describe("inlier_threshold").floating_point_range[0]
+    assert (threshold.from_value, threshold.to_value) == (0.01, 1000.0)
+    seed = describe("seed").integer_range[0]
+    assert (seed.from_value, seed.to_value) == (0, 2**31 - 1)
+    assert describe("scan_direction").additional_constraints == (
+        "one of top_to_bottom, bottom_to_top, left_to_right, right_to_left"
+    )
+    assert describe("autostart").read_only
+    assert not describe("solver").read_only
+
+
+def test_several_at_once_are_one_change(recorder: Recorder) -> None:
+    change = {"solver": "p3p", "seed": 4, "velocity_prior__linear": 0.5}
+    assert recorder.set_all(**change) == (True, "")
+    expected = NodeConfig(
+        solver="p3p", seed=4, velocity_prior=VelocityPrior(VelocityPrior().angular, 0.5)
+    )
+    assert recorder.applied == [expected]
+    assert parameters.read(recorder.node) == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"solver": "p4p"}, "solver must be one of p3p, .*; got 'p4p'"),
+        ({"inlier_threshold": 0.0}, "inlier_threshold out of range.*0.01.*1000.0.*0.0"),
+        ({"inlier_threshold": float("nan")}, "inlier_threshold"),
+        ({"min_inliers": 6}, "min_inliers out of range"),
+        ({"seed": 1.5}, "Wrong parameter type"),
+        ({"autostart": False}, "read-only parameter: autostart"),
+        ({"seed": 13}, "13 brings bad luck"),
+        ({"inlier_threshold": 3.0, "seed": 13}, "13 brings bad luck"),
+        ({"inlier_threshold": 3.0, "solver": "p4p"}, "solver must be one of"),
+    ],
+)
+def test_what_is_refused_stays_as_it_was(
+    recorder: Recorder, change: dict[str, object], reason: str
+) -> None:
+    successful, text = recorder.set_all(**change)
+    assert not successful
+    assert re.search(reason, text)
+    assert recorder.applied == []
+    assert parameters.read(recorder.node) == NodeConfig()
+
+
+def test_other_parameters_change_no_settings(recorder: Recorder) -> None:
+    assert recorder.set_all(use_sim_time=True) == (True, "")
+    assert recorder.applied == []
+
+
+def test_values_at_start(context: Context) -> None:
+    recorder = Recorder(context, "-p", "readout_time:=0.02", "-p", "velocity_prior.angular:=0.0")
+    assert recorder.config.readout_time == 0.02
+    assert recorder.config.velocity_prior.angular == 0.0
+    recorder.node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ("assignment", "text"),
+    [
+        ("solver:=p4p", "solver must be one of"),
+        ("readout_time:=0.5", r"readout_time out of range"),
+        ("readout_time:=0", r"readout_time must be of type float, got 0 \(write 0\.0\)$"),
+        ("inlier_threshold:=-3", r"got -3 \(write -3\.0\)$"),
+        ("readout_time:=true", "readout_time must be of type float, got True$"),
+        ("seed:=high", "seed must be of type int, got 'high'$"),
+    ],
+)
+def test_bad_values_at_start(context: Context, assignment: str, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        Recorder(context, "-p", assignment)
+
+
+def test_names_that_no_parameter_has(context: Context) -> None:
+    assignments = (
+        "readout_tim:=0.1",
+        "colour:=red",
+        "velocity_prior.angulr:=0.5",
+        "use_sim_time:=true",
+        "qos_overrides./camera_info.subscription.depth:=3",
+        "seed:=3",
+    )
+    recorder = Recorder(context, *(word for text in assignments for word in ("-p", text)))
+    texts = parameters.unknown_names(recorder.node)
+    recorder.node.destroy_node()
+    colour, readout_time, angular = texts
+    assert colour.startswith("'colour' is no setting; there are solver, ")
+    assert readout_time == "'readout_tim' is no setting; did you mean 'readout_time'?"
+    assert angular.endswith("did you mean 'velocity_prior.angular'?")

@@ -1,0 +1,81 @@
+"""A topic is heard as well as its publishers send it, whoever comes first."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from rs_localizer.ros.node.quality import best
+
+BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+VOLATILE, LATCHED = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
+ANY = (ReliabilityPolicy.BEST_AVAILABLE, DurabilityPolicy.BEST_AVAILABLE)
+WHOLE = QoSProfile(depth=1, reliability=RELIABLE, durability=LATCHED)
+
+
+@pytest.mark.parametrize(
+    ("wished", "offers", "expected"),
+    [
+        (ANY, [], (BEST_EFFORT, VOLATILE)),
+        (ANY, [(RELIABLE, LATCHED)], (RELIABLE, LATCHED)),
+        (ANY, [(RELIABLE, VOLATILE)], (RELIABLE, VOLATILE)),
+        (ANY, [(RELIABLE, LATCHED), (BEST_EFFORT, VOLATILE)], (BEST_EFFORT, VOLATILE)),
+        ((RELIABLE, ANY[1]), [(BEST_EFFORT, LATCHED)], (RELIABLE, LATCHED)),
+        ((BEST_EFFORT, VOLATILE), [(RELIABLE, LATCHED)], (BEST_EFFORT, VOLATILE)),
+    ],
+)
+def test_the_best_that_all_offer(wished: Any, offers: list[Any], expected: Any) -> None:
+    assert best(wished, offers) == expected
+
+
+def heard_with(peer: Any, topic: str) -> Callable[[], set[ReliabilityPolicy]]:
+    return lambda: {
+        info.qos_profile.reliability
+        for info in peer.node.get_subscriptions_info_by_topic(topic)
+        if info.node_name == "rs_localizer"
+    }
+
+
+def test_the_node_follows_its_publishers(start_node: Callable[..., Any], peer: Any) -> None:
+    node = start_node()
+    present = heard_with(peer, "/correspondences")
+    assert peer.spin_until(lambda: present() == {BEST_EFFORT})
+    sender = peer.node.create_publisher(PointCloud2, "/correspondences", 10)
+    assert peer.spin_until(lambda: present() == {RELIABLE})
+    other = peer.node.create_publisher(
+        PointCloud2, "/correspondences", QoSProfile(depth=1, reliability=BEST_EFFORT)
+    )
+    assert peer.spin_until(lambda: present() == {BEST_EFFORT})
+    peer.node.destroy_publisher(sender)
+    peer.node.destroy_publisher(other)
+    peer.spin_until(lambda: False, 1.5)
+    assert present() == {BEST_EFFORT}  # nobody there: as it was
+    assert "internal_error" not in node.log
+    assert node.stop() == 0
+
+
+def test_a_latched_camera_info_is_heard(start_node: Callable[..., Any], peer: Any) -> None:
+    info = CameraInfo(width=640, height=480, distortion_model="plumb_bob", d=[0.0] * 5)
+    info.k = [500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0]
+    info.header.frame_id = "camera"
+    publisher = peer.node.create_publisher(CameraInfo, "/camera_info", WHOLE)
+    publisher.publish(info)  # once, before there is a node
+    node = start_node()
+    node.wait_for_log("active with solver")
+    # Once it is heard, the node no longer says that it waits for it.
+    cloud = peer.node.create_publisher(PointCloud2, "/correspondences", 10)
+    deadline = time.monotonic() + 30.0
+    message = PointCloud2(height=1, width=0)
+    message.header.frame_id = "map"
+    while "empty_cloud" not in node.log and "bad_cloud" not in node.log:
+        assert time.monotonic() < deadline, node.log
+        cloud.publish(message)
+        peer.spin_until(lambda: False, 0.1)
+    time.sleep(6.0)
+    assert "waiting for camera_info" not in node.log.split("_cloud")[-1]
+    assert node.stop() == 0

@@ -1,0 +1,283 @@
+"""TF in the node. Where tf2_ros is installed the same tests run with it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.io.outputs import Frame, Pose
+from rs_localizer.io.transforms.rigid import NotYetError, TransformError
+from rs_localizer.ros.localizer.broadcaster import Broadcaster
+from rs_localizer.ros.node.transforms import check
+
+STAND_IN = Path(__file__).parents[1] / "stand_in"
+Notes = list[tuple[str, str]]
+HALF_TURN = (0.0, 0.0, 1.0, 0.0)
+
+
+@pytest.fixture
+def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    installed = importlib.util.find_spec("tf2_ros") is not None
+    if not installed:
+        monkeypatch.syspath_prepend(str(STAND_IN))
+    yield importlib.import_module("tf2_ros")
+    if not installed:
+        del sys.modules["tf2_ros"]
+
+
+@pytest.fixture
+def robot(tf2_ros: ModuleType, peer: Any) -> Any:
+    """Sends transforms, and hears what comes on TF."""
+    moving = tf2_ros.TransformBroadcaster(peer.node)
+    static: list[Any] = []
+
+    def send(parent: str, child: str, x: float, stamp_ns: int = 0, turn: Any = HALF_TURN) -> None:
+        item = TransformStamped(child_frame_id=child)
+        item.header.frame_id = parent
+        item.header.stamp.sec, item.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        item.transform.translation.x = x
+        q = item.transform.rotation
+        q.x, q.y, q.z, q.w = turn
+        if stamp_ns:
+            moving.sendTransform(item)
+        else:  # tf2_ros of Jazzy sends the first transform of a child for ever
+            static.append(tf2_ros.StaticTransformBroadcaster(peer.node))
+            static[-1].sendTransform(item)
+
+    buffer = tf2_ros.Buffer()
+    listener = tf2_ros.TransformListener(buffer, peer.node)
+    yield SimpleNamespace(send=send, buffer=buffer)
+    listener.unregister()
+
+
+@pytest.fixture
+def made(peer: Any, robot: Any) -> Iterator[Callable[..., Any]]:
+    """Makes the node's TF, in a node and a thread of their own as the executor is."""
+    parts: list[Any] = []
+
+    def make(**settings: Any) -> SimpleNamespace:
+        notes: Notes = []
+
+        def keep(*words: str) -> None:
+            notes.append(words)
+
+        broadcaster = Broadcaster(peer.node, SimpleNamespace(notice=keep, add=keep))
+        config = NodeConfig(**settings)
+        broadcaster.configure(config)
+        parts.append(broadcaster)
+        return SimpleNamespace(
+            tf=broadcaster.tf, publish=broadcaster.publish, notes=notes, config=config,
+            broadcaster=broadcaster,
+        )  # fmt: skip
+
+    yield make
+    for part in parts:
+        part.close()
+
+
+def frame(stamp_ns: int, x: float = 0.0) -> Frame:
+    pose = Pose(np.array([x, 0.0, 0.0]), np.eye(3), np.eye(6))
+    return Frame(
+        input_stamp_ns=stamp_ns, stamp_ns=stamp_ns, map_frame="map", body_frame="base_link",
+        pose=pose, twist=None, inliers=np.zeros(0), dropped=0, estimate=None,
+    )  # fmt: skip
+
+
+def known(made: Any, peer: Any, target: str, source: str, stamp_ns: int | None) -> Any:
+    def there() -> bool:
+        try:
+            made.tf.lookup(target, source, stamp_ns)
+        except TransformError:
+            return False
+        return True
+
+    assert peer.spin_until(there), f"no transform from {source} to {target}"
+    return made.tf.lookup(target, source, stamp_ns)
+
+
+def test_static_transforms_hold_for_all_times(made: Any, robot: Any, peer: Any) -> None:
+    node = made(base_frame="base_link")
+    with pytest.raises(TransformError, match=r'"?camera"?.* does not exist'):
+        node.tf.lookup("camera", "base_link", 5)
+    robot.send("base_link", "camera", 2.0)
+    for stamp_ns in (None, 5, 10**18):
+        found = known(node, peer, "base_link", "camera", stamp_ns)
+        assert found.translation.tolist() == [2.0, 0.0, 0.0]
+        assert np.array_equal(found.rotation, np.diag([-1.0, -1.0, 1.0]))
+    assert not node.tf.moves("camera", "base_link")
+    # Calibrated anew.
+    robot.send("base_link", "camera", 3.0)
+    assert peer.spin_until(lambda: node.tf.lookup("base_link", "camera", 5).translation[0] == 3.0)
+    with pytest.raises(TransformError, match=r"no transforms of the time -0\.010 s"):
+        node.tf.lookup("base_link", "camera", -10_000_000)
+
+
+def test_what_is_not_known_yet_is_said_at_once(made: Any, robot: Any, peer: Any) -> None:
+    node = made(base_frame="base_link", transform_tolerance=10.0)
+    second = 10**9
+    robot.send("base_link", "camera", 1.0, 5 * second)
+    robot.send("base_link", "camera", 2.0, 6 * second)
+    assert known(node, peer, "base_link", "camera", 5_500_000_000).translation[0] == 1.5
+    assert node.tf.moves("camera", "base_link")
+    started = time.monotonic()
+    with pytest.raises(NotYetError, match="extrapolation into the future"):
+        node.tf.lookup("base_link", "camera", 7 * second)
+    assert time.monotonic() - started < 1.0
+    robot.send("base_link", "camera", 6.0, 8 * second)
+    assert known(node, peer, "base_link", "camera", 7 * second).translation[0] == 4.0
+    with pytest.raises(TransformError, match="extrapolation into the past") as caught:
+        node.tf.lookup("base_link", "camera", 4 * second)
+    assert not isinstance(caught.value, NotYetError)
+    node.broadcaster.close()
+    with pytest.raises(TransformError, match="TF is not listened to"):
+        node.tf.lookup("base_link", "camera", 7 * second)
+
+
+def test_a_recording_that_starts_over(made: Any, robot: Any, peer: Any) -> None:
+    node = made(base_frame="base_link", transform_tolerance=0.0)
+    for stamp in (50, 51):
+        robot.send("base_link", "camera", 1.0, stamp * 10**9)
+    known(node, peer, "base_link", "camera", 50_500_000_000)
+    # tf2 ignores what is older than ten seconds, until a frame shows that time went back.
+    with pytest.raises(TransformError, match="past"):
+        node.tf.lookup("base_link", "camera", 5 * 10**9)
+    for stamp in (5, 6):
+        robot.send("base_link", "camera", 2.0, stamp * 10**9)
+    assert known(node, peer, "base_link", "camera", 5_500_000_000).translation[0] == 2.0
+
+
+def heard(robot: Any, peer: Any, parent: str, child: str, stamp_ns: int | None) -> Any:
+    """What another node makes of what was sent."""
+    rclpy_time = importlib.import_module("rclpy.time")
+    found: list[Any] = []
+
+    def there() -> bool:
+        try:
+            at = rclpy_time.Time(nanoseconds=stamp_ns or 0)
+            found.append(robot.buffer.lookup_transform(parent, child, at))
+        except Exception:
+            return False
+        return True
+
+    assert peer.spin_until(there), f"no transform from {child} to {parent}"
+    return found[0]
+
+
+def test_map_to_odom(made: Any, robot: Any, peer: Any) -> None:
+    node = made(publish_tf="map_to_odom", transform_tolerance=0.5)
+    second = 10**9
+    assert not node.notes
+    node.publish(frame(5 * second), node.config)
+    assert node.notes[0][0] == "not_broadcast"
+    assert "does not exist" in node.notes.pop()[1]
+    robot.send("odom", "base_link", 1.0, 5 * second)
+    robot.send("odom", "base_link", 2.0, 6 * second)
+    known(node, peer, "odom", "base_link", 6 * second)
+    # Odometry comes later than the frame: nothing waits, and it is sent when it has come.
+    started = time.monotonic()
+    node.publish(frame(7 * second, x=10.0), node.config)
+    assert time.monotonic() - started < 0.4
+    robot.send("odom", "base_link", 3.0, 8 * second)
+    sent = heard(robot, peer, "map", "odom", None)
+    assert sent.header.stamp.sec == 7
+    assert sent.header.stamp.nanosec == 500_000_000
+    # base_link is at 2.5 in odom, turned by half a turn, and at 10 in the map.
+    assert sent.transform.translation.x == pytest.approx(12.5)
+    assert sent.transform.rotation.z == pytest.approx(1.0)
+    assert not node.notes
+    # REP-105: with odometry, the map has the base where the localizer has found it.
+    node.publish(frame(7_800_000_000, x=11.0), node.config)
+    base = heard(robot, peer, "map", "base_link", 7_800_000_000)
+    assert base.transform.rotation.w == pytest.approx(1.0)
+
+
+def test_odometry_that_does_not_come(made: Any, robot: Any, peer: Any) -> None:
+    node = made(publish_tf="map_to_odom", transform_tolerance=0.1)
+    for stamp in (5, 6):
+        robot.send("odom", "base_link", 1.0, stamp * 10**9)
+    known(node, peer, "odom", "base_link", 6 * 10**9)
+    node.publish(frame(7 * 10**9), node.config)
+    assert not node.notes
+    time.sleep(0.15)
+    node.publish(frame(8 * 10**9), node.config)
+    assert len(node.notes) == 1
+    assert "extrapolation into the future" in node.notes[0][1]
+    # What still waits when the node is deactivated is not sent any more.
+    node.broadcaster.forget()
+    robot.send("odom", "base_link", 1.0, 9 * 10**9)
+    known(node, peer, "odom", "base_link", 9 * 10**9)
+    peer.spin_until(lambda: False, 0.1)
+    assert not robot_knows(robot, "map")
+
+
+def robot_knows(robot: Any, name: str) -> bool:
+    try:
+        robot.buffer.lookup_transform(
+            name, "base_link", importlib.import_module("rclpy.time").Time()
+        )
+    except Exception:
+        return False
+    return True
+
+
+def test_map_to_camera(made: Any, robot: Any, peer: Any) -> None:
+    node = made(publish_tf="map_to_camera", transform_tolerance=0.5)
+    node.publish(frame(5 * 10**9, x=4.0), node.config)
+    sent = heard(robot, peer, "map", "base_link", None)
+    assert sent.header.stamp.sec == 5
+    assert sent.header.stamp.nanosec == 0
+    assert sent.transform.translation.x == 4.0
+    node.publish(frame(0), node.config)
+    ((reason, text),) = node.notes
+    assert reason == "not_broadcast"
+    assert text.startswith("publish_tf map_to_camera: header.stamp of the input is zero")
+    assert node.broadcaster.fault() == {}  # one has been sent just now
+    node.publish(frame(6 * 10**9), NodeConfig())  # switched off meanwhile
+    assert len(node.notes) == 1
+
+
+def test_a_frame_has_one_parent(made: Any, robot: Any, peer: Any) -> None:
+    node = made(publish_tf="map_to_camera")
+    robot.send("odom", "base_link", 1.0)
+    known(node, peer, "odom", "base_link", None)
+    node.publish(frame(5 * 10**9), node.config)
+    reason, text = node.notes[0]
+    assert reason == "not_broadcast"
+    assert text.startswith("publish_tf map_to_camera: frame 'base_link' hangs on 'odom' already")
+    assert node.broadcaster.fault() == {"not_broadcast": text}  # for the diagnostics
+    peer.spin_until(lambda: False, 0.1)
+    assert not robot_knows(robot, "map")
+
+
+def test_another_map_is_no_other_parent(made: Any, robot: Any, peer: Any) -> None:
+    node = made(publish_tf="map_to_camera")
+    node.publish(frame(5 * 10**9), node.config)
+    heard(robot, peer, "map", "base_link", None)
+    known(node, peer, "map", "base_link", None)  # it has come back to us
+    cellar = frame(6 * 10**9)
+    object.__setattr__(cellar, "map_frame", "cellar")
+    node.publish(cellar, node.config)
+    heard(robot, peer, "cellar", "base_link", None)
+    assert not node.notes
+
+
+def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    check(NodeConfig())
+    check(NodeConfig(transform_tolerance=3.0))
+    package = "the Python package tf2_ros.* sudo apt install ros-jazzy-tf2-ros-py"
+    with pytest.raises(ValueError, match=f"^base_frame 'base_link' needs {package}$"):
+        check(NodeConfig(base_frame="base_link"))
+    with pytest.raises(ValueError, match=f"^publish_tf map_to_odom needs {package}$"):
+        check(NodeConfig(publish_tf="map_to_odom"))

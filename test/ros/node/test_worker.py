@@ -1,0 +1,225 @@
+"""The worker: nothing waits for a slow frame, the newest wins, and every frame is accounted for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from sensor_msgs.msg import Image
+
+from rs_localizer.pipeline.frames import Refusal, Waiting
+from rs_localizer.ros.node.refusals import Refusals
+from rs_localizer.ros.node.statistics import Statistics
+from rs_localizer.ros.node.worker import Worker, wait_for_workers
+
+PATIENCE = 10.0  # s, of a machine that is busy
+
+
+class Count(Statistics):
+    """Frames are plain text here, of which there are no details and no stamps."""
+
+    def received(self, topic: str, message: Any) -> None:
+        super().received(topic, Image())
+
+    def answered(self, frame: Any, received: float) -> None:
+        assert received <= time.monotonic()
+
+
+class Fake:
+    """Stands in for the localizer of the frames."""
+
+    def __init__(self) -> None:
+        self.settings = "old"
+        self.started = threading.Semaphore(0)
+        self.go_on = threading.Semaphore(0)
+        self.published: list[str] = []
+        self.done = threading.Semaphore(0)
+        self.errors: list[str] = []
+        self.mounted: set[str] = set()
+        self.patience = 10.0
+        self.refusals = Refusals(lambda text: None)
+        self.statistics = Count(self.refusals)
+        frames: Any = self
+        self.worker = Worker(frames, self._publish, self.statistics, self._fail)
+
+    def send(self, frame: str, topic: str = "frames") -> None:
+        self.worker.localize(topic, frame, lambda frames, message: self._localize(message))
+
+    def wait(self, semaphore: threading.Semaphore) -> None:
+        assert semaphore.acquire(timeout=PATIENCE)
+
+    def _localize(self, frame: str) -> Any:
+        self.started.release()
+        before = self.settings
+        assert self.go_on.acquire(timeout=PATIENCE)
+        assert self.settings == before
+        if frame == "bug":
+            self.done.release()
+            raise TypeError("a bug")
+        if frame.startswith("late"):
+            return self._waiting(frame)
+        if frame == "dark":
+            self.done.release()
+            return Refusal("dark", "there is no light")
+        return f"{frame} {self.settings}"
+
+    def _waiting(self, frame: str) -> Any:
+        def again() -> Any:
+            return frame if frame in self.mounted else self._waiting(frame)
+
+        return Waiting("no_transform", "not yet", again, self.patience)
+
+    def _publish(self, frame: Any) -> None:
+        self.published.append(frame)
+        self.done.release()
+
+    def _fail(self, text: str) -> None:
+        self.errors.append(text)
+        self.done.release()
+
+
+@pytest.fixture
+def fake() -> Iterator[Fake]:
+    fake = Fake()
+    yield fake
+    fake.worker.close()
+    fake.go_on.release(100)
+    assert wait_for_workers(PATIENCE)
+
+
+def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake: Fake) -> None:
+    fake.send("one")
+    fake.wait(fake.started)
+    for frame in ("two", "three", "four"):
+        fake.send(frame)
+    fake.go_on.release(2)
+    fake.wait(fake.done)
+    fake.wait(fake.done)
+    assert fake.published == ["one old", "four old"]
+    summary = fake.statistics.summary()
+    assert (summary.received, summary.replaced) == ({"frames": 4}, 2)
+
+
+def test_topics_do_not_replace_each_other(fake: Fake) -> None:
+    fake.send("one")
+    fake.wait(fake.started)
+    fake.send("two")
+    fake.send("other", topic="others")
+    fake.send("three")  # in the place of two
+    fake.go_on.release(3)
+    for _ in range(3):
+        fake.wait(fake.done)
+    assert fake.published == ["one old", "three old", "other old"]
+
+
+def test_updates_come_before_the_next_frame_and_never_within_one(fake: Fake) -> None:
+    order: list[str] = []
+
+    def settings(text: str) -> Any:
+        def change(frames: Any) -> None:
+            order.append(text)
+            fake.settings = text
+
+        return change
+
+    fake.send("one")
+    fake.wait(fake.started)
+    fake.send("two")
+    fake.worker.update("settings", settings("newer"))
+    fake.worker.update("camera", lambda frames: order.append("camera"))
+    fake.worker.update("settings", settings("newest"))
+    fake.go_on.release(2)
+    fake.wait(fake.done)
+    fake.wait(fake.done)
+    assert fake.published == ["one old", "two newest"]
+    assert order == ["camera", "newest"]
+
+
+def test_updates_do_not_wait_for_a_frame(fake: Fake) -> None:
+    done = threading.Event()
+    fake.worker.update("camera", lambda frames: done.set())
+    assert done.wait(PATIENCE)
+
+
+def test_errors_and_refusals_are_told_and_it_goes_on(fake: Fake) -> None:
+    def fail(frames: Any) -> None:
+        raise ValueError("no such setting")
+
+    fake.go_on.release(3)
+    for frame in ("bug", "dark", "light"):
+        fake.send(frame)
+        fake.wait(fake.done)
+    fake.worker.update("settings", fail)
+    fake.wait(fake.done)
+    assert fake.published == ["light old"]
+    assert fake.refusals.counts == {"internal_error": 1, "dark": 1}
+    summary = fake.statistics.summary()
+    assert summary.refused == 2
+    assert fake.errors[0].startswith("ValueError('no such setting') in fail, ")
+
+
+def test_nothing_is_published_after_a_pause(fake: Fake) -> None:
+    fake.send("one")
+    fake.wait(fake.started)
+    fake.send("two")
+    fake.worker.pause()  # does not wait for the frame
+    fake.send("three")
+    fake.go_on.release(2)
+    fake.wait(fake.done)
+    assert fake.published == ["three old"]
+    assert fake.statistics.summary().dropped == 2  # none is lost unseen
+
+
+def test_a_late_mounting_keeps_no_other_frame_waiting(fake: Fake) -> None:
+    fake.go_on.release(4)
+    for frame in ("late 1", "late 2", "next"):
+        fake.send(frame)
+        fake.wait(fake.started)
+    fake.wait(fake.done)
+    assert fake.published == ["next old"]
+    fake.mounted = {"late 2"}  # later ones wait for the first
+    time.sleep(0.05)
+    assert fake.published == ["next old"]
+    fake.mounted = {"late 1", "late 2"}
+    fake.wait(fake.done)
+    fake.wait(fake.done)
+    assert fake.published == ["next old", "late 1", "late 2"]
+    assert fake.statistics.summary().refused == 0
+
+
+def test_a_mounting_that_does_not_come_is_a_refusal(fake: Fake) -> None:
+    fake.patience = 0.05
+    fake.go_on.release(1)
+    fake.send("late")
+    deadline = time.monotonic() + PATIENCE
+    while not fake.refusals.counts:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert fake.refusals.counts == {"no_transform": 1}
+    assert fake.published == []
+
+
+def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake: Fake) -> None:
+    fake.go_on.release(1)
+    fake.send("late")
+    fake.wait(fake.started)
+    deadline = time.monotonic() + PATIENCE
+    fake.worker.pause()
+    fake.mounted = {"late"}
+    while not fake.statistics.summary().dropped:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert fake.published == []
+
+
+def test_the_end_waits_for_the_last_frame_but_not_for_ever(fake: Fake) -> None:
+    fake.send("one")
+    fake.wait(fake.started)
+    fake.worker.close()
+    assert not wait_for_workers(0.05)
+    fake.go_on.release()
+    assert wait_for_workers(PATIENCE)
+    assert fake.published == []
