@@ -10,13 +10,14 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 
 # What each part may import besides itself; every part has a row.
-METHOD = {"core", "config", "solvers", "estimation", "localizer", "tracking"}
+METHOD = {"core", "config", "solvers", "estimation", "inertial", "localizer", "tracking"}
 MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
     "data": set(),
     "core": set(),
     "config": {"core"},
     "solvers": {"core"},
+    "inertial": {"core"},
     "estimation": {"core", "config", "solvers"},
     "localizer": METHOD - {"localizer", "tracking"},
     "tracking": METHOD - {"tracking"},

@@ -40,7 +40,7 @@ def make(**changed: Any) -> Any:
 
 
 def as_rclpy(message: Any) -> Any:
-    from rs_localizer.ros.conversion import copy_message
+    from rs_localizer.ros.node.conversion import copy_message
 
     return copy_message(message, message.__msgtype__)
 

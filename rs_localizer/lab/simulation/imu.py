@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.lab.true_motion import BODY_FROM_CAMERA, TrueMotion
+from rs_localizer.lab.simulation.true_motion import BODY_FROM_CAMERA, TrueMotion
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up
 _STEP = 1e-5  # s, of the difference that gives accelerations

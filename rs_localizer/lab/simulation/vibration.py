@@ -9,7 +9,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.lab.true_motion import TrueMotion, TrueState
+from rs_localizer.lab.simulation.true_motion import TrueMotion, TrueState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
