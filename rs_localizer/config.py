@@ -423,7 +423,7 @@ class NodeConfig(LocalizerConfig):
     matching: Matching = field(default_factory=Matching)
     imu: Imu = field(default_factory=Imu)
     gravity_in_map: tuple[float, ...] = setting(
-        (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length, for imu.gravity"
+        (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
     )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 
