@@ -1,0 +1,174 @@
+"""How the camera turned during the readout, as a gyroscope knows it.
+
+The body rate is a natural cubic spline through the samples. Between two of them the camera turns by
+``exp(-theta)``, with Magnus' series up to its second term (Blanes, Casas, Oteo, Ros, "The Magnus
+expansion and some of its applications", 2009):
+
+    theta(h) = I + I x M / h,   I = integral of omega,   M = integral of (t - h/2) omega
+
+both in closed form for a cubic. The axes are those of the camera at each moment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.jit import kernel
+from rs_localizer.core.so3 import exp
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownTurn:
+    """The camera's turn beside the motion that its points are to tell.
+
+    Times are row times, rates are body rates in rad per readout, along the camera axes of then.
+    """
+
+    tau: Array  # (k,) of the samples, increasing, k >= 2
+    rates: Array  # (k-1,4,3) cubic of each interval, in powers of the time since its start
+    rotations: Array  # (k,3,3) camera_then_from_camera_at_tau_0
+    # (6,6) of what the gyroscope is off by: a constant rate and its change, rad per readout and
+    # per readout squared, along the axes at tau = 0
+    error: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    rate_noise: float = 0.0  # rad per readout, of the rate at one moment
+
+    @classmethod
+    def of(
+        cls, tau: Array, rates: Array, error: Array | None = None, rate_noise: float = 0.0
+    ) -> KnownTurn:
+        """The turn of body rates (k,3), rad per readout, at row times (k,).
+
+        Raises:
+            ValueError: fewer than two samples, or times that do not increase.
+        """
+        tau = np.ascontiguousarray(tau, dtype=np.float64)
+        rates = np.ascontiguousarray(rates, dtype=np.float64)
+        if len(tau) < 2 or not np.all(np.diff(tau) > 0.0):
+            raise ValueError(f"need two or more increasing times, got {len(tau)}")
+        cubics = spline(tau, rates)
+        rotations = rotations_at_knots(tau, cubics)
+        error = np.zeros((6, 6)) if error is None else error
+        return cls(tau, cubics, rotations, error, rate_noise)
+
+    def at(self, tau: float) -> tuple[Array, Array]:
+        """Rotation (3,3) camera_then_from_camera_at_tau_0 and body rate (3,) at ``tau``."""
+        rotations, rates = self.at_rows(np.array([tau]))
+        return rotations[0], rates[0]
+
+    def at_rows(self, tau: Array) -> tuple[Array, Array]:
+        """Rotations (n,3,3) and body rates (n,3) at row times (n,)."""
+        times = np.ascontiguousarray(tau, dtype=np.float64)
+        found: tuple[Array, Array] = turns_at(times, self.tau, self.rates, self.rotations)
+        return found
+
+    def acceleration(self, tau: float) -> Array:
+        """Change (3,) of the body rate at ``tau``, rad per readout squared."""
+        place = int(np.clip(np.searchsorted(self.tau, tau) - 1, 0, len(self.rates) - 1))
+        since = tau - self.tau[place]
+        _, first, second, third = self.rates[place]
+        change: Array = first + since * (2.0 * second + 3.0 * since * third)
+        return change
+
+
+@kernel
+def spline(times: Array, values: Array) -> Array:
+    """Natural cubic spline (k-1,4,3) through values (k,3) at times (k,): powers from each start."""
+    count = len(times)
+    # Second derivatives by Thomas' algorithm; zero at both ends.
+    second = np.zeros((count, 3))
+    upper = np.zeros(count)
+    for i in range(1, count - 1):
+        before, after = times[i] - times[i - 1], times[i + 1] - times[i]
+        pivot = 2.0 * (before + after) - before * upper[i - 1]
+        upper[i] = after / pivot
+        for axis in range(3):
+            slope = (values[i + 1, axis] - values[i, axis]) / after
+            slope -= (values[i, axis] - values[i - 1, axis]) / before
+            second[i, axis] = (6.0 * slope - before * second[i - 1, axis]) / pivot
+    for i in range(count - 2, 0, -1):
+        for axis in range(3):
+            second[i, axis] -= upper[i] * second[i + 1, axis]
+    cubics = np.empty((count - 1, 4, 3))
+    for i in range(count - 1):
+        step = times[i + 1] - times[i]
+        for axis in range(3):
+            here, there = second[i, axis], second[i + 1, axis]
+            cubics[i, 0, axis] = values[i, axis]
+            slope = (values[i + 1, axis] - values[i, axis]) / step
+            cubics[i, 1, axis] = slope - step * (2.0 * here + there) / 6.0
+            cubics[i, 2, axis] = 0.5 * here
+            cubics[i, 3, axis] = (there - here) / (6.0 * step)
+    return cubics
+
+
+@kernel
+def _turn(cubic: Array, time: float) -> Array:
+    """Rotation vector (3,) of the turn from the start of an interval to a time in it."""
+    whole, moment = np.empty(3), np.empty(3)
+    for axis in range(3):
+        a, b, c, d = cubic[0, axis], cubic[1, axis], cubic[2, axis], cubic[3, axis]
+        whole[axis] = time * (a + time * (b / 2.0 + time * (c / 3.0 + time * d / 4.0)))
+        # Over the time, so that none is divided by.
+        moment[axis] = time * time * ((b + time * c) / 12.0 + 0.075 * time * time * d)
+    turn = np.empty(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        turn[i] = whole[i] + whole[j] * moment[k] - whole[k] * moment[j]
+    return turn
+
+
+@kernel
+def _place(time: float, times: Array) -> int:
+    """The interval that a time lies in; the first or the last of times outside."""
+    place: int = np.searchsorted(times, time) - 1
+    return min(max(place, 0), len(times) - 2)
+
+
+@kernel
+def rotations_at_knots(times: Array, cubics: Array) -> Array:
+    """Rotations (k,3,3), camera_then_from_camera_at_time_0, at the knots of a spline of rates."""
+    count = len(times)
+    rotations = np.empty((count, 3, 3))
+    rotations[0] = np.eye(3)
+    for i in range(count - 1):
+        step = exp(-_turn(cubics[i], times[i + 1] - times[i]))
+        rotations[i + 1] = multiplied(step, rotations[i])
+    start = _place(0.0, times)
+    middle = multiplied(exp(-_turn(cubics[start], -times[start])), rotations[start])
+    back = middle.T.copy()
+    for i in range(count):
+        rotations[i] = multiplied(rotations[i], back)
+    return rotations
+
+
+@kernel
+def turns_at(
+    wanted: Array, times: Array, cubics: Array, rotations: Array
+) -> tuple[Array, Array]:
+    """Rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates; see `KnownTurn`."""
+    found, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
+    for i in range(len(wanted)):
+        place = _place(wanted[i], times)
+        since = wanted[i] - times[place]
+        found[i] = multiplied(exp(-_turn(cubics[place], since)), rotations[place])
+        for axis in range(3):
+            cubic = cubics[place]
+            rates[i, axis] = cubic[0, axis] + since * (
+                cubic[1, axis] + since * (cubic[2, axis] + since * cubic[3, axis])
+            )
+    return found, rates
+
+
+@kernel
+def multiplied(left: Array, right: Array) -> Array:
+    """Product of two (3,3) matrices."""
+    product = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            product[i, j] = (
+                left[i, 0] * right[0, j] + left[i, 1] * right[1, j] + left[i, 2] * right[2, j]
+            )
+    return product

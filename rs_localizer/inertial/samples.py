@@ -1,0 +1,68 @@
+"""What a gyroscope and an accelerometer measured, by the camera's clock and in its axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, IntArray
+
+MARGIN = 4
+"""Samples before and after an interval that the spline through its samples wants to have: what
+lies farther away counts less than 0.5 % in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSamples:
+    """Samples (n) in the order of their times.
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, times that do not increase.
+    """
+
+    times_ns: IntArray  # (n,) camera's clock
+    angular_velocity: Array  # (n,3) rad/s, camera axes
+    specific_force: Array | None = None  # (n,3) m/s^2, camera axes; upwards at rest
+
+    def __post_init__(self) -> None:
+        count = len(self.times_ns)
+        if np.shape(self.times_ns) != (count,) or np.any(np.diff(self.times_ns) <= 0):
+            raise ValueError("times_ns must be (n,) and increase")
+        for name in ("angular_velocity", "specific_force"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if np.shape(values) != (count, 3) or not np.all(np.isfinite(values)):
+                raise ValueError(
+                    f"{name} must be ({count},3) and finite, got shape {np.shape(values)}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    def around(self, first_ns: int, last_ns: int) -> ImuSamples | None:
+        """The samples that cover an interval, and a few on both sides; None if they do not."""
+        first = int(np.searchsorted(self.times_ns, first_ns, "right"))
+        last = int(np.searchsorted(self.times_ns, last_ns, "left"))
+        if first == 0 or last == len(self):
+            return None
+        part = slice(max(first - MARGIN, 0), last + MARGIN)
+        force = self.specific_force
+        return ImuSamples(
+            self.times_ns[part],
+            self.angular_velocity[part],
+            None if force is None else force[part],
+        )
+
+
+def needed(readout_time: float, middle_ns: int, period_ns: int) -> tuple[int, int]:
+    """First and last time (ns) of what a frame wants.
+
+    Args:
+        readout_time: s.
+        middle_ns: exposure of its middle row.
+        period_ns: from sample to sample.
+    """
+    reach = round(0.5e9 * readout_time) + MARGIN * period_ns
+    return middle_ns - reach, middle_ns + reach
