@@ -11,13 +11,13 @@ from __future__ import annotations
 import enum
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import rs_localizer
-from rs_localizer.pipeline.reasons import REASONS
+from rs_localizer.pipeline.reasons import IMU_REASONS, REASONS, Meaning
 
 PAGE = Path(__file__).with_name("api.md")
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
@@ -26,6 +26,14 @@ _REASONS_INTRODUCTION = """\
 
 Written by `python docs/make_api.py` from `rs_localizer/pipeline/reasons.py`. The reasons are the
 same in the library (`Failure.reason`), in what `replay` prints, in the log and in `/diagnostics`.
+
+| reason | means | look at |
+|---|---|---|
+"""
+_IMU_INTRODUCTION = """
+# Why the IMU is not used for an image
+
+The camera goes on alone, and the image has its pose all the same.
 
 | reason | means | look at |
 |---|---|---|
@@ -144,8 +152,11 @@ def _text(item: Any) -> str:
 
 def reasons_page() -> str:
     """The page of the reasons."""
-    rows = (f"| `{name}` | {means} | {look_at} |" for name, (means, look_at) in REASONS.items())
-    return _REASONS_INTRODUCTION + "\n".join(rows) + "\n"
+    return _REASONS_INTRODUCTION + _rows(REASONS) + _IMU_INTRODUCTION + _rows(IMU_REASONS)
+
+
+def _rows(reasons: Mapping[str, Meaning]) -> str:
+    return "".join(f"| `{name}` | {means} | {look} |\n" for name, (means, look) in reasons.items())
 
 
 if __name__ == "__main__":

@@ -142,10 +142,10 @@ class ReadingBuffer:
         stamps = self._stamps[self._first : self._last]
         return self._first + int(np.searchsorted(stamps, stamps[-1] - MEMORY_NS))
 
-    def covers(self, stamp_ns: int) -> bool:
-        """Whether a reading of this moment or a later one has come."""
+    def lag(self, stamp_ns: int) -> int:
+        """By how many ns the newest reading is older than this moment; without one, its stamp."""
         with self._lock:
-            return len(self) > 0 and int(self._stamps[self._last - 1]) >= stamp_ns
+            return stamp_ns - (int(self._stamps[self._last - 1]) if len(self) else 0)
 
     def rate(self) -> float:
         """Readings per second, by the median of the last steps; NaN for less than two."""

@@ -184,7 +184,7 @@ def test_readings_come_while_others_are_asked_for() -> None:
     thread.start()
     asked = START + 200 * MS
     while not done.is_set():
-        if buffer.covers(asked):
+        if buffer.lag(asked) <= 0:
             found.append(buffer.between(asked - 100 * MS, asked))
             asked += 20 * MS
     thread.join()
