@@ -11,7 +11,10 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import ANGULAR
+from rs_localizer.core.steadied import steadied
 from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.inputs import checked, distinct, median_point, near_image, unfit
@@ -25,12 +28,13 @@ from rs_localizer.estimation.prior import (
     state_in,
     with_measurements,
     with_motion,
+    with_turn,
 )
 from rs_localizer.estimation.ransac import Candidate
 from rs_localizer.estimation.refine import step_between
 from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import Frame, MotionSearch
-from rs_localizer.estimation.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, settle
+from rs_localizer.estimation.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, TurnSeen, settle
 from rs_localizer.solvers import Solver, find_solver
 
 # A prediction may be off by this multiple of the inlier threshold.
@@ -93,6 +97,7 @@ class Localizer:
         scores: ArrayLike | None = None,
         prior: Prior | None = None,
         expected_share: float = 0.5,
+        turn: KnownTurn | None = None,
     ) -> Estimate | Failure:
         """Estimate pose and velocities from one frame.
 
@@ -103,6 +108,8 @@ class Localizer:
             prior: what else is known of the motion. A prior motion is also a first guess; if the
                 points do not agree with it, it is dropped and the whole search runs.
             expected_share: share of inliers among the points that a prior motion should find.
+            turn: how the camera turned during the readout, as a gyroscope knows it. A prior
+                motion is then the one beside it.
 
         Returns:
             an :class:`Estimate`, or a :class:`Failure` with its reason. Same seed and same input
@@ -115,6 +122,9 @@ class Localizer:
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         rays, by_ray = self.camera.rays_and_jacobian(pixels)
+        if turn is not None:
+            gradient = self.camera.row_time_gradient
+            rays, by_ray = steadied(rays, self.camera.row_time(pixels), by_ray, gradient, turn)
         seen = np.isfinite(rays[:, 0])
         centre = median_point(points, seen)
         with np.errstate(over="ignore"):
@@ -124,7 +134,7 @@ class Localizer:
         failure = unfit(self.camera, pixels, usable, shown, self.config.min_inliers)
         if failure is not None:
             return failure
-        frame = self._frame(points, pixels, rays, by_ray, usable, centre, scores, prior)
+        frame = self._frame(points, pixels, rays, by_ray, usable, centre, scores, prior, turn)
         if prior is not None and prior.motion is not None:
             tracked = self._track(frame, prior, expected_share)
             if tracked:
@@ -146,8 +156,9 @@ class Localizer:
         centre: Array,
         scores: Array | None,
         prior: Prior | None,
+        turn: KnownTurn | None,
     ) -> Frame:
-        terms = self._terms
+        terms = self._terms if turn is None else with_turn(self._terms, turn.error)
         observations = Observations.of(
             points[usable] - centre,
             rays[usable],
@@ -163,15 +174,25 @@ class Localizer:
             None if scores is None else np.argsort(-scores[usable], kind="stable"),
             terms if prior is None else with_measurements(terms, prior),
             generator(self.config.seed),
-            _with_experience(self._assumed, prior),
+            _with_experience(self._assumed, prior, self._turn_seen(turn)),
+            turn,
         )
+
+    def _turn_seen(self, turn: KnownTurn | None) -> TurnSeen | None:
+        if turn is None:
+            return None
+        _, rate = turn.at(0.0)
+        variance = float(np.trace(turn.error[:3, :3])) / 3.0 + turn.rate_noise**2
+        precision = float(self._terms.informations[0][ANGULAR, ANGULAR][0, 0])
+        typical = 1.0 / precision if precision > 0.0 else math.inf
+        return TurnSeen(float(rate @ rate), variance, typical)
 
     def _track(self, frame: Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
         assert prior.motion is not None
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, frame.centre)
-        terms = with_motion(frame.terms, prior, frame.centre)
+        terms = with_motion(frame.terms, prior, frame.centre, frame.turn is not None)
         best = self._search.optimize(frame, predicted, _PREDICTION_SCALE * threshold, terms)
         start = Candidate(predicted, best.cost)
         posterior = self._final(frame, best, terms)
@@ -214,13 +235,13 @@ class Localizer:
     def _estimate(
         self, frame: Frame, start: Candidate, best: Candidate, posterior: Posterior
     ) -> Estimate:
-        state = posterior.state
+        state, turn = posterior.state, frame.turn
         rotation = state[:9].reshape(3, 3)
         residuals = np.full(frame.count, np.nan)
         residuals[frame.usable] = np.sqrt(posterior.squared_errors)
         inliers = np.zeros(frame.count, dtype=np.bool_)
         inliers[frame.usable] = posterior.inliers
-        return Estimate(
+        found = Estimate(
             rotation=rotation,
             translation=state[9:12] - rotation @ frame.centre,
             angular_velocity=state[12:15],
@@ -237,6 +258,7 @@ class Localizer:
             global_shutter_inliers=self._search.global_shutter_inliers(frame, start),
             iterations=best.samples,
         )
+        return found if turn is None else found.turned(turn)
 
 
 def assumptions(
@@ -265,8 +287,10 @@ def assumptions(
     )
 
 
-def _with_experience(assumed: Assumed, prior: Prior | None) -> Assumed:
-    """The assumptions and what the frames before say of shaking and model error."""
+def _with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None) -> Assumed:
+    """The assumptions and what gyroscope and earlier frames say of turn, shaking, model error."""
+    if turn is not None:
+        assumed = replace(assumed, turn=turn)
     if prior is None or prior.of_shake_sizes is None or prior.of_field_sizes is None:
         return assumed
     return replace(

@@ -6,13 +6,14 @@ together: its state is the camera's pose, velocities and accelerations with thei
 motion model accelerations that fade within a tenth of a second while new ones come (Singer,
 "Estimating optimal tracking filter performance for manned maneuvering targets", 1970), its
 measurement update the localizer's maximum a posteriori estimate with the prediction as prior (an
-iterated update).
+iterated update). A gyroscope takes the place of the motion model's rotation where there is one
+(:mod:`rs_localizer.inertial.aiding`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.shake import shake_in_the_middle
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import (
@@ -34,6 +36,10 @@ from rs_localizer.core.state import (
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.refine import step_between
+from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.status import InertialStatus
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers import find_solver
 
@@ -142,19 +148,20 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
     """The motion without its shaking, its covariance (18,18), and that of the shaking.
 
     A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
-    somewhere else on it.
+    somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.
     """
     values, slopes = shake_in_the_middle(len(estimate.shake))
     turn, rate = values @ estimate.shake, slopes @ estimate.shake
     # As if turned back in its own axes: exp(-[-turn]x) R.
     turned = so3.exp(turn)
+    beside = estimate.beside_turn()
     motion = Motion(
-        turned @ estimate.rotation,
-        turned @ estimate.translation,
-        estimate.angular_velocity - rate,
-        estimate.linear_velocity,
-        angular_acceleration=estimate.angular_acceleration,
-        linear_acceleration=estimate.linear_acceleration,
+        turned @ beside.rotation,
+        turned @ beside.translation,
+        beside.angular_velocity - rate,
+        beside.linear_velocity,
+        angular_acceleration=beside.angular_acceleration,
+        linear_acceleration=beside.linear_acceleration,
     )
     count = len(estimate.joint_covariance)
     jacobian = np.eye(PARAMETERS, count)
@@ -170,6 +177,19 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
         swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
         swing[ANGULAR, ANGULAR] = (slopes**2 @ squares) * np.eye(3)
     return motion, jacobian @ estimate.joint_covariance @ jacobian.T, swing
+
+
+def with_mean_turn(motion: Motion, covariance: Array, turn: KnownTurn) -> tuple[Motion, Array]:
+    """A motion beside a known turn with the mean rate of that, for a camera that goes on alone.
+
+    How much the rate changed within the readout, a gyroscope knows it to change in the next.
+    """
+    ends, rates = turn.at_rows(np.array([-0.5, 0.5]))
+    mean = so3.log(np.ascontiguousarray(ends[0] @ ends[1].T))
+    spread = np.zeros((PARAMETERS, PARAMETERS))
+    spread[ANGULAR, ANGULAR] = np.mean((rates - mean) ** 2) * np.eye(3)
+    faster = replace(motion, angular_velocity=motion.angular_velocity + mean)
+    return faster, covariance + spread
 
 
 @dataclass(slots=True)
@@ -192,12 +212,13 @@ class Tracker:
         localizer: its camera must have a readout time, because the velocities of one image are
             per readout, and its solver must be one for rolling shutters, because a global shutter
             knows no velocities.
+        inertial: of the gyroscope whose samples come with the frames; None: there is none.
 
     Raises:
         ValueError: without a readout time, or with a global-shutter solver.
     """
 
-    def __init__(self, localizer: Localizer) -> None:
+    def __init__(self, localizer: Localizer, inertial: InertialSettings | None = None) -> None:
         if not localizer.camera.readout_time > 0.0:
             raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
         if not find_solver(localizer.config.solver).rolling_shutter:
@@ -206,10 +227,19 @@ class Tracker:
             )
         self.localizer = localizer
         self._track: _Track | None = None
+        readout_time = localizer.camera.readout_time
+        self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
 
     def reset(self) -> None:
         """Forget all frames so far."""
         self._track = None
+        if self._aid is not None:
+            self._aid.reset()
+
+    @property
+    def inertial(self) -> InertialStatus | None:
+        """What became of the gyroscope; None without one."""
+        return None if self._aid is None else self._aid.status
 
     def prediction(self, time_ns: int) -> Prior | None:
         """What the last frames say of the motion at a time; None when there is no track."""
@@ -222,6 +252,8 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         acceleration = self.localizer.config.acceleration
         motion, covariance, swing = unshaken(track.estimate)
+        if track.estimate.turn is not None:
+            motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
         motion, covariance = predict(
             motion, covariance, dt / readout_time, _FADING / readout_time
         )
@@ -235,18 +267,43 @@ class Tracker:
         )
 
     def localize(
-        self, time_ns: int, points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None = None
+        self,
+        time_ns: int,
+        points: ArrayLike,
+        pixels: ArrayLike,
+        scores: ArrayLike | None = None,
+        imu: ImuSamples | None = None,
     ) -> Estimate | Failure:
         """Localize the frame whose middle row was exposed at ``time_ns``.
 
         Arguments, result and errors otherwise as :meth:`Localizer.localize`. A time that does not
         follow the last one (a bag that starts over), a gap, or failures in a row end the track.
+
+        Args:
+            imu: samples from before the last frame with a pose, if there are any, until after the
+                exposure of this one; None: the camera goes alone.
         """
         prior = self.prediction(time_ns)
         if prior is None:
             self._track = None
         share = 0.0 if self._track is None else self._track.share
-        result = self.localizer.localize(points, pixels, scores, prior, share)
+        foreseen = self._foreseen(time_ns, prior, imu)
+
+        def alone() -> Estimate | Failure:
+            return self.localizer.localize(points, pixels, scores, prior, share)
+
+        if self._aid is None or foreseen is None:
+            result = alone()
+            if self._aid is not None:
+                self._aid.compare(time_ns, result)
+        else:
+            found = self.localizer.localize(
+                points, pixels, scores, foreseen.prior, share, foreseen.turn
+            )
+            other = alone() if self._aid.doubtful(foreseen, found) else None
+            result = self._aid.learn(foreseen, found, other)
+            if result and result.turn is not None:
+                prior = foreseen.prior
         if not result:
             if self._track is not None:
                 self._track.failures += 1
@@ -257,10 +314,30 @@ class Tracker:
         return result
 
 
+    def _foreseen(
+        self, time_ns: int, prior: Prior | None, imu: ImuSamples | None
+    ) -> Foreseen | None:
+        if self._aid is None:
+            return None
+        track = self._track
+        if track is None:
+            return self._aid.foresee(imu, time_ns, None, None)
+        readout_time = self.localizer.camera.readout_time
+        motion, covariance, swing = unshaken(track.estimate)
+        added = acceleration_covariance(
+            self.localizer.config.acceleration, 1e-9 * (time_ns - track.time_ns), readout_time
+        )
+        for part in (TURN, ANGULAR, ANGULAR_ACCELERATION):  # what the gyroscope sees
+            added[part] = 0.0
+        added = swing + track.jolts * added
+        before = Before(track.time_ns, motion, covariance, added, _FADING / readout_time)
+        return self._aid.foresee(imu, time_ns, before, prior)
+
+
 def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_ns: int) -> _Track:
     """The track and its newest frame."""
     share = float(np.mean(found.inliers))
-    if track is None or prior is None:
+    if track is None or prior is None or prior.motion is None:
         return _Track(found, time_ns, share, found.of_shake_sizes, found.of_field_sizes, 1.0)
     if found.tracked:
         share = (1.0 - _NEWEST) * track.share + _NEWEST * share
@@ -285,7 +362,8 @@ def _surprise(prior: Prior, found: Estimate) -> float:
     assert prior.covariance is not None
     scale = 1.0 / np.sqrt(np.diag(prior.covariance))
     information = np.linalg.inv(prior.covariance * np.outer(scale, scale)) * np.outer(scale, scale)
-    step = step_between(state_in(prior.motion, np.zeros(3)), state_in(found, np.zeros(3)))
+    motion = found.beside_turn()
+    step = step_between(state_in(prior.motion, np.zeros(3)), state_in(motion, np.zeros(3)))
     posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
     expected = PARAMETERS - float(np.einsum("ij,ji->", information, posterior))
     return float(step @ information @ step) / max(expected, 1.0)

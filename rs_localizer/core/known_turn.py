@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.jit import kernel
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.so3 import exp
 
 
@@ -123,8 +123,9 @@ def _turn(cubic: Array, time: float) -> Array:
 @kernel
 def _place(time: float, times: Array) -> int:
     """The interval that a time lies in; the first or the last of times outside."""
-    place: int = np.searchsorted(times, time) - 1
-    return min(max(place, 0), len(times) - 2)
+    before = np.searchsorted(times, time) - 1
+    place: int = min(max(before, 0), len(times) - 2)
+    return place
 
 
 @kernel
@@ -145,9 +146,7 @@ def rotations_at_knots(times: Array, cubics: Array) -> Array:
 
 
 @kernel
-def turns_at(
-    wanted: Array, times: Array, cubics: Array, rotations: Array
-) -> tuple[Array, Array]:
+def turns_at(wanted: Array, times: Array, cubics: Array, rotations: Array) -> tuple[Array, Array]:
     """Rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates; see `KnownTurn`."""
     found, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
     for i in range(len(wanted)):

@@ -3,8 +3,8 @@
 Row by row the bearings are turned back into the axes of the middle row, so that all that follows
 sees a camera that hardly turns. A point's row is measured with its pixel, and with it the turn: of
 the pixels' noise ``n`` the model explains ``m g^T n``, where ``g`` is the gradient of the row time
-and ``m`` the velocity of the image point (see :mod:`rs_localizer.core.view`). The part ``k`` of
-``m`` that is the known turn's is taken care of here, because
+and ``m`` the velocity of the image point (as the module ``view`` of the estimation says). The part
+``k`` of ``m`` that is the known turn's is taken care of here, because
 
     I - (k + m) g^T = (I - k g^T) (I - m' g^T),   m' = (I - k g^T)^-1 m
 
@@ -17,10 +17,10 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.jit import kernel
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lanes.jit import kernel
 
-# As in :mod:`rs_localizer.core.view`: image points that keep pace with the rows.
+# Image points that nearly keep pace with the rows.
 _LEAST_PACE = 0.1
 # Bearings that the turn takes out of the camera's front have no place in its image.
 _LEAST_FRONT = 1e-3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS
@@ -53,6 +54,8 @@ class Estimate(Motion):
     of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
     of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
     tracked: bool = False  # found near a prior motion, without a search
+    # How a gyroscope says that the camera turned; velocities and accelerations are those of both
+    turn: KnownTurn | None = None
 
     @property
     def covariance(self) -> Array:
@@ -64,31 +67,65 @@ class Estimate(Motion):
         turn = shake_at(np.array([tau]), self.shake)[0]
         return turn[:3], turn[3:]
 
+    def turned(self, turn: KnownTurn) -> Estimate:
+        """The same with a known turn, beside which its motion was estimated."""
+        return replace(
+            self,
+            angular_velocity=self.angular_velocity + turn.at(0.0)[1],
+            angular_acceleration=self.angular_acceleration + turn.acceleration(0.0),
+            turn=turn,
+        )
+
+    def beside_turn(self) -> Motion:
+        """The motion but for the known turn."""
+        if self.turn is None:
+            return self
+        return Motion(
+            self.rotation,
+            self.translation,
+            self.angular_velocity - self.turn.at(0.0)[1],
+            self.linear_velocity,
+            angular_acceleration=self.angular_acceleration - self.turn.acceleration(0.0),
+            linear_acceleration=self.linear_acceleration,
+        )
+
+    def turned_beside(self, tau: float) -> Array:
+        """Rotation (3,3) by which the camera is turned beside that motion at ``tau``."""
+        shaken = so3.exp(-self.shake_at(tau)[0])
+        return shaken if self.turn is None else self.turn.at(tau)[0] @ shaken
+
     def at(self, tau: float) -> tuple[Array, Array]:
         """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
-        # No super(): a dataclass with slots is made anew.
-        rotation, translation = Motion.at(self, tau)
-        shaken = so3.exp(-self.shake_at(tau)[0])
-        return shaken @ rotation, shaken @ translation
+        # Not by the object itself: a dataclass with slots is made anew, and this is overridden.
+        rotation, translation = Motion.at(self.beside_turn(), tau)
+        turned = self.turned_beside(tau)
+        return turned @ rotation, turned @ translation
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
-        rotations, translations = Motion.at_rows(self, tau)
+        rotations, translations = Motion.at_rows(self.beside_turn(), tau)
         turns = shake_at(np.asarray(tau, float), self.shake)
-        shaken = so3.exp_many(-turns[:, :3])
-        return shaken @ rotations, np.einsum("nij,nj->ni", shaken, translations)
+        turned = so3.exp_many(-turns[:, :3])
+        if self.turn is not None:
+            turned = self.turn.at_rows(tau)[0] @ turned
+        return turned @ rotations, np.einsum("nij,nj->ni", turned, translations)
 
     def angular_velocity_at(self, tau: float) -> Array:
         """Body rate (3,) at ``tau``, rad per readout, in the camera axes of that moment."""
         turn, rate = self.shake_at(tau)
-        body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self, tau)
+        body_rate = so3.exp(-turn) @ Motion.angular_velocity_at(self.beside_turn(), tau)
         shaken: Array = body_rate + so3.right_jacobian(turn) @ rate
-        return shaken
+        if self.turn is None:
+            return shaken
+        rotation, known = self.turn.at(tau)
+        turned: Array = rotation @ shaken + known
+        return turned
 
     def linear_velocity_at(self, tau: float) -> Array:
         """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
-        velocity: Array = so3.exp(-self.shake_at(tau)[0]) @ Motion.linear_velocity_at(self, tau)
-        return velocity
+        velocity = Motion.linear_velocity_at(self.beside_turn(), tau)
+        turned: Array = self.turned_beside(tau) @ velocity
+        return turned
 
     @property
     def position(self) -> Array:

@@ -18,6 +18,7 @@ from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,
+    ANGULAR_ACCELERATION,
     LINEAR,
     MOTION_PARAMETERS,
     PARAMETERS,
@@ -30,6 +31,8 @@ _LEAST_DEVIATION = 1e-9
 # A tenth of the speed goes with the accelerations of the whole.
 _JOLTS = 10.0
 _WALKING = 0.1
+# What a gyroscope knows: turn rate and its change.
+_TURNING = np.ix_(np.r_[ANGULAR, ANGULAR_ACCELERATION], np.r_[ANGULAR, ANGULAR_ACCELERATION])
 # Numbers whose squares are finite.
 _MOST = 1e100
 
@@ -151,22 +154,37 @@ def held_terms() -> PriorTerms:
     return _single(np.diag(np.concatenate([np.zeros(6), np.full(12, _HOLDING)])), _STILL)
 
 
-def slower_terms(terms: PriorTerms, part: float) -> PriorTerms:
+def slower_terms(terms: PriorTerms, part: float, turn_known: bool = False) -> PriorTerms:
     """The prior of a motion whose typical turn rate is this part of the configured one.
 
     Neither travel nor accelerations slow down as much: who hardly turns may walk, and jolts come
-    at any speed.
+    at any speed. What a gyroscope leaves of a turn does not depend on it.
     """
     informations = terms.informations.copy()
+    kept = informations[0][_TURNING].copy()
     informations[0, ANGULAR] /= part**2
     informations[0, LINEAR] /= max(part, _WALKING) ** 2
     informations[0, ACCELERATIONS] /= min(_JOLTS * part, 1.0) ** 2
+    if turn_known:
+        informations[0][_TURNING] = kept
     return terms._replace(informations=informations)
 
 
-def held_beside(terms: PriorTerms) -> PriorTerms:
-    """A camera at rest, of which the direction of gravity is known as in other terms."""
-    return held_terms()._replace(gravity=terms.gravity)
+def held_beside(terms: PriorTerms, turn_known: bool = False) -> PriorTerms:
+    """A camera at rest, of which gravity, and what a gyroscope leaves, are as in other terms."""
+    held = held_terms()._replace(gravity=terms.gravity)
+    if not turn_known:
+        return held
+    informations = held.informations.copy()
+    informations[0][_TURNING] = terms.informations[0][_TURNING]
+    return held._replace(informations=informations)
+
+
+def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
+    """The terms of a motion beside a known turn; error (6,6): see ``KnownTurn.error``."""
+    informations = terms.informations.copy()
+    informations[0][_TURNING] = np.linalg.inv(error)
+    return terms._replace(informations=informations)
 
 
 def gravity_cost(terms: PriorTerms, state: Array) -> float:
@@ -201,10 +219,12 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
     return PriorTerms(informations, references, gravity)
 
 
-def with_motion(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
+def with_motion(
+    terms: PriorTerms, prior: Prior, centre: Array, turn_known: bool = False
+) -> PriorTerms:
     """The terms and a prior's motion in the map frame, for points relative to ``centre`` (3,).
 
-    Its term is the last one.
+    Its term is the last one. Beside a known turn it knows the gyroscope's errors, too.
     """
     if prior.motion is None or prior.covariance is None:
         return terms
@@ -212,6 +232,8 @@ def with_motion(terms: PriorTerms, prior: Prior, centre: Array) -> PriorTerms:
     if len(prior.covariance) == PARAMETERS:  # it knows the accelerations better than a default
         own = own.copy()
         own[0, ACCELERATIONS] = 0.0
+        if turn_known:
+            own[0][_TURNING] = 0.0
     return PriorTerms(
         np.concatenate([own, _inverse(np.asarray(prior.covariance, float))[None]]),
         np.concatenate([terms.references, state_in(prior.motion, centre)[None]]),

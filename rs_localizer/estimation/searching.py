@@ -9,6 +9,7 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, held_terms
@@ -44,6 +45,7 @@ class Frame:
     terms: PriorTerms  # velocity prior and whatever else is known but the pose
     random: Random
     assumed: Assumed
+    turn: KnownTurn | None  # what the observations are steadied by
 
 
 class MotionSearch:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import PARAMETERS, VELOCITIES
+from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, Sizes, examine
 from rs_localizer.estimation.observations import Observations
@@ -71,6 +71,20 @@ _COVERED = 4.0
 SHAKE_SIZES, FIELD_SIZES = len(_SHAKE_SIZES), len(_FIELD_SIZES)
 
 
+@dataclass(frozen=True, slots=True)
+class TurnSeen:
+    """What a gyroscope says of the speed of a motion."""
+
+    squared_rate: float  # (rad per readout)^2
+    variance: float  # of each axis, if the camera is at rest
+    typical_variance: float  # of each axis, by the prior of the motion
+
+    def evidence(self, speed: float) -> float:
+        """Logarithm of the likelihood of a typical speed, but for a constant."""
+        variance = self.variance + speed**2 * self.typical_variance
+        return -0.5 * (self.squared_rate / variance + 3.0 * math.log(variance))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Assumed:
     """What is assumed of a camera and its map, beside the prior of the motion."""
@@ -83,6 +97,7 @@ class Assumed:
     of_field_sizes: Array
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
+    turn: TurnSeen | None = None  # by a gyroscope
 
     def field_sizes(self, depth: float) -> Array:
         """Standard deviations (k,) of the field to try, px, of points so far away (m)."""
@@ -144,10 +159,13 @@ class _Frame:
         state, cost = self.fitted(start, terms)
         examined = self.examined(state, terms, 0)
         volume = _volume(terms, examined)
+        evidence = self.worth * (examined.sizes.evidence + volume)
+        if self.assumed.turn is not None:
+            evidence += self.assumed.turn.evidence(speed)
         return _Mode(
             state,
             self.inflation / self.worth * examined.covariance,
-            self.worth * (examined.sizes.evidence + volume),
+            evidence,
             self.worth * volume,
             cost / self.noise**2,
             speed,
@@ -230,7 +248,8 @@ def _settled(
         agreement=examined.agreement,
     )
     planar = other is not None
-    if planar or (assumed.may_rest and not _clearly_moving(found, terms)):
+    turn_known = assumed.turn is not None
+    if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
         return _weighed(frame, found, planar)
     return found
 
@@ -240,8 +259,11 @@ def _rather_rests(frame: _Frame, best: Posterior, examined: Examined) -> bool:
     if not frame.assumed.may_rest:
         return False
     still = np.concatenate([best.state[:12], np.zeros(12)])
-    rest = frame.mode(still, held_beside(frame.terms), 0.0)
+    turn = frame.assumed.turn
+    rest = frame.mode(still, held_beside(frame.terms, turn is not None), 0.0)
     moving = examined.sizes.evidence + _volume(frame.terms, examined)
+    if turn is not None:
+        moving += turn.evidence(1.0)
     return rest.evidence + frame.odds > moving
 
 
@@ -278,13 +300,14 @@ def _followed(
     )
 
 
-def _clearly_moving(found: Posterior, terms: PriorTerms) -> bool:
+def _clearly_moving(found: Posterior, terms: PriorTerms, turn_known: bool) -> bool:
     """Whether neither rest nor another typical speed would change anything."""
-    spread = found.covariance[VELOCITIES, VELOCITIES]
+    chosen = LINEAR if turn_known else VELOCITIES  # of the others the gyroscope knows
+    spread = found.covariance[chosen, chosen]
     information = inverted(np.ascontiguousarray(spread))
-    velocities = found.state[12:18]
+    velocities = found.state[6:][chosen]  # behind the pose a state is longer by six
     # The trace is as much as the largest eigenvalue could be.
-    part = float(np.diag(terms.informations[0])[VELOCITIES] @ np.diag(spread))
+    part = float(np.diag(terms.informations[0])[chosen] @ np.diag(spread))
     return bool(
         part < _LITTLE_OF_THE_PRIOR and velocities @ information @ velocities > _CLEARLY_MOVING
     )
@@ -323,14 +346,15 @@ def _weighed(frame: _Frame, found: Posterior, planar: bool) -> Posterior:
 def _modes(frame: _Frame, found: Posterior, planar: bool) -> list[_Mode]:
     """A Gaussian for each speed and, before a plane, for either way that it may lean."""
     terms, may_rest = frame.terms, frame.assumed.may_rest
+    turn_known = frame.assumed.turn is not None
     modes: list[_Mode] = []
     near = np.concatenate([found.state[:12], np.zeros(12)]) if may_rest else found.state
     other = mirrored(frame.observations.points, frame.inliers, near) if planar else None
     for speed in _SPEEDS if may_rest else (1.0,):
         if speed == 0.0:
-            chosen = held_beside(terms)
+            chosen = held_beside(terms, turn_known)
         else:
-            chosen = terms if speed == 1.0 else slower_terms(terms, speed)
+            chosen = terms if speed == 1.0 else slower_terms(terms, speed, turn_known)
         modes.append(frame.mode(near, chosen, speed))
         near = modes[-1].state
         if planar and other is None:

@@ -1,158 +1,222 @@
-"""A gyroscope beside a tracker: what it says of each frame, and whether it can be believed."""
+"""A gyroscope beside a tracker: it foresees each frame, and learns from it."""
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
-from rs_localizer.inertial.filter import GyroscopeFilter
-from rs_localizer.inertial.mounting import fit_mounting
-from rs_localizer.inertial.offset import CameraTurn, fit_offset
+from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import PARAMETERS
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.refine import step_between
+from rs_localizer.inertial import turning
+from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
+from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
-from rs_localizer.inertial.turning import BIAS, OFFSET, turn_between
+from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
-# Squared Mahalanobis length of what a frame changes in the predicted rotation and turn rate; a
-# chi-squared variable of six degrees of freedom exceeds this once in a million.
-_MOST_SURPRISE = 38.0
-# So many of the last frames that contradict the gyroscope are no chance.
-_WATCHED, _CONTRADICTIONS = 12, 6
-# Turns of the camera that are kept to find out why, and how often that is tried (frames).
-_KEPT, _TRY_EVERY = 90, 15
-_LONGEST_PAIR_NS = 200_000_000
-_MEMORY_NS = 4_000_000_000
-# Turns smaller than this, in deviations, say nothing.
-_TELLING = 5.0
-# Of the camera's turns and the gyroscope's, as a part of them, beyond the deviations.
-_ALLOWED = 0.03
+# Points that fit without the gyroscope, beyond those that fit with it, that speak against it.
+_BETTER_SHARE, _BETTER_COUNT = 1.05, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Believed:
-    """A frame with a pose, as the gyroscope is compared with it."""
+class Before:
+    """The last frame with a pose, for a prediction."""
 
     middle_ns: int
-    rotation: Array  # (3,3) camera_from_map
-    covariance: Array  # (3,3) of it, rad^2
+    motion: Motion  # beside its known turn
+    covariance: Array  # (18,18)
+    added: Array  # (18,18) that the prediction gets, but for the rotation
+    fading: float  # of accelerations, in readouts
 
 
-class GyroscopeWatch:
-    """Drops a gyroscope that contradicts the camera, finds out why, and takes it up again."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Foreseen:
+    """What the gyroscope says of a frame."""
 
-    def __init__(self, settings: InertialSettings, filter_: GyroscopeFilter) -> None:
-        self._settings, self._filter = settings, filter_
-        self.reset()
+    middle_ns: int
+    turn: KnownTurn
+    prior: Prior | None  # of the motion beside the turn
+    predicted: Predicted | None  # the same with the gyroscope's parameters
+
+
+class GyroscopeAid:
+    """The gyroscope of one camera.
+
+    Args:
+        settings: what is known of it.
+        readout_time: s, of the camera.
+    """
+
+    def __init__(self, settings: InertialSettings, readout_time: float) -> None:
+        self._settings, self._readout_time = settings, readout_time
+        self.filter = GyroscopeFilter(settings)
+        self._watch = GyroscopeWatch(settings, self.filter)
+        self._last_ns: int | None = None
+        self.status = InertialStatus(Alone.NO_SAMPLES)
 
     def reset(self) -> None:
         """Forget all frames."""
-        self.dropped = Alone.NONE
-        self.angle = 0.0
-        self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
-        self._turns: deque[CameraTurn] = deque(maxlen=_KEPT)
-        self._last: Believed | None = None
-        self._samples: deque[ImuSamples] = deque()
-        self._untried = 0
+        self.filter.reset()
+        self._watch.reset()
+        self._last_ns = None
 
-    def hear(self, samples: ImuSamples) -> None:
-        """Keep the samples that are new."""
-        newest = int(self._samples[-1].times_ns[-1]) if self._samples else -(2**63)
-        first = int(np.searchsorted(samples.times_ns, newest, "right"))
-        if first < len(samples):
-            new = ImuSamples(samples.times_ns[first:], samples.angular_velocity[first:])
-            self._samples.append(new)
-        while self._samples and self._samples[0].times_ns[-1] < samples.times_ns[-1] - _MEMORY_NS:
-            self._samples.popleft()
+    def foresee(
+        self, samples: ImuSamples | None, middle_ns: int, before: Before | None, prior: Prior | None
+    ) -> Foreseen | None:
+        """What is known of a frame before its points; None: the camera has to go alone.
 
-    def judge(self, contradicts: bool, frame: Believed | None) -> None:
-        """Take in a frame: whether it contradicts the gyroscope, and its pose, if it has one."""
-        self._contradictions.append(contradicts)
-        if frame is not None:
-            self._follow(frame)
-        if self.dropped is Alone.NONE:
-            if sum(self._contradictions) >= _CONTRADICTIONS:
-                self.dropped = Alone.DISAGREES
-                self._untried = 0
-                self._explain()
-            return
-        self._untried += 1
-        if self._untried >= _TRY_EVERY:
-            self._untried = 0
-            self._explain()
+        Args:
+            middle_ns: exposure of its middle row.
+            before: the last frame; None: there is no track.
+            prior: what the camera alone foresees.
+        """
+        if self._last_ns is not None and middle_ns > self._last_ns:
+            self.filter.walk(1e-9 * (middle_ns - self._last_ns))
+        self._last_ns = middle_ns
+        if before is None:
+            self.filter.forget_motion()
+        if samples is None or len(samples) == 0:
+            self._alone(Alone.NO_SAMPLES)
+            return None
+        self._watch.hear(samples)
+        if self._watch.dropped is not Alone.NONE:
+            self._alone(self._watch.dropped)
+            return None
+        turn = turning.turn_within(samples, middle_ns, self._readout_time, self.filter.errors)
+        if turn is None:
+            self._alone(Alone.NOT_COVERED)
+            return None
+        if before is None or prior is None:
+            return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
+        predicted = self._predicted(samples, middle_ns, before, prior, turn)
+        prior = replace(prior, motion=predicted.motion, covariance=predicted.covariance)
+        return Foreseen(middle_ns, turn, prior, predicted)
 
-    def _follow(self, frame: Believed) -> None:
-        last, self._last = self._last, frame
-        if last is None or not 0 < frame.middle_ns - last.middle_ns <= _LONGEST_PAIR_NS:
-            return
-        turn = frame.rotation @ last.rotation.T
-        deviation = np.sqrt((np.trace(frame.covariance) + np.trace(last.covariance)) / 3.0)
-        self._turns.append(CameraTurn(last.middle_ns, frame.middle_ns, turn, float(deviation)))
+    def _alone(self, why: Alone) -> None:
+        self.filter.forget_motion()
+        self.status = self._watch.status(why)
 
-    def _explain(self) -> None:
-        """Find a time offset that makes the two agree, or say that the mounting does not."""
-        if not self._samples:
-            return
-        times = np.concatenate([part.times_ns for part in self._samples])
-        rates = np.concatenate([part.angular_velocity for part in self._samples])
-        fit = fit_offset(times, rates, self._turns)
-        if fit is None:
-            return
-        if fit.explains and self._settings.estimate_time_offset:
-            self._filter.reset(fit.time_offset, 2.0 * fit.deviation)
-            self._take_up()
-            return
-        shown, seen = self._compared(ImuSamples(times, rates))
-        if len(seen) and np.sum((seen - shown) ** 2) < _ALLOWED * np.sum(seen**2):
-            self._take_up()
-            return
-        mounting = fit_mounting(shown, seen) if len(seen) else None
-        if mounting is not None and mounting.explains:
-            self.dropped, self.angle = Alone.TURNED, mounting.angle
-        else:
-            self.dropped, self.angle = Alone.DISAGREES, 0.0
+    def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
+        up = self._settings.gravity_in_map
+        seen = None if up is None else gravity_seen(samples, middle_ns, self.filter.errors)
+        if up is None or seen is None:
+            return None
+        return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
 
-    def _take_up(self) -> None:
-        self.dropped, self.angle = Alone.NONE, 0.0
-        self._contradictions.clear()
-
-    def _compared(self, samples: ImuSamples) -> tuple[Array, Array]:
-        """Turns (k,3) of gyroscope and camera, as rotation vectors; those that say something."""
-        shown, seen = [], []
-        for turn in self._turns:
-            camera = so3.log(np.ascontiguousarray(turn.rotation.T))
-            between = turn_between(samples, turn.from_ns, turn.to_ns, self._filter.errors)
-            if between is not None and np.linalg.norm(camera) > _TELLING * turn.deviation:
-                shown.append(so3.log(between.rotation.T.copy()))
-                seen.append(camera)
-        return np.array(shown).reshape(-1, 3), np.array(seen).reshape(-1, 3)
-
-    def status(self, alone: Alone) -> InertialStatus:
-        """What to tell."""
-        errors = self._filter.errors
-        deviations = np.sqrt(np.diag(errors.covariance))
-        return InertialStatus(
-            alone,
-            errors.bias,
-            float(np.sqrt(np.mean(deviations[BIAS] ** 2))),
-            errors.time_offset,
-            float(deviations[OFFSET]),
-            self.angle,
+    def _predicted(
+        self, samples: ImuSamples, middle_ns: int, before: Before, prior: Prior, turn: KnownTurn
+    ) -> Predicted:
+        errors = self.filter.errors
+        between = turning.turn_between(samples, before.middle_ns, middle_ns, errors)
+        if between is None:
+            return self._predicted_by_camera(prior, turn)
+        predicted = self.filter.predict(
+            before.motion,
+            before.covariance,
+            between,
+            turn,
+            1e-9 * (middle_ns - before.middle_ns) / self._readout_time,
+            self._readout_time,
+            before.fading,
         )
+        return replace(predicted, covariance=predicted.covariance + before.added)
+
+    def _predicted_by_camera(self, prior: Prior, turn: KnownTurn) -> Predicted:
+        """The camera's prediction, beside the turn within the frame."""
+        assert prior.motion is not None
+        assert prior.covariance is not None
+        motion = replace(
+            prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3)
+        )
+        covariance = prior.covariance.copy()
+        covariance[RATE] = 0.0
+        covariance[:, RATE] = 0.0
+        covariance[np.ix_(RATE, RATE)] = turn.error
+        with_parameters = np.zeros((PARAMETERS, turning.PARAMETERS))
+        by_parameters = turning.sensitivity(turn, self._readout_time)
+        with_parameters[RATE] = by_parameters @ self.filter.errors.covariance
+        return Predicted(motion, covariance, with_parameters)
+
+    def doubtful(self, foreseen: Foreseen, found: Estimate | Failure) -> bool:
+        """Whether a frame should be tried without the gyroscope."""
+        if not found or (foreseen.predicted is not None and not found.tracked):
+            return True
+        return self._contradicts(foreseen, found)
+
+    def _contradicts(self, foreseen: Foreseen, found: Estimate) -> bool:
+        if foreseen.predicted is None:
+            covariance = np.eye(PARAMETERS)
+            covariance[np.ix_(RATE, RATE)] = foreseen.turn.error
+            step = np.zeros(PARAMETERS)
+            step[RATE] = _left(found)
+            return contradicts(step, covariance)
+        return contradicts(_step(foreseen.predicted, found), foreseen.predicted.covariance)
+
+    def learn(
+        self, foreseen: Foreseen, found: Estimate | Failure, alone: Estimate | Failure | None
+    ) -> Estimate | Failure:
+        """Take in a frame; the better of its results, with the gyroscope and without.
+
+        Args:
+            alone: without the gyroscope; None where there was no doubt.
+        """
+        better = _better(found, alone)
+        if not better:
+            self.filter.forget_motion()
+            self.status = self._watch.status(Alone.NONE)
+            return better
+        if better.turn is None:
+            self.filter.forget_motion()
+            self._watch.judge(True, _believed(foreseen.middle_ns, better))
+            dropped = self._watch.dropped
+            self.status = self._watch.status(Alone.DOUBTED if dropped is Alone.NONE else dropped)
+            return better
+        contradicted = self._contradicts(foreseen, better)
+        self._watch.judge(contradicted, None)
+        posterior = better.joint_covariance[:PARAMETERS, :PARAMETERS]
+        if contradicted:
+            self.filter.forget_motion()
+        elif foreseen.predicted is not None and better.tracked:
+            step = _step(foreseen.predicted, better)
+            self.filter.update(foreseen.predicted, step, posterior)
+        else:
+            self.filter.begin(foreseen.turn, self._readout_time, _left(better), posterior)
+        self.status = self._watch.status(Alone.NONE)
+        return better
+
+    def compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
+        """Compare a gyroscope that was dropped with what the camera sees without it."""
+        if alone and self._watch.dropped is not Alone.NONE:
+            self._watch.judge(False, _believed(middle_ns, alone))
 
 
-def contradicts(step: Array, covariance: Array) -> bool:
-    """Whether a frame moved rotation and turn rate by more than a prediction allows for.
+def _better(found: Estimate | Failure, alone: Estimate | Failure | None) -> Estimate | Failure:
+    if not alone:  # Also where it was not asked for.
+        return found
+    if not found:
+        return alone
+    most = _BETTER_SHARE * np.count_nonzero(found.inliers) + _BETTER_COUNT
+    return alone if np.count_nonzero(alone.inliers) > most else found
 
-    Args:
-        step: (18,) from the prediction to the estimate.
-        covariance: (18,18) of the prediction.
-    """
-    chosen = np.r_[TURN, ANGULAR]
-    moved, expected = step[chosen], covariance[np.ix_(chosen, chosen)]
-    return bool(moved @ np.linalg.solve(expected, moved) > _MOST_SURPRISE)
+
+def _believed(middle_ns: int, found: Estimate) -> Believed:
+    return Believed(middle_ns, found.rotation, found.covariance[:3, :3])
+
+
+def _step(predicted: Predicted, found: Estimate) -> Array:
+    """The step (18,) from a prediction to an estimate, both beside the known turn."""
+    origin = np.zeros(3)
+    return step_between(state_in(predicted.motion, origin), state_in(found.beside_turn(), origin))
+
+
+def _left(found: Estimate) -> Array:
+    """Rate and its change (6,) that the points left beside the known turn."""
+    motion = found.beside_turn()
+    return np.concatenate([motion.angular_velocity, motion.angular_acceleration])

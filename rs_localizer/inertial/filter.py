@@ -76,8 +76,9 @@ class GyroscopeFilter:
         self._with_motion = np.zeros((PARAMETERS, turning.PARAMETERS))
 
     def _set(self, parameters: Array, covariance: Array) -> None:
+        bias, time_offset = parameters[BIAS], float(parameters[OFFSET])
         noise = self._settings.gyroscope_noise
-        self.errors = GyroscopeErrors(parameters[BIAS], float(parameters[OFFSET]), covariance, noise)
+        self.errors = GyroscopeErrors(bias, time_offset, covariance, noise)
 
     def walk(self, seconds: float) -> None:
         """Let time pass."""
@@ -141,9 +142,7 @@ class GyroscopeFilter:
         predicted = transport @ covariance @ transport.T + crossed + crossed.T
         predicted += by_parameters @ self.errors.covariance @ by_parameters.T
         predicted[TURN, TURN] += between.covariance
-        predicted[np.ix_(RATE, RATE)] += turning.unforeseen(
-            within, readout_time, self.errors.noise
-        )
+        predicted[np.ix_(RATE, RATE)] += turning.unforeseen(within, readout_time, self.errors.noise)
         return Predicted(later, predicted, with_parameters)
 
     def update(self, predicted: Predicted, step: Array, posterior: Array) -> None:
@@ -154,9 +153,7 @@ class GyroscopeFilter:
             posterior: (18,18) covariance of the estimate.
         """
         everything = np.arange(PARAMETERS)
-        self._update(
-            everything, predicted.covariance, predicted.with_parameters, step, posterior
-        )
+        self._update(everything, predicted.covariance, predicted.with_parameters, step, posterior)
 
     def begin(self, within: KnownTurn, readout_time: float, left: Array, posterior: Array) -> None:
         """Take in a frame of which nothing was known but its turn.
@@ -172,18 +169,31 @@ class GyroscopeFilter:
         self, known: IntArray, before: Array, with_parameters: Array, step: Array, posterior: Array
     ) -> None:
         """``known``: places of a step that the prediction ``before`` was of."""
-        deviations = np.sqrt(np.diag(before))
-        scaled = before / np.outer(deviations, deviations)
-        gain = np.linalg.solve(scaled, with_parameters / deviations[:, None]).T / deviations
-        after = posterior[np.ix_(known, known)]
-        covariance = self.errors.covariance
-        scale = np.sqrt(np.diag(covariance))
-        gained = gain @ (before - after) @ gain.T / np.outer(scale, scale)
-        # What shaking and model error make of an estimate's covariance may exceed the prediction's.
-        own = np.linalg.cholesky(covariance / np.outer(scale, scale))
-        inner = np.linalg.solve(own, np.linalg.solve(own, gained).T)
-        values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-        kept = own @ vectors * np.sqrt(1.0 - np.clip(values, 0.0, _MOST_GAIN))
+        after = np.ascontiguousarray(posterior[np.ix_(known, known)])
+        gain, gained, left = _gain(before, after, with_parameters)
+        covariance = self.errors.covariance - gained
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain @ step
-        self._with_motion = posterior[:, known] @ gain.T
-        self._set(parameters, scale[:, None] * (kept @ kept.T) * scale)
+        tied = left @ gain.T
+        if len(known) < PARAMETERS:
+            tied = posterior[:, known] @ np.linalg.solve(after, tied)
+        self._with_motion = tied
+        self._set(parameters, 0.5 * (covariance + covariance.T))
+
+
+def _gain(before: Array, after: Array, with_parameters: Array) -> tuple[Array, Array, Array]:
+    """Gain (4,k), what it takes from the covariance (4,4), and the covariance (k,k) after.
+
+    What shaking and model error make of an estimate's covariance may exceed the prediction's. Such
+    a frame says nothing of the parameters, but does not make them worse.
+    """
+    deviations = np.sqrt(np.diag(before))
+    factor = np.linalg.cholesky(before / np.outer(deviations, deviations))
+    inverse = np.linalg.inv(factor) / deviations  # of the factor, of what is not scaled
+    half = inverse @ with_parameters
+    values, vectors = np.linalg.eigh(inverse @ after @ inverse.T)
+    values = np.minimum(values, 1.0)
+    along = vectors.T @ half
+    lost = np.clip(1.0 - values, 0.0, _MOST_GAIN)
+    outer = deviations[:, None] * (factor @ vectors)
+    left = outer * values @ outer.T
+    return half.T @ inverse, along.T * lost @ along, left

@@ -38,7 +38,7 @@ def gravity_seen(
         return None
     now_ns = middle_ns - round(1e9 * errors.time_offset)  # by the clock of the samples
     chosen = np.abs(samples.times_ns - now_ns) <= round(1e9 * _LONGEST)
-    times = 1e-9 * (samples.times_ns[chosen] - now_ns)
+    times = np.asarray(1e-9 * (samples.times_ns[chosen] - now_ns), np.float64)
     if len(times) < 2 or not (times[0] < -_SHORTEST and times[-1] >= 0.0):
         return None
     cubics = spline(times, samples.angular_velocity[chosen] - errors.bias)

@@ -71,7 +71,7 @@ def fit_offset(times_ns: IntArray, rates: Array, turns: Sequence[CameraTurn]) ->
     if len(covered) < _FEWEST:
         return None
     origin = int(times_ns[0])
-    times = 1e-9 * (times_ns - origin)
+    times = np.asarray(1e-9 * (times_ns - origin), np.float64)
     cubics = spline(times, np.ascontiguousarray(rates))
     knots = rotations_at_knots(times, cubics)
     start = 1e-9 * np.array([turn.from_ns - origin for turn in covered])

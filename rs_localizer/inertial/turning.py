@@ -16,8 +16,8 @@ PARAMETERS = 4
 """Of a gyroscope: its bias (3, rad/s), and the time offset of its stamps (s)."""
 BIAS, OFFSET = slice(0, 3), 3
 
-# The integral of white noise is a random walk. Of one over an interval of length 1 the least-squares
-# parabola has a slope and a curvature of these variances (its Legendre coefficients).
+# The integral of white noise is a random walk. The least-squares parabola of one over an interval
+# of length 1 has a slope and a curvature of these variances (by its Legendre coefficients).
 _WALK_SLOPE, _WALK_CURVATURE = 6.0 / 5.0, 120.0 / 7.0
 
 
@@ -117,4 +117,5 @@ def _spanning(
     part = samples.around(here_ns - round(1e9 * before), here_ns + round(1e9 * after))
     if part is None:
         return None, None
-    return 1e-9 * (part.times_ns - here_ns), part.angular_velocity - errors.bias
+    times = np.asarray(1e-9 * (part.times_ns - here_ns), np.float64)
+    return times, part.angular_velocity - errors.bias

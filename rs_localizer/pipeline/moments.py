@@ -19,7 +19,9 @@ where J is the left Jacobian of SO(3): ``exp(a + d) = exp(J(a) d) exp(a)``; it i
 ``-a``. Without acceleration the body rate is ``omega`` at any time; second orders of the
 acceleration are left out.
 Shaking turns the camera by ``delta(tau)`` in its own axes beside all that; its coefficients stand
-behind the motion in the estimate's covariance, and its turn and rate are linear in them.
+behind the motion in the estimate's covariance, and its turn and rate are linear in them. What a
+gyroscope knows of the turn comes last: what is said above is of the motion beside it, and then
+turned by it; its own noise at one moment is added to the angular velocity's.
 """
 
 from __future__ import annotations
@@ -51,16 +53,19 @@ def pose_at(estimate: Estimate, tau: float) -> Pose:
     """Pose of the camera in the map at row time ``tau``."""
     rotation, translation = estimate.at(tau)
     map_from_middle, map_from_then = estimate.rotation.T, rotation.T
-    by_angle = map_from_middle @ so3.right_jacobian(-estimate.angle_at(tau))
+    motion = estimate.beside_turn()
+    by_angle = map_from_middle @ so3.right_jacobian(-motion.angle_at(tau))
     values, _ = _shaking(estimate, tau)
     jacobian = np.zeros((6, len(estimate.joint_covariance)))
-    jacobian[_LINEAR, TURN] = -map_from_middle @ so3.hat(estimate.way_at(tau))
+    jacobian[_LINEAR, TURN] = -map_from_middle @ so3.hat(motion.way_at(tau))
     jacobian[_LINEAR, MOVE] = map_from_middle
     jacobian[_LINEAR, LINEAR] = tau * map_from_middle
     jacobian[_LINEAR, LINEAR_ACCELERATION] = 0.5 * tau * tau * map_from_middle
     jacobian[_ANGULAR, TURN] = map_from_middle
     jacobian[_ANGULAR, ANGULAR] = tau * by_angle
     jacobian[_ANGULAR, ANGULAR_ACCELERATION] = 0.5 * tau * tau * by_angle
+    if estimate.turn is not None:
+        map_from_then = map_from_then @ estimate.turn.at(tau)[0]
     jacobian[_ANGULAR, PARAMETERS:] = np.kron(values, map_from_then)
     return Pose(
         position=-rotation.T @ translation,
@@ -72,8 +77,9 @@ def pose_at(estimate: Estimate, tau: float) -> Pose:
 def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     """Twist of the camera at row time ``tau``, in its axes at that moment; readout_time in s."""
     linear = estimate.linear_velocity_at(tau)
-    shaken = so3.exp(-estimate.shake_at(tau)[0])
-    angle = estimate.angle_at(tau)
+    shaken = estimate.turned_beside(tau)
+    motion = estimate.beside_turn()
+    angle = motion.angle_at(tau)
     turn = shaken @ so3.exp(-angle)
     by_angle = so3.hat(linear) @ shaken @ so3.right_jacobian(angle)
     angular = estimate.angular_velocity_at(tau)
@@ -84,14 +90,19 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     jacobian[_LINEAR, ANGULAR_ACCELERATION] = 0.5 * tau * tau * by_angle
     jacobian[_LINEAR, LINEAR] = turn
     jacobian[_LINEAR, LINEAR_ACCELERATION] = tau * turn
-    jacobian[_LINEAR, PARAMETERS:] = np.kron(values, so3.hat(linear))
     jacobian[_ANGULAR, ANGULAR] = shaken
     jacobian[_ANGULAR, ANGULAR_ACCELERATION] = by_acceleration
-    jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, np.eye(3)) + np.kron(values, so3.hat(angular))
+    if estimate.turn is None:
+        known, rate, noise = np.eye(3), np.zeros(3), 0.0
+    else:
+        (known, rate), noise = estimate.turn.at(tau), estimate.turn.rate_noise
+    jacobian[_LINEAR, PARAMETERS:] = np.kron(values, so3.hat(linear) @ known)
+    by_shake = np.kron(values, so3.hat(angular - rate) @ known)
+    jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, known) + by_shake
+    covariance = _propagate(jacobian / readout_time, estimate.joint_covariance)
+    covariance[_ANGULAR, _ANGULAR] += (noise / readout_time) ** 2 * np.eye(3)
     return Twist(
-        linear=linear / readout_time,
-        angular=angular / readout_time,
-        covariance=_propagate(jacobian / readout_time, estimate.joint_covariance),
+        linear=linear / readout_time, angular=angular / readout_time, covariance=covariance
     )
 
 

@@ -7,7 +7,7 @@ that may stop, so pose, velocities and accelerations are known exactly at every 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +120,20 @@ def vibration(count: int, rng: np.random.Generator, degrees: float, hertz: float
         np.concatenate([amplitude, shaking], axis=1),
         np.column_stack([frequency, np.full(count, 2.0 * np.pi * hertz)]),
         in_step=True,
+    )
+
+
+def shaken_hand(
+    count: int, rng: np.random.Generator, shaking: tuple[tuple[float, float], ...]
+) -> Motions:
+    """Cameras in a hand that vibrate besides, each vibration (degrees, hertz) about any axis."""
+    held = hand(count, rng)
+    motions = [vibration(count, rng, *one) for one in shaking]
+    return replace(
+        held,
+        amplitude=np.concatenate([held.amplitude, *(m.amplitude[:, -1:] for m in motions)], 1),
+        frequency=np.concatenate([held.frequency, *(m.frequency[:, -1:] for m in motions)], 1),
+        phase=np.concatenate([held.phase, *(m.phase[:, -1:] for m in motions)], 1),
     )
 
 

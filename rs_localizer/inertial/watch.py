@@ -1,0 +1,160 @@
+"""Whether a gyroscope can be believed, by what the camera sees."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.state import ANGULAR, TURN
+from rs_localizer.inertial.filter import GyroscopeFilter
+from rs_localizer.inertial.mounting import fit_mounting
+from rs_localizer.inertial.offset import CameraTurn, fit_offset
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.inertial.turning import BIAS, OFFSET, turn_between
+
+# Squared Mahalanobis length of what a frame changes in the predicted rotation and turn rate; a
+# chi-squared variable of six degrees of freedom exceeds this once in a million.
+_MOST_SURPRISE = 38.0
+# So many of the last frames that contradict the gyroscope are no chance.
+_WATCHED, _CONTRADICTIONS = 12, 6
+# Turns of the camera that are kept to find out why, and how often that is tried (frames).
+_KEPT, _TRY_EVERY = 90, 15
+_LONGEST_PAIR_NS = 200_000_000
+_MEMORY_NS = 4_000_000_000
+# Turns smaller than this, in deviations, say nothing.
+_TELLING = 5.0
+# Of the camera's turns and the gyroscope's, as a part of them, beyond the deviations.
+_ALLOWED = 0.03
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Believed:
+    """A frame with a pose, as the gyroscope is compared with it."""
+
+    middle_ns: int
+    rotation: Array  # (3,3) camera_from_map
+    covariance: Array  # (3,3) of it, rad^2
+
+
+class GyroscopeWatch:
+    """Drops a gyroscope that contradicts the camera, finds out why, and takes it up again."""
+
+    def __init__(self, settings: InertialSettings, filter_: GyroscopeFilter) -> None:
+        self._settings, self._filter = settings, filter_
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self.dropped = Alone.NONE
+        self.angle = 0.0
+        self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
+        self._turns: deque[CameraTurn] = deque(maxlen=_KEPT)
+        self._last: Believed | None = None
+        self._samples: deque[ImuSamples] = deque()
+        self._untried = 0
+
+    def hear(self, samples: ImuSamples) -> None:
+        """Keep the samples that are new."""
+        newest = int(self._samples[-1].times_ns[-1]) if self._samples else -(2**63)
+        first = int(np.searchsorted(samples.times_ns, newest, "right"))
+        if first < len(samples):
+            new = ImuSamples(samples.times_ns[first:], samples.angular_velocity[first:])
+            self._samples.append(new)
+        while self._samples and self._samples[0].times_ns[-1] < samples.times_ns[-1] - _MEMORY_NS:
+            self._samples.popleft()
+
+    def judge(self, contradicts: bool, frame: Believed | None) -> None:
+        """Take in a frame.
+
+        Args:
+            contradicts: the gyroscope.
+            frame: its pose, if it was found without the gyroscope.
+        """
+        self._contradictions.append(contradicts)
+        if frame is not None:
+            self._follow(frame)
+        if self.dropped is Alone.NONE:
+            if sum(self._contradictions) >= _CONTRADICTIONS:
+                self.dropped = Alone.DISAGREES
+            return
+        self._untried += 1
+        if self._untried >= _TRY_EVERY:
+            self._untried = 0
+            self._explain()
+
+    def _follow(self, frame: Believed) -> None:
+        last, self._last = self._last, frame
+        if last is None or not 0 < frame.middle_ns - last.middle_ns <= _LONGEST_PAIR_NS:
+            return
+        turn = frame.rotation @ last.rotation.T
+        deviation = np.sqrt((np.trace(frame.covariance) + np.trace(last.covariance)) / 3.0)
+        self._turns.append(CameraTurn(last.middle_ns, frame.middle_ns, turn, float(deviation)))
+
+    def _explain(self) -> None:
+        """Find a time offset that makes the two agree, or say that the mounting does not."""
+        if not self._samples:
+            return
+        times = np.concatenate([part.times_ns for part in self._samples])
+        rates = np.concatenate([part.angular_velocity for part in self._samples])
+        fit = fit_offset(times, rates, self._turns)
+        if fit is None:
+            return
+        if fit.explains and self._settings.estimate_time_offset:
+            self._filter.reset(fit.time_offset, 2.0 * fit.deviation)
+            self._take_up()
+            return
+        shown, seen = self._compared(ImuSamples(times, rates))
+        if len(seen) and np.sum((seen - shown) ** 2) < _ALLOWED * np.sum(seen**2):
+            self._take_up()
+            return
+        mounting = fit_mounting(shown, seen) if len(seen) else None
+        if mounting is not None and mounting.explains:
+            self.dropped, self.angle = Alone.TURNED, mounting.angle
+        else:
+            self.dropped, self.angle = Alone.DISAGREES, 0.0
+
+    def _take_up(self) -> None:
+        self.dropped, self.angle = Alone.NONE, 0.0
+        self._contradictions.clear()
+
+    def _compared(self, samples: ImuSamples) -> tuple[Array, Array]:
+        """Turns (k,3) of gyroscope and camera, as rotation vectors; those that say something."""
+        shown, seen = [], []
+        for turn in self._turns:
+            camera = so3.log(np.ascontiguousarray(turn.rotation.T))
+            between = turn_between(samples, turn.from_ns, turn.to_ns, self._filter.errors)
+            if between is not None and np.linalg.norm(camera) > _TELLING * turn.deviation:
+                shown.append(so3.log(between.rotation.T.copy()))
+                seen.append(camera)
+        return np.array(shown).reshape(-1, 3), np.array(seen).reshape(-1, 3)
+
+    def status(self, alone: Alone) -> InertialStatus:
+        """What to tell."""
+        errors = self._filter.errors
+        deviations = np.sqrt(np.diag(errors.covariance))
+        return InertialStatus(
+            alone,
+            errors.bias,
+            float(np.sqrt(np.mean(deviations[BIAS] ** 2))),
+            errors.time_offset,
+            float(deviations[OFFSET]),
+            self.angle,
+        )
+
+
+def contradicts(step: Array, covariance: Array) -> bool:
+    """Whether a frame moved rotation and turn rate by more than a prediction allows for.
+
+    Args:
+        step: (18,) from the prediction to the estimate.
+        covariance: (18,18) of the prediction.
+    """
+    chosen = np.r_[TURN, ANGULAR]
+    moved, expected = step[chosen], covariance[np.ix_(chosen, chosen)]
+    return bool(moved @ np.linalg.solve(expected, moved) > _MOST_SURPRISE)
