@@ -17,7 +17,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "core": set(),
     "config": {"core"},
     "solvers": {"core"},
-    "inertial": {"core"},
     "estimation": {"core", "config", "solvers"},
     "inertial": {"core", "estimation"},
     "localizer": METHOD - {"inertial", "localizer", "tracking"},

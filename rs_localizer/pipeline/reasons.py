@@ -107,7 +107,7 @@ REASONS = {
 }
 """By the reason as it is counted, logged and published."""
 
-IMU_REASONS = {
+IMU_REASONS: dict[str, Meaning] = {
     ImuReason.NEVER: Meaning("no message has come on imu", "is its topic remapped, does it run?"),
     ImuReason.LATE: Meaning(
         "the messages of the exposure come later than imu.wait, or by another clock",
