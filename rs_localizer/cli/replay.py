@@ -24,16 +24,18 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
     Topics,
+    find_imu,
     find_topics,
     find_transforms,
     has_frames,
+    imu_topics,
     replay,
 )
 from rs_localizer.offline.smoothed import smooth_frames
@@ -50,6 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     topics.add_argument("--camera-info", metavar="TOPIC")
     topics.add_argument("--keypoints", metavar="TOPIC", help="instead of correspondences")
     topics.add_argument("--map-points", metavar="TOPIC", help="the map of the keypoints")
+    inertial = topics.add_mutually_exclusive_group()
+    inertial.add_argument("--imu", metavar="TOPIC", help="of the IMU, if there are several")
+    inertial.add_argument("--no-imu", action="store_true", help="the camera alone")
     offline = parser.add_argument_group(
         "offline (default): at full speed, no ROS needed",
         "With the settings base_frame and publish_tf, transforms come from the recording's "
@@ -109,7 +114,8 @@ def run(args: argparse.Namespace) -> None:
     if args.ros:
         with open_bag(args.bag) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
-            play(bag, None if only_images else _find_topics(bag, args), args.rate or 1.0)
+            topics = None if only_images else _find_topics(bag, args)
+            play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
     config = _config(args.params, args.assignments + given)
@@ -124,7 +130,8 @@ def run(args: argparse.Namespace) -> None:
             raise ValueError(
                 f"{args.bag} has keypoints and no map on map_points; give one with --map"
             )
-        transforms = find_transforms(bag, topics, config)
+        imu = None if args.no_imu or config.imu.use == ImuUse.NONE else find_imu(bag, args.imu)
+        transforms = find_transforms(bag, topics, config, imu)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         localizer.load_map()
         if args.smooth and config.readout_time == 0.0:
@@ -132,7 +139,9 @@ def run(args: argparse.Namespace) -> None:
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         with fresh(out, args.overwrite):
             _hint(args.bag, args.params)
-            tally = _replay(bag, topics, localizer, notices, out, args)
+            if imu is None and not args.no_imu and len(several := imu_topics(bag)) > 1:
+                print(f"no IMU is used: choose {' or '.join(several)} with --imu")
+            tally = _replay(bag, topics, imu, localizer, notices, out, args)
         _tell(tally, config, out)
         if not tally.frames:
             raise ValueError(
@@ -153,6 +162,14 @@ def _detect_command(path: Path) -> str:
 
 def _find_topics(bag: BagReader, args: argparse.Namespace) -> Topics:
     return find_topics(bag, args.correspondences, args.camera_info, args.keypoints, args.map_points)
+
+
+def _played_imus(bag: BagReader, args: argparse.Namespace) -> list[str]:
+    """Topics of IMUs that live nodes shall hear."""
+    if args.no_imu:
+        return []
+    given = find_imu(bag, args.imu) if args.imu else None
+    return imu_topics(bag) if given is None else [given]
 
 
 def _check_usage(args: argparse.Namespace) -> None:
@@ -200,6 +217,7 @@ def _hint(bag: Path, params: Path | None) -> None:
 def _replay(
     bag: BagReader,
     topics: Topics,
+    imu: str | None,
     localizer: FrameLocalizer,
     notices: Counter[str],
     out: Path,
@@ -213,7 +231,7 @@ def _replay(
         BagWriter(out / RESULT, args.storage) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
-        for recorded_ns, result in replay(bag, topics, localizer):
+        for recorded_ns, result in replay(bag, topics, localizer, imu):
             if result:
                 tally.frames.append(result)
                 if not args.smooth:
@@ -229,6 +247,7 @@ def _replay(
                 tally.not_sent += not write_frame(writer, frame, localizer, frame.input_stamp_ns)
             write_bridged(out, tally.smoothed.bridged)
     tally.seconds = time.perf_counter() - start
+    tally.imu = localizer.imu.state
     tally.repeated = write_texts(out, tally.written, localizer.config)
     return tally
 

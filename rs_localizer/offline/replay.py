@@ -8,10 +8,11 @@ from typing import Any
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
-from rs_localizer.io.messages import MessageError
+from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transforms.rigid import TransformError
 from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.offline.imu_first import LOOK_AHEAD, imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
 
 _INPUTS = {
@@ -19,13 +20,14 @@ _INPUTS = {
     "keypoints": "sensor_msgs/msg/PointCloud2",
     "map_points": "sensor_msgs/msg/PointCloud2",
     "camera_info": "sensor_msgs/msg/CameraInfo",
+    "imu": "sensor_msgs/msg/Imu",
 }
 # Reasons of messages that are no frames.
-NO_FRAMES = ("bad_camera_info", "bad_map")
+NO_FRAMES = ("bad_camera_info", "bad_map", "bad_imu")
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 _OLD_TF_TYPE = "tf/msg/tfMessage"  # of ROS 1 before tf2
-CARRIED_TYPES = (TF_TYPE, _OLD_TF_TYPE, "sensor_msgs/msg/Imu")
+CARRIED_TYPES = (TF_TYPE, _OLD_TF_TYPE, _INPUTS["imu"])
 """Types of topics that a recording made from another one keeps, because replay may need them."""
 
 
@@ -81,6 +83,26 @@ def find_topics(
     return Topics(camera, None, _find(bag, "keypoints", keypoints), map_points)
 
 
+def find_imu(bag: BagReader, given: str | None = None) -> str | None:
+    """The topic of the IMU: the given one, the one named imu, else the only one of its type.
+
+    Without it, the camera goes on alone: several that could be meant are none.
+
+    Raises:
+        BagError: when a given topic is not there.
+    """
+    if given is not None:
+        return _find(bag, "imu", given)
+    named = _named(bag, "imu")
+    found = named if named else imu_topics(bag)
+    return found[0] if len(found) == 1 else None
+
+
+def imu_topics(bag: BagReader) -> list[str]:
+    """All topics of inertial measurements."""
+    return sorted(topic for topic, kind in bag.topics.items() if kind == _INPUTS["imu"])
+
+
 def has_frames(bag: BagReader) -> bool:
     """Whether there is anything to localize: a cloud of any kind."""
     return _INPUTS["correspondences"] in bag.topics.values()
@@ -130,10 +152,19 @@ def as_tf2(message: Any) -> Any:
     return make_message(TF_TYPE, transforms=message.transforms)
 
 
-def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> TransformTree:
+def find_transforms(
+    bag: BagReader, topics: Topics, config: NodeConfig, imu: str | None = None
+) -> TransformTree:
     """The transforms of the recording that the settings need; an empty tree where they need none.
 
-    All are known from the start. A live node hears them as they come.
+    All are known from the start. A live node hears them as they come. An IMU that is not connected
+    with the camera is not used.
+
+    Args:
+        bag: the recording.
+        topics: of the inputs.
+        config: the settings.
+        imu: topic of the IMU that is to be used.
 
     Raises:
         BagError: when the camera's frame is not connected to ``base_frame``, or to ``odom_frame``
@@ -145,14 +176,17 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     if config.publish_tf == PublishTf.MAP_TO_ODOM:
         wanted["odom_frame"] = config.odom_frame
     tree = TransformTree()
-    camera = next((m.header.frame_id for _, _, m in bag.messages((topics.camera_info,))), None)
-    if not wanted or camera is None:
+    camera = _frame_of(bag, topics.camera_info)
+    ends = [*wanted.values()]
+    if imu is not None and (imu_frame := _frame_of(bag, imu)) is not None:
+        ends.append(imu_frame)
+    if not ends or camera is None:
         return tree
     found = tf_topics(bag, TF_TYPE, _OLD_TF_TYPE)
     for topic in found:
         for _, _, message in bag.messages((topic,)):
             tree.add(message, static=topic == "/tf_static")
-        if topic == "/tf_static" and all(_connected(tree, f, camera) for f in wanted.values()):
+        if topic == "/tf_static" and all(_connected(tree, frame, camera) for frame in ends):
             break  # /tf is long
     for name, frame in wanted.items():
         try:
@@ -166,6 +200,11 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     return tree
 
 
+def _frame_of(bag: BagReader, topic: str) -> str | None:
+    """Of the first message on a topic."""
+    return next((message.header.frame_id for _, _, message in bag.messages((topic,))), None)
+
+
 def _connected(tree: TransformTree, target: str, source: str) -> bool:
     try:
         tree.moves(target, source)
@@ -175,27 +214,37 @@ def _connected(tree: TransformTree, target: str, source: str) -> bool:
 
 
 def replay(
-    bag: BagReader, topics: Topics, localizer: FrameLocalizer
+    bag: BagReader, topics: Topics, localizer: FrameLocalizer, imu: str | None = None
 ) -> Iterator[tuple[int, Frame | Refusal]]:
     """Time of recording (ns) and result of every frame, as the node would have answered.
 
-    A CameraInfo or a map that cannot be used gives a Refusal of its own, for a reason of
-    :data:`NO_FRAMES`.
+    A CameraInfo, a map or a message of the IMU that cannot be used gives a Refusal of its own, for
+    a reason of :data:`NO_FRAMES`.
     """
-    for topic, recorded_ns, message in bag.messages(topics.names):
-        if topic == topics.correspondences:
-            yield recorded_ns, localizer.localize(message)
-        elif topic == topics.keypoints:
-            yield recorded_ns, localizer.localize_keypoints(message)
-        else:
-            kind = "camera_info" if topic == topics.camera_info else "map"
-            try:
-                if kind == "map":
-                    localizer.take_map(message)
-                else:
-                    localizer.take_camera_info(message)
-            except MessageError as error:
-                yield recorded_ns, Refusal(f"bad_{kind}", str(error))
+    frames = {
+        topics.correspondences: localizer.localize,
+        topics.keypoints: localizer.localize_keypoints,
+    }
+    others = {
+        topics.camera_info: ("bad_camera_info", localizer.take_camera_info),
+        topics.map_points: ("bad_map", localizer.take_map),
+        imu: ("bad_imu", localizer.take_imu),
+    }
+
+    def awaits(item: tuple[str, int, Any]) -> bool:
+        topic, _, message = item
+        return topic in frames and localizer.awaits_imu(stamp_ns(message), LOOK_AHEAD)
+
+    names = topics.names if imu is None else (*topics.names, imu)
+    for topic, recorded_ns, message in imu_first(bag.messages(names), imu, awaits):
+        if topic in frames:
+            yield recorded_ns, frames[topic](message)
+            continue
+        reason, take = others[topic]
+        try:
+            take(message)
+        except MessageError as error:
+            yield recorded_ns, Refusal(reason, str(error))
 
 
 def _list(topics: list[str]) -> str:

@@ -8,7 +8,7 @@ recording gives the same poses live and offline.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -74,6 +74,7 @@ class ImuState:
     used: int  # of them
     share: float  # of the last of them
     unused: Unused | None  # of the last frame; None: it was used
+    reasons: dict[str, int]  # of the others, how many for which
     rate: float  # Hz; NaN: unknown
     time_offset: float  # s to be added to its stamps, in all; NaN: unknown
     status: InertialStatus | None  # what the frames say of the gyroscope
@@ -93,6 +94,7 @@ class ImuInput:
         self._recently: deque[bool] = deque(maxlen=_MANY)
         self._frames = self._used = 0
         self._unused: Unused | None = None
+        self._reasons: Counter[str] = Counter()
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
         self._told: ImuReason | None = None
         self._status: InertialStatus | None = None
@@ -121,6 +123,7 @@ class ImuInput:
             self._used,
             sum(recently) / len(recently),
             self._unused,
+            dict(self._reasons),
             self._buffer.rate(),
             self._given_offset + left,
             self._status,
@@ -206,6 +209,7 @@ class ImuInput:
             self._in_a_row.clear()
             self._told = None
             return
+        self._reasons[unused.reason] += 1
         self._in_a_row.append(unused.reason)
         if self._in_a_row.count(unused.reason) == _LONG and self._told != unused.reason:
             self._told = unused.reason
