@@ -11,15 +11,16 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.messages import MessageError
+from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.ros.node.inputs import LATCHED, Topic
+from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, Topic
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.worker import Localize, Worker
 
@@ -40,6 +41,7 @@ class Feed:
         frames: that of the worker, here only to be read.
         refusals: told of messages that cannot be used.
         say: takes a line for the log.
+        needs_tf: called once when an IMU comes whose axes are not the camera's.
     """
 
     def __init__(
@@ -48,11 +50,13 @@ class Feed:
         frames: FrameLocalizer,
         refusals: Refusals,
         say: Callable[[str], Any],
+        needs_tf: Callable[[], None] = lambda: None,
     ) -> None:
         self._worker = worker
         self._frames = frames
         self._refusals = refusals
         self._say = say
+        self._needs_tf: Callable[[], None] | None = needs_tf
         # The last that was handed on.
         self._camera_info = b""
         self._calibration: Calibration | None = None
@@ -63,6 +67,7 @@ class Feed:
         return {
             "camera_info": Topic(CameraInfo, self._take_camera_info, LATCHED, raw=True),
             "map_points": Topic(PointCloud2, self._take_map, LATCHED, lasting=True),
+            "imu": Topic(Imu, self._take_imu, FAST_DATA, raw=True),
             "correspondences": self._localized_by(
                 "correspondences", lambda frames, message: frames.localize(message)
             ),
@@ -83,7 +88,26 @@ class Feed:
 
     def _localized_by(self, topic: str, localize: Localize) -> Topic:
         """A topic whose messages are frames, which the worker localizes in this way."""
-        return Topic(PointCloud2, lambda message: self._worker.localize(topic, message, localize))
+
+        def take(message: PointCloud2) -> None:
+            wait = self._frames.config.imu.wait
+            self._worker.localize(topic, message, localize, _awaits_imu, wait)
+
+        return Topic(PointCloud2, take)
+
+    def _take_imu(self, serialized: bytes) -> None:
+        if self._frames.config.imu.use == ImuUse.NONE:
+            return
+        try:
+            reading = read_imu(deserialize_message(serialized, Imu))
+        except MessageError as error:
+            self._refusals.add("bad_imu", str(error))
+            return
+        self._frames.imu.add(reading)
+        self._worker.look()
+        if self._needs_tf is not None and reading.frame != self._frames.camera_frame:
+            self._needs_tf()
+            self._needs_tf = None
 
     def _take_camera_info(self, serialized: bytes) -> None:
         # Drivers repeat it with every image, and only its stamp is new.
@@ -129,6 +153,10 @@ class Feed:
             self.changing = False
         if seconds > _LONG_CHANGE:
             self._say(f"kernels for the new settings are ready after {seconds:.1f} s")
+
+
+def _awaits_imu(frames: FrameLocalizer, message: PointCloud2) -> bool:
+    return frames.awaits_imu(stamp_ns(message), frames.config.imu.wait)
 
 
 def described(landmarks: Map) -> str:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from rs_localizer.pipeline.imu import ImuState
+from rs_localizer.ros.localizer.imu_health import imu_values, why_alone
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import WINDOW, Percentiles, Summary
 from rs_localizer.trajectory.online import MeasuredReadout
@@ -42,6 +44,7 @@ class Condition:
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
     readout: MeasuredReadout | None = None  # as the camera's motion shows it
+    imu: ImuState | None = None  # None: there is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +62,7 @@ def of_interest(
 ) -> dict[str, Silence]:
     """Without the topics that nobody publishes and nothing waits for.
 
-    Frames come as correspondences or as keypoints; only keypoints need a map.
+    Frames come as correspondences or as keypoints; only keypoints need a map, and none an IMU.
     """
     coming = any(silence[name].heard for name in frame_topics if name in silence)
 
@@ -68,7 +71,7 @@ def of_interest(
             return True
         if name in frame_topics:
             return not coming
-        return name != "map_points" or "a map" in missing
+        return name != "imu" and (name != "map_points" or "a map" in missing)
 
     return {name: item for name, item in silence.items() if counts(name, item)}
 
@@ -108,7 +111,10 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
         return level, f"waiting for {what}", "; ".join([f"waiting for {what}", *causes])
     if silent is not None:
         return silent
-    return _judge_frames(summary, condition.oddities)
+    oddities = dict(condition.oddities)
+    if condition.imu is not None and (alone := why_alone(condition.imu)):
+        oddities["imu"] = alone
+    return _judge_frames(summary, oddities)
 
 
 def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
@@ -182,6 +188,8 @@ def _values(condition: Condition, summary: Summary) -> dict[str, str]:
     if condition.readout is not None:
         seen, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
         values["Readout time seen (ms)"] = f"{seen:.2f} +- {deviation:.2f}"
+    if condition.imu is not None:
+        values |= imu_values(condition.imu)
     values |= {
         "Frames received": str(sum(summary.received.values())),
         "Poses published": str(summary.answered),

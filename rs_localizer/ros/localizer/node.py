@@ -61,6 +61,8 @@ class LocalizerNode(RobustLifecycleNode):
         self._outputs: Outputs | None = None
         self._broadcaster = Broadcaster(self, self.refusals)
         self._reset_service: Service | None = None
+        # Triggered by the inputs' thread: subscriptions are the executor's.
+        self._imu_came = self.create_guard_condition(lambda: self._broadcaster.tf.listen("the IMU"))
         # From activating to deactivating.
         self._inputs: Inputs | None = None
         self._diagnostics = Diagnostics(self, self._examine, self.refusals.notice)
@@ -105,7 +107,13 @@ class LocalizerNode(RobustLifecycleNode):
             self._statistics,
             functools.partial(self.refusals.add, "internal_error"),
         )
-        self._feed = Feed(self._worker, frames, self.refusals, self.get_logger().info)
+        self._feed = Feed(
+            self._worker,
+            frames,
+            self.refusals,
+            self.get_logger().info,
+            self._imu_came.trigger,
+        )
         self._reset_service = self.create_service(Trigger, "~/reset", self._reset)
         return super().on_configure(state)
 
@@ -196,6 +204,7 @@ class LocalizerNode(RobustLifecycleNode):
             | self._broadcaster.fault()
             | ({"readout_time": watch.fault} if watch and watch.fault else {}),
             readout=watch.measured if watch else None,
+            imu=None if frames is None else frames.imu.state,
         )
         health = diagnose(condition, self._statistics.summary())
         return health, "" if frames is None else frames.camera_frame

@@ -21,7 +21,8 @@ from rs_localizer.ros.node.statistics import Statistics
 
 Localize = Callable[[FrameLocalizer, Any], Frame | Refusal]
 _NAME = "rs_localizer worker"
-# How often frames are looked at that wait for their mounting, in s, and how many may.
+Awaits = Callable[[FrameLocalizer, Any], bool]
+# How often frames are looked at that wait for something, in s, and how many may.
 _LATE_PERIOD = 0.005
 _MOST_LATE = 100
 
@@ -34,6 +35,8 @@ class Arrival:
     message: Any
     localize: Localize
     received: float  # s, time.monotonic()
+    awaits: Awaits | None  # whether something that it needs may still come
+    patience: float  # s for which it waits
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,8 @@ class Worker:
         self._statistics = statistics
         self._failed = failed
         self._mailbox: Mailbox[FrameLocalizer, Arrival] = Mailbox()
+        # Frames that wait for what they need, and localized ones for their mounting.
+        self._early: deque[tuple[Work[FrameLocalizer, Arrival], Arrival]] = deque()
         self._late: deque[_Late] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
@@ -78,12 +83,27 @@ class Worker:
         """Have this done before the next frame (see :meth:`Mailbox.update`)."""
         self._mailbox.update(kind, update)
 
-    def localize(self, topic: str, message: Any, localize: Localize) -> None:
-        """Have this frame localized and published, unless a newer one comes first."""
+    def localize(
+        self,
+        topic: str,
+        message: Any,
+        localize: Localize,
+        awaits: Awaits | None = None,
+        patience: float = 0.0,
+    ) -> None:
+        """Have this frame localized and published, unless a newer one comes first.
+
+        It, and those behind it, waits while it ``awaits`` something, but for ``patience`` (s) only.
+        """
         self._statistics.received(topic, message)
-        arrival = Arrival(topic, message, localize, time.monotonic())
+        arrival = Arrival(topic, message, localize, time.monotonic(), awaits, patience)
         if self._mailbox.put(topic, arrival):
             self._statistics.replaced()
+
+    def look(self) -> None:
+        """Something has come that a frame may have waited for."""
+        if self._early:
+            self._mailbox.wake()
 
     def pause(self) -> None:
         """Forget the frames so far, the one that is worked on included."""
@@ -98,12 +118,32 @@ class Worker:
     # -- in the thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        while (work := self._mailbox.take(_LATE_PERIOD if self._late else None)) is not None:
+        while (work := self._mailbox.take(self._timeout())) is not None:
             for update in work.updates:
                 self._guarded(update, self._frames)
             self._finish_late()
             if work.frame is not None:
-                self._localize(work, work.frame)
+                self._early.append((work, work.frame))
+            if self._early and not self._waits(self._early[0][1]):
+                self._begin(*self._early.popleft())
+
+    def _timeout(self) -> float | None:
+        """How long nothing has to be done, unless something comes."""
+        if self._early and not self._waits(self._early[0][1]):
+            return 0.0
+        return _LATE_PERIOD if self._late or self._early else None
+
+    def _waits(self, arrival: Arrival) -> bool:
+        overdue = time.monotonic() >= arrival.received + arrival.patience
+        if overdue or arrival.awaits is None or len(self._early) > _MOST_LATE:
+            return False
+        return self._attempt(lambda: arrival.awaits(self._frames, arrival.message)) is True
+
+    def _begin(self, work: Work[FrameLocalizer, Arrival], arrival: Arrival) -> None:
+        if self._mailbox.is_current(work):
+            self._localize(work, arrival)
+        else:
+            self._statistics.dropped(1)
 
     def _guarded(self, function: Callable[..., None], *arguments: Any) -> None:
         try:
