@@ -17,6 +17,7 @@ from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.steadied import steadied
 from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.estimation.acceptance import refusal
+from rs_localizer.estimation.delay import delay_of
 from rs_localizer.estimation.inputs import checked, distinct, median_point, near_image, unfit
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior
@@ -181,11 +182,10 @@ class Localizer:
     def _turn_seen(self, turn: KnownTurn | None) -> TurnSeen | None:
         if turn is None:
             return None
-        _, rate = turn.at(0.0)
         variance = float(np.trace(turn.error[:3, :3])) / 3.0 + turn.rate_noise**2
         precision = float(self._terms.informations[0][ANGULAR, ANGULAR][0, 0])
         typical = 1.0 / precision if precision > 0.0 else math.inf
-        return TurnSeen(float(rate @ rate), variance, typical)
+        return TurnSeen(float(turn.rate @ turn.rate), variance, typical)
 
     def _track(self, frame: Frame, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
@@ -258,7 +258,11 @@ class Localizer:
             global_shutter_inliers=self._search.global_shutter_inliers(frame, start),
             iterations=best.samples,
         )
-        return found if turn is None else found.turned(turn)
+        return (
+            found
+            if turn is None
+            else found.turned(turn, delay_of(frame.observations, posterior, turn))
+        )
 
 
 def assumptions(

@@ -254,9 +254,7 @@ class Tracker:
         motion, covariance, swing = unshaken(track.estimate)
         if track.estimate.turn is not None:
             motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
-        motion, covariance = predict(
-            motion, covariance, dt / readout_time, _FADING / readout_time
-        )
+        motion, covariance = predict(motion, covariance, dt / readout_time, _FADING / readout_time)
         covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
         covariance += swing
         return Prior(
@@ -312,7 +310,6 @@ class Tracker:
             return result
         self._track = _followed(self._track, prior, result, time_ns)
         return result
-
 
     def _foreseen(
         self, time_ns: int, prior: Prior | None, imu: ImuSamples | None

@@ -19,6 +19,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.so3 import exp
 
+# Gauss' rule on the readout; the sum of the weights is its length.
+_NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(5))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownTurn:
@@ -30,14 +33,24 @@ class KnownTurn:
     tau: Array  # (k,) of the samples, increasing, k >= 2
     rates: Array  # (k-1,4,3) cubic of each interval, in powers of the time since its start
     rotations: Array  # (k,3,3) camera_then_from_camera_at_tau_0
+    rate: Array  # (3,) at tau = 0, and its change (3,) there, per readout
+    change: Array
+    # (3,3) the parabola, in powers of tau, that is nearest to the rate over the readout
+    parabola: Array
     # (6,6) of what the gyroscope is off by: a constant rate and its change, rad per readout and
     # per readout squared, along the axes at tau = 0
     error: Array = field(default_factory=lambda: np.zeros((6, 6)))
     rate_noise: float = 0.0  # rad per readout, of the rate at one moment
+    delay: float = 0.0  # by how many readouts (standard deviation) all of it may be late or early
 
     @classmethod
     def of(
-        cls, tau: Array, rates: Array, error: Array | None = None, rate_noise: float = 0.0
+        cls,
+        tau: Array,
+        rates: Array,
+        error: Array | None = None,
+        rate_noise: float = 0.0,
+        delay: float = 0.0,
     ) -> KnownTurn:
         """The turn of body rates (k,3), rad per readout, at row times (k,).
 
@@ -48,10 +61,8 @@ class KnownTurn:
         rates = np.ascontiguousarray(rates, dtype=np.float64)
         if len(tau) < 2 or not np.all(np.diff(tau) > 0.0):
             raise ValueError(f"need two or more increasing times, got {len(tau)}")
-        cubics = spline(tau, rates)
-        rotations = rotations_at_knots(tau, cubics)
         error = np.zeros((6, 6)) if error is None else error
-        return cls(tau, cubics, rotations, error, rate_noise)
+        return cls(tau, *turn_of(tau, rates), error, rate_noise, delay)
 
     def at(self, tau: float) -> tuple[Array, Array]:
         """Rotation (3,3) camera_then_from_camera_at_tau_0 and body rate (3,) at ``tau``."""
@@ -64,13 +75,67 @@ class KnownTurn:
         found: tuple[Array, Array] = turns_at(times, self.tau, self.rates, self.rotations)
         return found
 
-    def acceleration(self, tau: float) -> Array:
-        """Change (3,) of the body rate at ``tau``, rad per readout squared."""
-        place = int(np.clip(np.searchsorted(self.tau, tau) - 1, 0, len(self.rates) - 1))
-        since = tau - self.tau[place]
-        _, first, second, third = self.rates[place]
-        change: Array = first + since * (2.0 * second + 3.0 * since * third)
-        return change
+    def late(self, tau: float) -> tuple[Array, Array]:
+        """Turn (3,) and rate (3,) at ``tau`` that a delay of one readout would leave.
+
+        What a motion under constant acceleration follows is told by the points and left out.
+        """
+        _, rate = self.at(tau)
+        powers = np.array([1.0, tau, tau * tau])
+        slopes = np.array([0.0, 1.0, 2.0 * tau])
+        return rate - powers @ self.parabola, (
+            change_at(tau, self.tau, self.rates) - slopes @ self.parabola
+        )
+
+
+@kernel
+def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """What a :class:`KnownTurn` holds of rates (k,3) at row times (k,)."""
+    cubics = spline(tau, rates)
+    rotations = rotations_at_knots(tau, cubics)
+    found, middle = np.zeros((3, 3)), np.zeros(3)
+    # Projections on Legendre polynomials by Gauss' rule of five nodes, exact up to degree 9.
+    for node in range(5):
+        x = 2.0 * _NODES[node]
+        here = _rate_at(_NODES[node], tau, cubics)
+        legendre = (1.0, x, 1.5 * x * x - 0.5)
+        for degree in range(3):
+            for axis in range(3):
+                part = (2 * degree + 1) * _WEIGHTS[node] * legendre[degree] * here[axis]
+                found[degree, axis] += part
+    parabola = np.empty((3, 3))
+    parabola[0] = found[0] - 0.5 * found[2]
+    parabola[1] = 2.0 * found[1]
+    parabola[2] = 6.0 * found[2]
+    middle[:] = _rate_at(0.0, tau, cubics)
+    return cubics, rotations, middle, change_at(0.0, tau, cubics), parabola
+
+
+@kernel
+def _rate_at(time: float, times: Array, cubics: Array) -> Array:
+    place = _place(time, times)
+    since = time - times[place]
+    rate = np.empty(3)
+    for axis in range(3):
+        cubic = cubics[place]
+        rate[axis] = cubic[0, axis] + since * (
+            cubic[1, axis] + since * (cubic[2, axis] + since * cubic[3, axis])
+        )
+    return rate
+
+
+@kernel
+def change_at(time: float, times: Array, cubics: Array) -> Array:
+    """Derivative (3,) of a spline of rates."""
+    place = _place(time, times)
+    since = time - times[place]
+    change = np.empty(3)
+    for axis in range(3):
+        cubic = cubics[place]
+        change[axis] = cubic[1, axis] + since * (
+            2.0 * cubic[2, axis] + 3.0 * since * cubic[3, axis]
+        )
+    return change
 
 
 @kernel
@@ -123,8 +188,7 @@ def _turn(cubic: Array, time: float) -> Array:
 @kernel
 def _place(time: float, times: Array) -> int:
     """The interval that a time lies in; the first or the last of times outside."""
-    before = np.searchsorted(times, time) - 1
-    place: int = min(max(before, 0), len(times) - 2)
+    place: int = np.searchsorted(times[1:-1], time)
     return place
 
 
@@ -153,11 +217,7 @@ def turns_at(wanted: Array, times: Array, cubics: Array, rotations: Array) -> tu
         place = _place(wanted[i], times)
         since = wanted[i] - times[place]
         found[i] = multiplied(exp(-_turn(cubics[place], since)), rotations[place])
-        for axis in range(3):
-            cubic = cubics[place]
-            rates[i, axis] = cubic[0, axis] + since * (
-                cubic[1, axis] + since * (cubic[2, axis] + since * cubic[3, axis])
-            )
+        rates[i] = _rate_at(wanted[i], times, cubics)
     return found, rates
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
@@ -56,6 +57,8 @@ class Estimate(Motion):
     tracked: bool = False  # found near a prior motion, without a search
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both
     turn: KnownTurn | None = None
+    # By how many readouts the points would delay the known turn, and the variance of that
+    delay: tuple[float, float] = (0.0, math.inf)
 
     @property
     def covariance(self) -> Array:
@@ -67,13 +70,14 @@ class Estimate(Motion):
         turn = shake_at(np.array([tau]), self.shake)[0]
         return turn[:3], turn[3:]
 
-    def turned(self, turn: KnownTurn) -> Estimate:
+    def turned(self, turn: KnownTurn, delay: tuple[float, float]) -> Estimate:
         """The same with a known turn, beside which its motion was estimated."""
         return replace(
             self,
-            angular_velocity=self.angular_velocity + turn.at(0.0)[1],
-            angular_acceleration=self.angular_acceleration + turn.acceleration(0.0),
+            angular_velocity=self.angular_velocity + turn.rate,
+            angular_acceleration=self.angular_acceleration + turn.change,
             turn=turn,
+            delay=delay,
         )
 
     def beside_turn(self) -> Motion:
@@ -83,9 +87,9 @@ class Estimate(Motion):
         return Motion(
             self.rotation,
             self.translation,
-            self.angular_velocity - self.turn.at(0.0)[1],
+            self.angular_velocity - self.turn.rate,
             self.linear_velocity,
-            angular_acceleration=self.angular_acceleration - self.turn.acceleration(0.0),
+            angular_acceleration=self.angular_acceleration - self.turn.change,
             linear_acceleration=self.linear_acceleration,
         )
 

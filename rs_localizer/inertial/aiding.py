@@ -19,6 +19,7 @@ from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.inertial.turning import TurnWithin
 from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
 # Points that fit without the gyroscope, beyond those that fit with it, that speak against it.
@@ -41,9 +42,13 @@ class Foreseen:
     """What the gyroscope says of a frame."""
 
     middle_ns: int
-    turn: KnownTurn
+    within: TurnWithin
     prior: Prior | None  # of the motion beside the turn
     predicted: Predicted | None  # the same with the gyroscope's parameters
+
+    @property
+    def turn(self) -> KnownTurn:
+        return self.within.known
 
 
 class GyroscopeAid:
@@ -111,7 +116,7 @@ class GyroscopeAid:
         return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
 
     def _predicted(
-        self, samples: ImuSamples, middle_ns: int, before: Before, prior: Prior, turn: KnownTurn
+        self, samples: ImuSamples, middle_ns: int, before: Before, prior: Prior, turn: TurnWithin
     ) -> Predicted:
         errors = self.filter.errors
         between = turning.turn_between(samples, before.middle_ns, middle_ns, errors)
@@ -123,12 +128,11 @@ class GyroscopeAid:
             between,
             turn,
             1e-9 * (middle_ns - before.middle_ns) / self._readout_time,
-            self._readout_time,
             before.fading,
         )
         return replace(predicted, covariance=predicted.covariance + before.added)
 
-    def _predicted_by_camera(self, prior: Prior, turn: KnownTurn) -> Predicted:
+    def _predicted_by_camera(self, prior: Prior, turn: TurnWithin) -> Predicted:
         """The camera's prediction, beside the turn within the frame."""
         assert prior.motion is not None
         assert prior.covariance is not None
@@ -138,10 +142,9 @@ class GyroscopeAid:
         covariance = prior.covariance.copy()
         covariance[RATE] = 0.0
         covariance[:, RATE] = 0.0
-        covariance[np.ix_(RATE, RATE)] = turn.error
+        covariance[np.ix_(RATE, RATE)] = turn.known.error
         with_parameters = np.zeros((PARAMETERS, turning.PARAMETERS))
-        by_parameters = turning.sensitivity(turn, self._readout_time)
-        with_parameters[RATE] = by_parameters @ self.filter.errors.covariance
+        with_parameters[RATE] = turn.by_parameters @ self.filter.errors.covariance
         return Predicted(motion, covariance, with_parameters)
 
     def doubtful(self, foreseen: Foreseen, found: Estimate | Failure) -> bool:
@@ -181,13 +184,17 @@ class GyroscopeAid:
         contradicted = self._contradicts(foreseen, better)
         self._watch.judge(contradicted, None)
         posterior = better.joint_covariance[:PARAMETERS, :PARAMETERS]
+        delay, variance = better.delay
         if contradicted:
             self.filter.forget_motion()
         elif foreseen.predicted is not None and better.tracked:
             step = _step(foreseen.predicted, better)
             self.filter.update(foreseen.predicted, step, posterior)
         else:
-            self.filter.begin(foreseen.turn, self._readout_time, _left(better), posterior)
+            self.filter.begin(foreseen.within, _left(better), posterior)
+        if not contradicted:
+            readout_time = self._readout_time
+            self.filter.hear_delay(readout_time * delay, readout_time**2 * variance)
         self.status = self._watch.status(Alone.NONE)
         return better
 

@@ -15,18 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,
-    LINEAR,
-    LINEAR_ACCELERATION,
-    MOVE,
     PARAMETERS,
-    TURN,
 )
 from rs_localizer.inertial import turning
 from rs_localizer.inertial.settings import (
@@ -35,7 +30,7 @@ from rs_localizer.inertial.settings import (
     OFFSET_WALK,
     InertialSettings,
 )
-from rs_localizer.inertial.turning import BIAS, OFFSET, GyroscopeErrors, TurnBetween
+from rs_localizer.inertial.turning import BIAS, OFFSET, GyroscopeErrors, TurnBetween, TurnWithin
 
 # An offset that is not estimated is known to this, s.
 _GIVEN_OFFSET_DEVIATION = 1e-4
@@ -44,6 +39,11 @@ _MOST_GAIN = 0.9999
 
 RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 """Of a step: what the gyroscope leaves to the points."""
+_TURNS = np.arange(3)
+# What the rows say of the time offset is believed when it is known this well, s (a vibration of
+# 100 Hz turns by two thirds meanwhile), never better than the second, and not if it is beyond
+# chance (squared, in variances).
+_NEAR, _LEAST_DELAY, _MOST_DELAY = 1e-3, 1e-5, 16.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,9 +93,8 @@ class GyroscopeFilter:
         motion: Motion,
         covariance: Array,
         between: TurnBetween,
-        within: KnownTurn,
+        within: TurnWithin,
         readouts: float,
-        readout_time: float,
         fading: float,
     ) -> Predicted:
         """The motion some readout times later, beside the turn that the gyroscope knows.
@@ -107,7 +106,6 @@ class GyroscopeFilter:
             motion, covariance: of the last frame, beside its known turn; (18,18).
             between, within: turns from the last middle row to this one, and within this frame.
             readouts: from middle row to middle row.
-            readout_time: s.
             fading: of accelerations, in readouts.
         """
         left = math.exp(-readouts / fading)
@@ -123,26 +121,13 @@ class GyroscopeFilter:
             velocity,
             linear_acceleration=left * back @ motion.linear_acceleration,
         )
-        transport = np.zeros((PARAMETERS, PARAMETERS))
-        transport[TURN, TURN] = back
-        transport[MOVE, MOVE] = back
-        transport[MOVE, TURN] = -back @ so3.hat(way)
-        transport[MOVE, LINEAR] = readouts * back
-        transport[MOVE, LINEAR_ACCELERATION] = farther * back
-        transport[LINEAR, LINEAR] = back
-        transport[LINEAR, LINEAR_ACCELERATION] = faster * back
-        transport[LINEAR_ACCELERATION, LINEAR_ACCELERATION] = left * back
-        by_parameters = np.zeros((PARAMETERS, turning.PARAMETERS))
-        by_parameters[TURN] = between.by_parameters
-        by_parameters[LINEAR] = so3.hat(velocity) @ between.by_parameters
-        by_parameters[RATE] = turning.sensitivity(within, readout_time)
-        moved = transport @ self._with_motion
-        with_parameters = moved + by_parameters @ self.errors.covariance
-        crossed = moved @ by_parameters.T
-        predicted = transport @ covariance @ transport.T + crossed + crossed.T
-        predicted += by_parameters @ self.errors.covariance @ by_parameters.T
-        predicted[TURN, TURN] += between.covariance
-        predicted[np.ix_(RATE, RATE)] += turning.unforeseen(within, readout_time, self.errors.noise)
+        predicted, with_parameters = _carried(
+            covariance, self._with_motion, self.errors.covariance, back,
+            between.by_parameters, within.by_parameters, way, velocity,
+            np.array([readouts, farther, faster, left]),
+        )  # fmt: skip
+        predicted[_TURNS, _TURNS] += between.variance
+        predicted[RATE, RATE] += within.variances
         return Predicted(later, predicted, with_parameters)
 
     def update(self, predicted: Predicted, step: Array, posterior: Array) -> None:
@@ -155,45 +140,119 @@ class GyroscopeFilter:
         everything = np.arange(PARAMETERS)
         self._update(everything, predicted.covariance, predicted.with_parameters, step, posterior)
 
-    def begin(self, within: KnownTurn, readout_time: float, left: Array, posterior: Array) -> None:
+    def begin(self, within: TurnWithin, left: Array, posterior: Array) -> None:
         """Take in a frame of which nothing was known but its turn.
 
         Args:
             left: (6,) rate and its change that the points left beside the known turn.
             posterior: (18,18) covariance of the estimate.
         """
-        with_parameters = turning.sensitivity(within, readout_time) @ self.errors.covariance
-        self._update(RATE, within.error, with_parameters, left, posterior)
+        with_parameters = within.by_parameters @ self.errors.covariance
+        self._update(RATE, within.known.error, with_parameters, left, posterior)
+
+    def hear_delay(self, delay: float, variance: float) -> None:
+        """Take in what the rows of a frame say of the time offset: to be later by ``delay`` (s).
+
+        Their motion stays what it is, so that this is not the best filter, but a consistent one.
+        """
+        covariance = self.errors.covariance
+        known = float(covariance[OFFSET, OFFSET])
+        total = known + variance + _LEAST_DELAY**2
+        if not self._settings.estimate_time_offset or not known < _NEAR**2:
+            return
+        if delay * delay > _MOST_DELAY * total:
+            return
+        gain = covariance[:, OFFSET] / total
+        parameters = np.append(self.errors.bias, self.errors.time_offset) + gain * delay
+        self._with_motion = self._with_motion - np.outer(self._with_motion[:, OFFSET], gain)
+        self._set(parameters, covariance - np.outer(gain, covariance[OFFSET]))
 
     def _update(
         self, known: IntArray, before: Array, with_parameters: Array, step: Array, posterior: Array
     ) -> None:
         """``known``: places of a step that the prediction ``before`` was of."""
         after = np.ascontiguousarray(posterior[np.ix_(known, known)])
-        gain, gained, left = _gain(before, after, with_parameters)
+        gain, gained, left = _gain(before, after, np.ascontiguousarray(with_parameters))
         covariance = self.errors.covariance - gained
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain @ step
         tied = left @ gain.T
         if len(known) < PARAMETERS:
             tied = posterior[:, known] @ np.linalg.solve(after, tied)
-        self._with_motion = tied
+        self._with_motion = np.ascontiguousarray(tied)
         self._set(parameters, 0.5 * (covariance + covariance.T))
 
 
+@kernel
+def _carried(
+    covariance: Array, with_motion: Array, of_parameters: Array, back: Array,
+    turn_by_parameters: Array, rate_by_parameters: Array, way: Array, velocity: Array,
+    times: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Covariance (18,18) of a motion, and with the parameters (18,4), after a turn.
+
+    Args:
+        times: readouts, and what a unit of acceleration adds to way and velocity, and what is
+            left of it.
+    """
+    readouts, farther, faster, left = times
+    transport = np.zeros((PARAMETERS, PARAMETERS))
+    by_parameters = np.zeros((PARAMETERS, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for column in range(3):
+            b = back[i, column]
+            transport[i, column] = b
+            transport[3 + i, 3 + column] = b
+            transport[3 + i, 9 + column] = readouts * b
+            transport[3 + i, 15 + column] = farther * b
+            transport[9 + i, 9 + column] = b
+            transport[9 + i, 15 + column] = faster * b
+            transport[15 + i, 15 + column] = left * b
+            # -back hat(way), column by column
+            after, before = (column + 1) % 3, (column + 2) % 3
+            transport[3 + i, column] = back[i, before] * way[after] - back[i, after] * way[before]
+        for column in range(4):
+            by_parameters[i, column] = turn_by_parameters[i, column]
+            by_parameters[6 + i, column] = rate_by_parameters[i, column]
+            by_parameters[12 + i, column] = rate_by_parameters[3 + i, column]
+            by_parameters[9 + i, column] = (
+                velocity[j] * turn_by_parameters[k, column]
+                - velocity[k] * turn_by_parameters[j, column]
+            )
+    moved = transport @ with_motion
+    crossed = moved @ by_parameters.T
+    predicted = transport @ covariance @ transport.T + crossed + crossed.T
+    predicted += by_parameters @ of_parameters @ by_parameters.T
+    return predicted, moved + by_parameters @ of_parameters
+
+
+@kernel
 def _gain(before: Array, after: Array, with_parameters: Array) -> tuple[Array, Array, Array]:
     """Gain (4,k), what it takes from the covariance (4,4), and the covariance (k,k) after.
 
     What shaking and model error make of an estimate's covariance may exceed the prediction's. Such
     a frame says nothing of the parameters, but does not make them worse.
     """
+    size = len(before)
     deviations = np.sqrt(np.diag(before))
-    factor = np.linalg.cholesky(before / np.outer(deviations, deviations))
-    inverse = np.linalg.inv(factor) / deviations  # of the factor, of what is not scaled
+    scaled = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            scaled[i, j] = before[i, j] / (deviations[i] * deviations[j])
+    factor = np.linalg.cholesky(scaled)
+    inverse = np.linalg.inv(factor)  # of the factor of what is not scaled
+    for i in range(size):
+        for j in range(size):
+            inverse[i, j] /= deviations[j]
     half = inverse @ with_parameters
     values, vectors = np.linalg.eigh(inverse @ after @ inverse.T)
-    values = np.minimum(values, 1.0)
-    along = vectors.T @ half
-    lost = np.clip(1.0 - values, 0.0, _MOST_GAIN)
-    outer = deviations[:, None] * (factor @ vectors)
-    left = outer * values @ outer.T
-    return half.T @ inverse, along.T * lost @ along, left
+    outer, along = factor @ vectors, vectors.T @ half
+    lost, kept = along.copy(), outer.copy()
+    for k in range(size):
+        value = min(max(values[k], 1.0 - _MOST_GAIN), 1.0)
+        for i in range(size):
+            outer[i, k] *= deviations[i]
+            kept[i, k] = outer[i, k] * value
+        for i in range(4):
+            lost[k, i] *= 1.0 - value
+    return half.T @ inverse, along.T @ lost, kept @ outer.T

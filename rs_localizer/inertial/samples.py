@@ -41,19 +41,13 @@ class ImuSamples:
     def __len__(self) -> int:
         return len(self.times_ns)
 
-    def around(self, first_ns: int, last_ns: int) -> ImuSamples | None:
-        """The samples that cover an interval, and a few on both sides; None if they do not."""
+    def around(self, first_ns: int, last_ns: int) -> slice | None:
+        """Which samples cover an interval, and a few on both sides; None if they do not."""
         first = int(np.searchsorted(self.times_ns, first_ns, "right"))
         last = int(np.searchsorted(self.times_ns, last_ns, "left"))
         if first == 0 or last == len(self):
             return None
-        part = slice(max(first - MARGIN, 0), last + MARGIN)
-        force = self.specific_force
-        return ImuSamples(
-            self.times_ns[part],
-            self.angular_velocity[part],
-            None if force is None else force[part],
-        )
+        return slice(max(first - MARGIN, 0), last + MARGIN)
 
 
 def needed(readout_time: float, middle_ns: int, period_ns: int) -> tuple[int, int]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn, multiplied, rotations_at_knots, spline, turns_at
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.so3 import coefficients, log
+from rs_localizer.inertial.band import densified
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import SCALE_DEVIATION
 
@@ -38,27 +40,47 @@ class TurnBetween:
     rotation: Array  # (3,3) camera_then_from_camera_now
     # (3,4) of a turn of the camera then, in its own axes, by the gyroscope's parameters
     by_parameters: Array
-    covariance: Array  # (3,3) of noise and scale, rad^2, likewise
+    variance: float  # rad^2 of each axis, by noise and scale
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnWithin:
+    """The turn during a frame, and how what it leaves depends on what is not known.
+
+    That is the rate and its change (6), per readout, along the axes of the middle row.
+    """
+
+    known: KnownTurn
+    by_parameters: Array  # (6,4)
+    variances: Array  # (6,) by noise and scale
 
 
 def turn_within(
     samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors
-) -> KnownTurn | None:
+) -> TurnWithin | None:
     """How the camera turns during a frame; None if the samples do not cover it.
 
     Args:
         middle_ns: exposure of the middle row.
         readout_time: s.
     """
-    times, rates = _spanning(samples, middle_ns, 0.5 * readout_time, 0.5 * readout_time, errors)
-    if times is None or rates is None:
+    spanning = _spanning(samples, middle_ns, 0.5 * readout_time, 0.5 * readout_time, errors)
+    if spanning is None:
         return None
-    turn = KnownTurn.of(times / readout_time, rates * readout_time)
-    period = float(np.median(np.diff(times)))
-    noise = errors.noise * readout_time / np.sqrt(period)
-    jacobian = sensitivity(turn, readout_time)
-    error = unforeseen(turn, readout_time, errors.noise) + jacobian @ errors.covariance @ jacobian.T
-    return replace(turn, error=error, rate_noise=float(noise))
+    times, rates = spanning
+    tau = times / readout_time
+    turn = KnownTurn.of(tau, rates * readout_time)
+    by_parameters, variances = _left_over(
+        turn.tau, turn.rates, turn.rotations, readout_time, errors.noise
+    )
+    period = (times[-1] - times[0]) / (len(times) - 1) * 2.0  # of the samples
+    known = KnownTurn(
+        turn.tau, turn.rates, turn.rotations, turn.rate, turn.change, turn.parabola,
+        np.diag(variances) + by_parameters @ errors.covariance @ by_parameters.T,
+        errors.noise * readout_time / float(np.sqrt(period)),
+        float(np.sqrt(errors.covariance[OFFSET, OFFSET])) / readout_time,
+    )  # fmt: skip
+    return TurnWithin(known, by_parameters, variances)
 
 
 def turn_between(
@@ -66,56 +88,77 @@ def turn_between(
 ) -> TurnBetween | None:
     """How the camera turns from one moment to a later one; None if the samples do not cover it."""
     length = 1e-9 * (to_ns - from_ns)
-    times, rates = _spanning(samples, to_ns, length, 0.0, errors)
-    if times is None or rates is None:
+    spanning = _spanning(samples, to_ns, length, 0.0, errors)
+    if spanning is None:
         return None
+    return TurnBetween(*_between(*spanning, length, errors.noise))
+
+
+@kernel
+def _left_over(
+    tau: Array, cubics: Array, rotations: Array, readout_time: float, noise: float
+) -> tuple[Array, Array]:
+    """Derivatives (6,4) of what a known turn leaves by the parameters, and its variances (6,)."""
+    ends, rates = turns_at(np.array([-0.5, 0.0, 0.5]), tau, cubics, rotations)
+    by_parameters = np.zeros((6, PARAMETERS))
+    variances = np.empty(6)
+    whole = log(multiplied(ends[2], ends[0].T.copy()))
+    turned, changed = 0.0, 0.0
+    for k in range(3):
+        by_parameters[k, k] = -readout_time
+        # Samples of later times: each row has the rate of a little earlier.
+        change = rates[2, k] - rates[0, k]
+        bend = 4.0 * (rates[0, k] - 2.0 * rates[1, k] + rates[2, k])
+        by_parameters[k, OFFSET] = -change / readout_time
+        by_parameters[3 + k, OFFSET] = -bend / readout_time
+        turned += whole[k] * whole[k]
+        changed += change * change
+    walk, scale = noise * noise * readout_time, SCALE_DEVIATION * SCALE_DEVIATION
+    variances[:3] = _WALK_SLOPE * walk + scale * turned
+    variances[3:] = _WALK_CURVATURE * walk + scale * changed
+    return by_parameters, variances
+
+
+@kernel
+def _between(times: Array, rates: Array, length: float, noise: float) -> tuple[Array, Array, float]:
+    """The fields of a :class:`TurnBetween`; it ends at time 0."""
     cubics = spline(times, rates)
     rotations = rotations_at_knots(times, cubics)  # from the camera then
     ends, end_rates = turns_at(np.array([-length, 0.0]), times, cubics, rotations)
-    then_from_now = ends[0].T.copy()
-    by_parameters = np.zeros((3, PARAMETERS))
-    angle = so3.log(then_from_now.T.copy())
-    # A constant rate in the camera's axes of each moment, seen in those of then.
-    by_parameters[:, BIAS] = -length * so3.right_jacobian(angle)
-    by_parameters[:, OFFSET] = then_from_now @ end_rates[0] - end_rates[1]
-    variance = errors.noise**2 * length + SCALE_DEVIATION**2 * float(angle @ angle)
-    return TurnBetween(then_from_now, by_parameters, variance * np.eye(3))
-
-
-def sensitivity(turn: KnownTurn, readout_time: float) -> Array:
-    """Derivatives (6,4) of the rate that a known turn leaves, and of its change, per readout.
-
-    By the gyroscope's parameters, at least squares over the readout, along the axes at tau = 0.
-    """
-    _, rates = turn.at_rows(np.array([-0.5, 0.0, 0.5]))
-    jacobian = np.zeros((6, PARAMETERS))
-    jacobian[:3, BIAS] = -readout_time * np.eye(3)
-    # Samples of later times: each row has the rate of a little earlier.
-    jacobian[:3, OFFSET] = (rates[0] - rates[2]) / readout_time
-    jacobian[3:, OFFSET] = -4.0 * (rates[0] - 2.0 * rates[1] + rates[2]) / readout_time
-    return jacobian
-
-
-def unforeseen(turn: KnownTurn, readout_time: float, noise: float) -> Array:
-    """Covariance (6,6) of the same by noise (rad/s/sqrt(Hz)) and scale of the gyroscope."""
-    ends, rates = turn.at_rows(np.array([-0.5, 0.5]))
-    whole = so3.log(multiplied(ends[1], ends[0].T.copy()))
-    slope = rates[1] - rates[0]
-    walk, scale = noise**2 * readout_time, SCALE_DEVIATION**2
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = (_WALK_SLOPE * walk + scale * (whole @ whole)) * np.eye(3)
-    covariance[3:, 3:] = (_WALK_CURVATURE * walk + scale * (slope @ slope)) * np.eye(3)
-    return covariance
+    rotation = ends[0].T.copy()
+    angle = log(ends[0].copy())
+    x, y, z = angle[0], angle[1], angle[2]
+    squared = x * x + y * y + z * z
+    _, c, d = coefficients(squared)
+    by_parameters = np.empty((3, PARAMETERS))
+    # A constant rate in the camera's axes of each moment, seen in those of then: the right
+    # Jacobian of the exponential.
+    by_parameters[0, 0] = -length * (1.0 - d * (y * y + z * z))
+    by_parameters[1, 1] = -length * (1.0 - d * (x * x + z * z))
+    by_parameters[2, 2] = -length * (1.0 - d * (x * x + y * y))
+    by_parameters[0, 1] = -length * (c * z + d * x * y)
+    by_parameters[1, 0] = -length * (-c * z + d * x * y)
+    by_parameters[0, 2] = -length * (-c * y + d * x * z)
+    by_parameters[2, 0] = -length * (c * y + d * x * z)
+    by_parameters[1, 2] = -length * (c * x + d * y * z)
+    by_parameters[2, 1] = -length * (-c * x + d * y * z)
+    for k in range(3):
+        started = 0.0
+        for j in range(3):
+            started += rotation[k, j] * end_rates[0, j]
+        by_parameters[k, OFFSET] = started - end_rates[1, k]
+    variance = noise * noise * length + SCALE_DEVIATION * SCALE_DEVIATION * squared
+    return rotation, by_parameters, variance
 
 
 def _spanning(
     samples: ImuSamples, at_ns: int, before: float, after: float, errors: GyroscopeErrors
-) -> tuple[Array, Array] | tuple[None, None]:
+) -> tuple[Array, Array] | None:
     """Times (k,) in s since a moment and rates (k,3) without the bias that span what is around."""
-    offset_ns = round(1e9 * errors.time_offset)
-    here_ns = at_ns - offset_ns  # by the clock of the samples
+    here_ns = at_ns - round(1e9 * errors.time_offset)  # by the clock of the samples
     part = samples.around(here_ns - round(1e9 * before), here_ns + round(1e9 * after))
     if part is None:
-        return None, None
-    times = np.asarray(1e-9 * (part.times_ns - here_ns), np.float64)
-    return times, part.angular_velocity - errors.bias
+        return None
+    times = np.asarray(1e-9 * (samples.times_ns[part] - here_ns), np.float64)
+    dense: tuple[Array, Array] = densified(times, samples.angular_velocity[part] - errors.bias)
+    return dense

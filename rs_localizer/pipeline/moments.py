@@ -67,11 +67,11 @@ def pose_at(estimate: Estimate, tau: float) -> Pose:
     if estimate.turn is not None:
         map_from_then = map_from_then @ estimate.turn.at(tau)[0]
     jacobian[_ANGULAR, PARAMETERS:] = np.kron(values, map_from_then)
-    return Pose(
-        position=-rotation.T @ translation,
-        rotation=rotation.T,
-        covariance=_propagate(jacobian, estimate.joint_covariance),
-    )
+    covariance = _propagate(jacobian, estimate.joint_covariance)
+    if estimate.turn is not None:
+        late = estimate.turn.delay * rotation.T @ estimate.turn.late(tau)[0]
+        covariance[_ANGULAR, _ANGULAR] += np.outer(late, late)
+    return Pose(position=-rotation.T @ translation, rotation=rotation.T, covariance=covariance)
 
 
 def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
@@ -92,15 +92,16 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     jacobian[_LINEAR, LINEAR_ACCELERATION] = tau * turn
     jacobian[_ANGULAR, ANGULAR] = shaken
     jacobian[_ANGULAR, ANGULAR_ACCELERATION] = by_acceleration
-    if estimate.turn is None:
-        known, rate, noise = np.eye(3), np.zeros(3), 0.0
-    else:
-        (known, rate), noise = estimate.turn.at(tau), estimate.turn.rate_noise
+    known, rate, own = np.eye(3), np.zeros(3), np.zeros((3, 3))
+    if estimate.turn is not None:
+        known, rate = estimate.turn.at(tau)
+        late = estimate.turn.delay * estimate.turn.late(tau)[1]
+        own = np.outer(late, late) + estimate.turn.rate_noise**2 * np.eye(3)
     jacobian[_LINEAR, PARAMETERS:] = np.kron(values, so3.hat(linear) @ known)
     by_shake = np.kron(values, so3.hat(angular - rate) @ known)
     jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, known) + by_shake
     covariance = _propagate(jacobian / readout_time, estimate.joint_covariance)
-    covariance[_ANGULAR, _ANGULAR] += (noise / readout_time) ** 2 * np.eye(3)
+    covariance[_ANGULAR, _ANGULAR] += own / readout_time**2
     return Twist(
         linear=linear / readout_time, angular=angular / readout_time, covariance=covariance
     )
