@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,6 +61,8 @@ _LEARNING = 0.2
 _MOST_JOLTS = 1e4
 # Below this part of the time of fading the closed form of the noise is rounding errors.
 _SHORT = 0.03
+# The least angular acceleration there is, rad/s^2: turns are told by a gyroscope.
+_NO_TURN = 0.001
 
 
 def predict(
@@ -144,6 +147,17 @@ def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time:
     return covariance
 
 
+@cache
+def _without_shaking(coefficients: int) -> Array:
+    """Derivatives (18,18 + 3 k) of a motion without its shaking by motion and coefficients."""
+    jacobian = np.eye(PARAMETERS, PARAMETERS + 3 * coefficients)
+    if coefficients:
+        values, slopes = shake_in_the_middle(coefficients)
+        jacobian[TURN, PARAMETERS:] = -np.kron(values[None], np.eye(3))
+        jacobian[ANGULAR, PARAMETERS:] = -np.kron(slopes[None], np.eye(3))
+    return jacobian
+
+
 def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
     """The motion without its shaking, its covariance (18,18), and that of the shaking.
 
@@ -163,13 +177,7 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
         angular_acceleration=beside.angular_acceleration,
         linear_acceleration=beside.linear_acceleration,
     )
-    count = len(estimate.joint_covariance)
-    jacobian = np.eye(PARAMETERS, count)
-    coefficients = (count - PARAMETERS) // 3
-    if coefficients:
-        values, slopes = shake_in_the_middle(coefficients)
-        jacobian[TURN, PARAMETERS:] = -np.kron(values[None], np.eye(3))
-        jacobian[ANGULAR, PARAMETERS:] = -np.kron(slopes[None], np.eye(3))
+    jacobian = _without_shaking((len(estimate.joint_covariance) - PARAMETERS) // 3)
     swing = np.zeros((PARAMETERS, PARAMETERS))
     squares = np.mean(estimate.shake**2, axis=1)
     if len(squares):
@@ -241,14 +249,17 @@ class Tracker:
         """What became of the gyroscope; None without one."""
         return None if self._aid is None else self._aid.status
 
+    def _follows(self, time_ns: int) -> bool:
+        """Whether a time follows that of the last frame with a pose."""
+        track = self._track
+        return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
+
     def prediction(self, time_ns: int) -> Prior | None:
         """What the last frames say of the motion at a time; None when there is no track."""
         track = self._track
-        if track is None:
+        if track is None or not self._follows(time_ns):
             return None
         dt = (time_ns - track.time_ns) * 1e-9
-        if not 0.0 < dt <= _LONGEST_GAP:
-            return None
         readout_time = self.localizer.camera.readout_time
         acceleration = self.localizer.config.acceleration
         motion, covariance, swing = unshaken(track.estimate)
@@ -281,27 +292,21 @@ class Tracker:
             imu: samples from before the last frame with a pose, if there are any, until after the
                 exposure of this one; None: the camera goes alone.
         """
-        prior = self.prediction(time_ns)
-        if prior is None:
+        if not self._follows(time_ns):
             self._track = None
         share = 0.0 if self._track is None else self._track.share
-        foreseen = self._foreseen(time_ns, prior, imu)
 
-        def alone() -> Estimate | Failure:
-            return self.localizer.localize(points, pixels, scores, prior, share)
+        def localized(foreseen: Foreseen | None) -> tuple[Estimate | Failure, Prior | None]:
+            prior = self.prediction(time_ns) if foreseen is None else foreseen.prior
+            turn = None if foreseen is None else foreseen.turn
+            return self.localizer.localize(points, pixels, scores, prior, share, turn), prior
 
-        if self._aid is None or foreseen is None:
-            result = alone()
-            if self._aid is not None:
-                self._aid.compare(time_ns, result)
+        if self._aid is None:
+            result, prior = localized(None)
         else:
-            found = self.localizer.localize(
-                points, pixels, scores, foreseen.prior, share, foreseen.turn
+            result, prior = self._aid.localize(
+                imu, time_ns, lambda: self._before(time_ns), localized
             )
-            other = alone() if self._aid.doubtful(foreseen, found) else None
-            result = self._aid.learn(foreseen, found, other)
-            if result and result.turn is not None:
-                prior = foreseen.prior
         if not result:
             if self._track is not None:
                 self._track.failures += 1
@@ -311,24 +316,25 @@ class Tracker:
         self._track = _followed(self._track, prior, result, time_ns)
         return result
 
-    def _foreseen(
-        self, time_ns: int, prior: Prior | None, imu: ImuSamples | None
-    ) -> Foreseen | None:
-        if self._aid is None:
-            return None
+    def _before(self, time_ns: int) -> Before | None:
+        """What the last frame says of the motion beside what a gyroscope sees."""
         track = self._track
         if track is None:
-            return self._aid.foresee(imu, time_ns, None, None)
+            return None
         readout_time = self.localizer.camera.readout_time
-        motion, covariance, swing = unshaken(track.estimate)
-        added = acceleration_covariance(
-            self.localizer.config.acceleration, 1e-9 * (time_ns - track.time_ns), readout_time
+        motion, covariance, added = unshaken(track.estimate)
+        dt = 1e-9 * (time_ns - track.time_ns)
+        acceleration = Acceleration(_NO_TURN, self.localizer.config.acceleration.linear)
+        added += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
+        return Before(
+            track.time_ns,
+            motion,
+            covariance,
+            added,
+            _FADING / readout_time,
+            track.of_shake_sizes,
+            track.of_field_sizes,
         )
-        for part in (TURN, ANGULAR, ANGULAR_ACCELERATION):  # what the gyroscope sees
-            added[part] = 0.0
-        added = swing + track.jolts * added
-        before = Before(track.time_ns, motion, covariance, added, _FADING / readout_time)
-        return self._aid.foresee(imu, time_ns, before, prior)
 
 
 def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_ns: int) -> _Track:

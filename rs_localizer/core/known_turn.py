@@ -21,6 +21,7 @@ from rs_localizer.core.so3 import exp
 
 # Gauss' rule on the readout; the sum of the weights is its length.
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(5))
+_POWERS = np.vander(_NODES, 3, increasing=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +75,12 @@ class KnownTurn:
         times = np.ascontiguousarray(tau, dtype=np.float64)
         found: tuple[Array, Array] = turns_at(times, self.tau, self.rates, self.rotations)
         return found
+
+    @property
+    def roughness(self) -> float:
+        """Root mean square (rad per readout) of what a parabola leaves of the rate."""
+        rates = self.at_rows(_NODES)[1]
+        return float(np.sqrt(np.mean((rates - _POWERS @ self.parabola) ** 2)))
 
     def late(self, tau: float) -> tuple[Array, Array]:
         """Turn (3,) and rate (3,) at ``tau`` that a delay of one readout would leave.
@@ -188,7 +195,9 @@ def _turn(cubic: Array, time: float) -> Array:
 @kernel
 def _place(time: float, times: Array) -> int:
     """The interval that a time lies in; the first or the last of times outside."""
-    place: int = np.searchsorted(times[1:-1], time)
+    place: int = 0
+    while place < len(times) - 2 and times[place + 1] < time:
+        place += 1
     return place
 
 

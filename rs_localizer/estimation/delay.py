@@ -25,12 +25,16 @@ from rs_localizer.estimation.residuals import linearized
 
 # Of the information of the column alone; less is rounding errors.
 _LEAST_PART = 1e-6
+# Turns (rad) that are not worth the time: a tenth of what a good frame tells of its pose.
+_LEAST_TURN = 3e-5
 
 
 def delay_of(
     observations: Observations, posterior: Posterior, turn: KnownTurn
 ) -> tuple[float, float]:
     """By how many readouts the known turn has to be delayed, and the variance of that."""
+    if turn.roughness * turn.delay < _LEAST_TURN:
+        return 0.0, math.inf
     errors, by_motion, by_turn, _ = linearized(
         observations.packed,
         len(observations),

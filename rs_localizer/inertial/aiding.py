@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import PARAMETERS
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.refine import step_between
@@ -19,11 +20,16 @@ from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
-from rs_localizer.inertial.turning import TurnWithin
+from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
+SEEN = np.r_[TURN, ANGULAR]
+"""Of a step: what a gyroscope contradicts."""
 # Points that fit without the gyroscope, beyond those that fit with it, that speak against it.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
+
+
+Found = tuple[Estimate | Failure, Prior | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +41,8 @@ class Before:
     covariance: Array  # (18,18)
     added: Array  # (18,18) that the prediction gets, but for the rotation
     fading: float  # of accelerations, in readouts
+    of_shake_sizes: Array  # as of the fields of a :class:`Prior`
+    of_field_sizes: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +72,12 @@ class GyroscopeAid:
         self.filter = GyroscopeFilter(settings)
         self._watch = GyroscopeWatch(settings, self.filter)
         self._last_ns: int | None = None
-        self.status = InertialStatus(Alone.NO_SAMPLES)
+        self._state = Alone.NO_SAMPLES
+
+    @property
+    def status(self) -> InertialStatus:
+        """What became of the gyroscope in the last frame."""
+        return self._watch.status(self._state)
 
     def reset(self) -> None:
         """Forget all frames."""
@@ -72,41 +85,65 @@ class GyroscopeAid:
         self._watch.reset()
         self._last_ns = None
 
-    def foresee(
-        self, samples: ImuSamples | None, middle_ns: int, before: Before | None, prior: Prior | None
-    ) -> Foreseen | None:
-        """What is known of a frame before its points; None: the camera has to go alone.
+    def localize(
+        self,
+        samples: ImuSamples | None,
+        middle_ns: int,
+        before: Callable[[], Before | None],
+        localized: Callable[[Foreseen | None], Found],
+    ) -> Found:
+        """Localize a frame with the gyroscope, or without it where that is better.
 
         Args:
             middle_ns: exposure of its middle row.
-            before: the last frame; None: there is no track.
-            prior: what the camera alone foresees.
+            before: gives the last frame; None: there is no track.
+            localized: localizes the frame with what is foreseen, or with the camera alone; and the
+                prior that it did so with.
         """
         if self._last_ns is not None and middle_ns > self._last_ns:
             self.filter.walk(1e-9 * (middle_ns - self._last_ns))
         self._last_ns = middle_ns
-        if before is None:
+        foreseen = self._foreseen(samples, middle_ns, before)
+        if foreseen is None:
             self.filter.forget_motion()
+            alone = localized(None)
+            self._compare(middle_ns, alone[0])
+            return alone
+        found = localized(foreseen)
+        step = _step(foreseen, found[0])
+        if step is not None and not _contradicts(foreseen, step):
+            self._learn(foreseen, found[0], step)
+            return found
+        alone = localized(None)
+        if _better(found[0], alone[0]):
+            self._contradicted(middle_ns, None, step is not None)
+            return found
+        self._contradicted(middle_ns, alone[0], True)
+        return alone
+
+    def _foreseen(
+        self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
+    ) -> Foreseen | None:
+        """What is known of a frame before its points; None: the camera has to go alone."""
         if samples is None or len(samples) == 0:
-            self._alone(Alone.NO_SAMPLES)
+            self._state = Alone.NO_SAMPLES
             return None
         self._watch.hear(samples)
         if self._watch.dropped is not Alone.NONE:
-            self._alone(self._watch.dropped)
+            self._state = self._watch.dropped
             return None
         turn = turning.turn_within(samples, middle_ns, self._readout_time, self.filter.errors)
         if turn is None:
-            self._alone(Alone.NOT_COVERED)
+            self._state = Alone.NOT_COVERED
             return None
-        if before is None or prior is None:
-            return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
-        predicted = self._predicted(samples, middle_ns, before, prior, turn)
-        prior = replace(prior, motion=predicted.motion, covariance=predicted.covariance)
-        return Foreseen(middle_ns, turn, prior, predicted)
-
-    def _alone(self, why: Alone) -> None:
+        last = before()
+        if last is not None:
+            errors = self.filter.errors
+            between = turning.turn_between(samples, last.middle_ns, middle_ns, errors)
+            if between is not None:
+                return self._predicted(last, between, turn, middle_ns)
         self.filter.forget_motion()
-        self.status = self._watch.status(why)
+        return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
 
     def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
         up = self._settings.gravity_in_map
@@ -116,114 +153,83 @@ class GyroscopeAid:
         return Prior(gravity=seen[0], gravity_deviation=seen[1], gravity_in_map=up)
 
     def _predicted(
-        self, samples: ImuSamples, middle_ns: int, before: Before, prior: Prior, turn: TurnWithin
-    ) -> Predicted:
-        errors = self.filter.errors
-        between = turning.turn_between(samples, before.middle_ns, middle_ns, errors)
-        if between is None:
-            return self._predicted_by_camera(prior, turn)
+        self, last: Before, between: TurnBetween, within: TurnWithin, middle_ns: int
+    ) -> Foreseen:
+        readouts = 1e-9 * (middle_ns - last.middle_ns) / self._readout_time
         predicted = self.filter.predict(
-            before.motion,
-            before.covariance,
-            between,
-            turn,
-            1e-9 * (middle_ns - before.middle_ns) / self._readout_time,
-            before.fading,
+            last.motion, last.covariance, between, within, readouts, last.fading
         )
-        return replace(predicted, covariance=predicted.covariance + before.added)
-
-    def _predicted_by_camera(self, prior: Prior, turn: TurnWithin) -> Predicted:
-        """The camera's prediction, beside the turn within the frame."""
-        assert prior.motion is not None
-        assert prior.covariance is not None
-        motion = replace(
-            prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3)
+        predicted = replace(predicted, covariance=predicted.covariance + last.added)
+        prior = Prior(
+            motion=predicted.motion,
+            covariance=predicted.covariance,
+            of_shake_sizes=last.of_shake_sizes,
+            of_field_sizes=last.of_field_sizes,
         )
-        covariance = prior.covariance.copy()
-        covariance[RATE] = 0.0
-        covariance[:, RATE] = 0.0
-        covariance[np.ix_(RATE, RATE)] = turn.known.error
-        with_parameters = np.zeros((PARAMETERS, turning.PARAMETERS))
-        with_parameters[RATE] = turn.by_parameters @ self.filter.errors.covariance
-        return Predicted(motion, covariance, with_parameters)
+        return Foreseen(middle_ns, within, prior, predicted)
 
-    def doubtful(self, foreseen: Foreseen, found: Estimate | Failure) -> bool:
-        """Whether a frame should be tried without the gyroscope."""
-        if not found or (foreseen.predicted is not None and not found.tracked):
-            return True
-        return self._contradicts(foreseen, found)
-
-    def _contradicts(self, foreseen: Foreseen, found: Estimate) -> bool:
-        if foreseen.predicted is None:
-            covariance = np.eye(PARAMETERS)
-            covariance[np.ix_(RATE, RATE)] = foreseen.turn.error
-            step = np.zeros(PARAMETERS)
-            step[RATE] = _left(found)
-            return contradicts(step, covariance)
-        return contradicts(_step(foreseen.predicted, found), foreseen.predicted.covariance)
-
-    def learn(
-        self, foreseen: Foreseen, found: Estimate | Failure, alone: Estimate | Failure | None
-    ) -> Estimate | Failure:
-        """Take in a frame; the better of its results, with the gyroscope and without.
-
-        Args:
-            alone: without the gyroscope; None where there was no doubt.
-        """
-        better = _better(found, alone)
-        if not better:
-            self.filter.forget_motion()
-            self.status = self._watch.status(Alone.NONE)
-            return better
-        if better.turn is None:
-            self.filter.forget_motion()
-            self._watch.judge(True, _believed(foreseen.middle_ns, better))
-            dropped = self._watch.dropped
-            self.status = self._watch.status(Alone.DOUBTED if dropped is Alone.NONE else dropped)
-            return better
-        contradicted = self._contradicts(foreseen, better)
-        self._watch.judge(contradicted, None)
-        posterior = better.joint_covariance[:PARAMETERS, :PARAMETERS]
-        delay, variance = better.delay
-        if contradicted:
-            self.filter.forget_motion()
-        elif foreseen.predicted is not None and better.tracked:
-            step = _step(foreseen.predicted, better)
+    def _learn(self, foreseen: Foreseen, found: Estimate | Failure, step: Array) -> None:
+        """Take in a frame that agrees with the gyroscope."""
+        assert found
+        self._state = Alone.NONE
+        self._watch.judge(False, None)
+        posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
+        if foreseen.predicted is not None:
             self.filter.update(foreseen.predicted, step, posterior)
         else:
-            self.filter.begin(foreseen.within, _left(better), posterior)
-        if not contradicted:
-            readout_time = self._readout_time
-            self.filter.hear_delay(readout_time * delay, readout_time**2 * variance)
-        self.status = self._watch.status(Alone.NONE)
-        return better
+            self.filter.begin(foreseen.within, step[RATE], posterior)
+        (delay, variance), unit = found.delay, self._readout_time
+        self.filter.hear_delay(unit * delay, unit**2 * variance)
 
-    def compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
+    def _contradicted(
+        self, middle_ns: int, alone: Estimate | Failure | None, by_points: bool
+    ) -> None:
+        """Take in a frame that does not agree, with the result of the camera alone if it counts."""
+        self.filter.forget_motion()
+        self._watch.judge(by_points, _believed(middle_ns, alone) if alone else None)
+        self._state = Alone.NONE
+        if alone:
+            dropped = self._watch.dropped
+            self._state = Alone.DOUBTED if dropped is Alone.NONE else dropped
+
+    def _compare(self, middle_ns: int, alone: Estimate | Failure) -> None:
         """Compare a gyroscope that was dropped with what the camera sees without it."""
         if alone and self._watch.dropped is not Alone.NONE:
             self._watch.judge(False, _believed(middle_ns, alone))
 
 
-def _better(found: Estimate | Failure, alone: Estimate | Failure | None) -> Estimate | Failure:
-    if not alone:  # Also where it was not asked for.
-        return found
-    if not found:
-        return alone
+def _better(found: Estimate | Failure, alone: Estimate | Failure) -> bool:
+    """Whether a result with the gyroscope is the better one."""
+    if not alone or not found:
+        return bool(found) or not alone
     most = _BETTER_SHARE * np.count_nonzero(found.inliers) + _BETTER_COUNT
-    return alone if np.count_nonzero(alone.inliers) > most else found
+    return bool(np.count_nonzero(alone.inliers) <= most)
 
 
 def _believed(middle_ns: int, found: Estimate) -> Believed:
     return Believed(middle_ns, found.rotation, found.covariance[:3, :3])
 
 
-def _step(predicted: Predicted, found: Estimate) -> Array:
-    """The step (18,) from a prediction to an estimate, both beside the known turn."""
-    origin = np.zeros(3)
-    return step_between(state_in(predicted.motion, origin), state_in(found.beside_turn(), origin))
+def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
+    """The step (18,) from what was foreseen to an estimate, beside the known turn.
+
+    None where there is no estimate, or none near the prediction. Without a prediction only what the
+    gyroscope leaves counts.
+    """
+    if not found:
+        return None
+    motion, origin = found.beside_turn(), np.zeros(3)
+    if foreseen.predicted is None:
+        step = np.zeros(PARAMETERS)
+        step[ANGULAR] = motion.angular_velocity
+        step[ANGULAR_ACCELERATION] = motion.angular_acceleration
+        return step
+    if not found.tracked:
+        return None
+    return step_between(state_in(foreseen.predicted.motion, origin), state_in(motion, origin))
 
 
-def _left(found: Estimate) -> Array:
-    """Rate and its change (6,) that the points left beside the known turn."""
-    motion = found.beside_turn()
-    return np.concatenate([motion.angular_velocity, motion.angular_acceleration])
+def _contradicts(foreseen: Foreseen, step: Array) -> bool:
+    if foreseen.predicted is None:
+        return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3])
+    return contradicts(step[SEEN], foreseen.predicted.covariance[np.ix_(SEEN, SEEN)])

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn, multiplied, rotations_at_knots, spline, turns_at
+from rs_localizer.core.known_turn import (
+    KnownTurn,
+    multiplied,
+    rotations_at_knots,
+    spline,
+    turn_of,
+    turns_at,
+)
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.so3 import coefficients, log
 from rs_localizer.inertial.band import densified
@@ -68,19 +76,13 @@ def turn_within(
     if spanning is None:
         return None
     times, rates = spanning
-    tau = times / readout_time
-    turn = KnownTurn.of(tau, rates * readout_time)
-    by_parameters, variances = _left_over(
-        turn.tau, turn.rates, turn.rotations, readout_time, errors.noise
+    turn, error, by_parameters, variances = _within(
+        times, rates, readout_time, errors.noise, errors.covariance
     )
-    period = (times[-1] - times[0]) / (len(times) - 1) * 2.0  # of the samples
-    known = KnownTurn(
-        turn.tau, turn.rates, turn.rotations, turn.rate, turn.change, turn.parabola,
-        np.diag(variances) + by_parameters @ errors.covariance @ by_parameters.T,
-        errors.noise * readout_time / float(np.sqrt(period)),
-        float(np.sqrt(errors.covariance[OFFSET, OFFSET])) / readout_time,
-    )  # fmt: skip
-    return TurnWithin(known, by_parameters, variances)
+    period = (times[-1] - times[0]) / (len(times) - 1)
+    rate_noise = errors.noise * readout_time / math.sqrt(period)
+    delay = math.sqrt(errors.covariance[OFFSET, OFFSET]) / readout_time
+    return TurnWithin(KnownTurn(*turn, error, rate_noise, delay), by_parameters, variances)
 
 
 def turn_between(
@@ -92,6 +94,21 @@ def turn_between(
     if spanning is None:
         return None
     return TurnBetween(*_between(*spanning, length, errors.noise))
+
+
+@kernel
+def _within(
+    times: Array, rates: Array, readout_time: float, noise: float, of_parameters: Array
+) -> tuple[tuple[Array, Array, Array, Array, Array, Array], Array, Array, Array]:
+    """The turn of a :class:`KnownTurn`, its error, and what :func:`_left_over` gives."""
+    dense, found = densified(times, rates)
+    tau = dense / readout_time
+    cubics, rotations, rate, change, parabola = turn_of(tau, found * readout_time)
+    by_parameters, variances = _left_over(tau, cubics, rotations, readout_time, noise)
+    error = by_parameters @ of_parameters @ by_parameters.T
+    for k in range(6):
+        error[k, k] += variances[k]
+    return (tau, cubics, rotations, rate, change, parabola), error, by_parameters, variances
 
 
 @kernel
@@ -122,9 +139,10 @@ def _left_over(
 @kernel
 def _between(times: Array, rates: Array, length: float, noise: float) -> tuple[Array, Array, float]:
     """The fields of a :class:`TurnBetween`; it ends at time 0."""
-    cubics = spline(times, rates)
-    rotations = rotations_at_knots(times, cubics)  # from the camera then
-    ends, end_rates = turns_at(np.array([-length, 0.0]), times, cubics, rotations)
+    dense, found = densified(times, rates)
+    cubics = spline(dense, found)
+    rotations = rotations_at_knots(dense, cubics)  # from the camera then
+    ends, end_rates = turns_at(np.array([-length, 0.0]), dense, cubics, rotations)
     rotation = ends[0].T.copy()
     angle = log(ends[0].copy())
     x, y, z = angle[0], angle[1], angle[2]
@@ -160,5 +178,4 @@ def _spanning(
     if part is None:
         return None
     times = np.asarray(1e-9 * (samples.times_ns[part] - here_ns), np.float64)
-    dense: tuple[Array, Array] = densified(times, samples.angular_velocity[part] - errors.bias)
-    return dense
+    return times, samples.angular_velocity[part] - errors.bias

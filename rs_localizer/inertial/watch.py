@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import ANGULAR, TURN
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.inertial.filter import GyroscopeFilter
 from rs_localizer.inertial.mounting import fit_mounting
 from rs_localizer.inertial.offset import CameraTurn, fit_offset
@@ -56,17 +55,16 @@ class GyroscopeWatch:
         self._contradictions: deque[bool] = deque(maxlen=_WATCHED)
         self._turns: deque[CameraTurn] = deque(maxlen=_KEPT)
         self._last: Believed | None = None
-        self._samples: deque[ImuSamples] = deque()
+        self._samples: deque[tuple[IntArray, Array]] = deque()
         self._untried = 0
 
     def hear(self, samples: ImuSamples) -> None:
         """Keep the samples that are new."""
-        newest = int(self._samples[-1].times_ns[-1]) if self._samples else -(2**63)
+        newest = int(self._samples[-1][0][-1]) if self._samples else -(2**63)
         first = int(np.searchsorted(samples.times_ns, newest, "right"))
         if first < len(samples):
-            new = ImuSamples(samples.times_ns[first:], samples.angular_velocity[first:])
-            self._samples.append(new)
-        while self._samples and self._samples[0].times_ns[-1] < samples.times_ns[-1] - _MEMORY_NS:
+            self._samples.append((samples.times_ns[first:], samples.angular_velocity[first:]))
+        while self._samples and self._samples[0][0][-1] < samples.times_ns[-1] - _MEMORY_NS:
             self._samples.popleft()
 
     def judge(self, contradicts: bool, frame: Believed | None) -> None:
@@ -100,8 +98,8 @@ class GyroscopeWatch:
         """Find a time offset that makes the two agree, or say that the mounting does not."""
         if not self._samples:
             return
-        times = np.concatenate([part.times_ns for part in self._samples])
-        rates = np.concatenate([part.angular_velocity for part in self._samples])
+        times = np.concatenate([part[0] for part in self._samples])
+        rates = np.concatenate([part[1] for part in self._samples])
         fit = fit_offset(times, rates, self._turns)
         if fit is None:
             return
@@ -149,12 +147,5 @@ class GyroscopeWatch:
 
 
 def contradicts(step: Array, covariance: Array) -> bool:
-    """Whether a frame moved rotation and turn rate by more than a prediction allows for.
-
-    Args:
-        step: (18,) from the prediction to the estimate.
-        covariance: (18,18) of the prediction.
-    """
-    chosen = np.r_[TURN, ANGULAR]
-    moved, expected = step[chosen], covariance[np.ix_(chosen, chosen)]
-    return bool(moved @ np.linalg.solve(expected, moved) > _MOST_SURPRISE)
+    """Whether a frame moved rotation and turn rate (k,) by more than their prediction allows."""
+    return bool(step @ np.linalg.solve(covariance, step) > _MOST_SURPRISE)
