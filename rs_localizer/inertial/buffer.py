@@ -22,9 +22,11 @@ MOST = 16_384
 """How many readings are remembered."""
 # Readings that come so much behind the newest are no stragglers: the clock was set back.
 _SET_BACK_NS = 500_000_000
-# Readings farther apart than this leave parts of an exposure unseen: a shaking of 30 Hz turns by
-# half a cycle meanwhile.
-_LARGEST_STEP_NS = 16_000_000
+# At a longer period than this, a shaking of 30 Hz turns by half a cycle between two readings.
+_LONGEST_PERIOD_NS = 16_000_000
+# Readings farther apart than so many periods are a gap: one that is missing can be told from its
+# neighbours, as far as a vibration goes that they can show, two cannot.
+_MOST_PERIODS = 2.5
 # A gyroscope that shows its greatest value so many times in a row, and at least this (rad/s; the
 # smallest range there is), shows the end of its range.
 _SATURATED_COUNT, _SATURATED_RATE = 4, 2.0
@@ -176,12 +178,20 @@ class ReadingBuffer:
             end = int(known.searchsorted(until_ns)) + 1
             stamps = known[begin:end].copy()
             values = self._values[self._first + begin : self._first + end].copy()
-            latest = known[-_RATE_COUNT:].copy()
         first = int(stamps.searchsorted(start_ns, "right")) - 1
         last = int(stamps.searchsorted(end_ns)) + 1
-        stops = np.flatnonzero(stamps[1:] - stamps[:-1] > _LARGEST_STEP_NS) + 1
+        steps = stamps[1:] - stamps[:-1]
+        period = float(np.median(steps)) if len(steps) else 0.0
+        if period > _LONGEST_PERIOD_NS:
+            return Lacking(
+                Lack.TOO_SLOW,
+                f"a reading comes every {_span(period)}; at most {_span(_LONGEST_PERIOD_NS)} tell "
+                "how a camera shakes",
+            )
+        stops = np.flatnonzero(steps > _MOST_PERIODS * period) + 1
         if ((stops > first) & (stops < last)).any():
-            return _sparse(_period(latest), stamps[first:last])
+            step = _span(float(steps[first : last - 1].max()))
+            return Lacking(Lack.GAP, f"for {step} within the exposure there is no reading")
         greatest = values[-1, 6:]
         if greatest.max() >= _SATURATED_RATE:
             ends = _at_the_end_of_the_range(values[:, :3], greatest)
@@ -222,17 +232,6 @@ def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:
             Lack.NOT_YET, f"the last reading is {_span(end_ns - newest)} older than the last row"
         )
     return None
-
-
-def _sparse(period: float, within: IntArray) -> Lacking:
-    if period > _LARGEST_STEP_NS:
-        return Lacking(
-            Lack.TOO_SLOW,
-            f"a reading comes every {_span(period)}; at most {_span(_LARGEST_STEP_NS)} tell how a "
-            "camera shakes",
-        )
-    step = float(np.diff(within).max())
-    return Lacking(Lack.GAP, f"for {_span(step)} within the exposure there is no reading")
 
 
 def _period(stamps: IntArray) -> float:

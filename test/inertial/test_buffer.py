@@ -97,6 +97,11 @@ def test_what_is_missing_is_told() -> None:
     assert lack(gap) == Lack.GAP
     assert "for 20.0 ms within" in str(gap)
     assert with_gap.between(START + 530 * MS, START + 560 * MS)
+    # One that is lost can be told from its neighbours, two cannot.
+    for lost, expected in ((1, None), (2, Lack.GAP)):
+        some = filled([t for t in stamps(400) if not 0 < t - START - 500 * MS <= lost * PERIOD])
+        found = some.between(START + 490 * MS, START + 525 * MS)
+        assert (found.lack if isinstance(found, Lacking) else None) == expected
     slow = filled(stamps(50, 20 * MS))
     assert lack(slow.between(START + 100 * MS, START + 130 * MS)) == Lack.TOO_SLOW
     assert filled(stamps(100, 10 * MS)).between(START + 100 * MS, START + 130 * MS)

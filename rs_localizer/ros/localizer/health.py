@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from rs_localizer.pipeline.imu import ImuState
-from rs_localizer.ros.localizer.imu_health import imu_values, why_alone
+from rs_localizer.ros.localizer.imu_health import imu_values
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import WINDOW, Percentiles, Summary
 from rs_localizer.trajectory.online import MeasuredReadout
@@ -111,10 +111,7 @@ def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
         return level, f"waiting for {what}", "; ".join([f"waiting for {what}", *causes])
     if silent is not None:
         return silent
-    oddities = dict(condition.oddities)
-    if condition.imu is not None and (alone := why_alone(condition.imu)):
-        oddities["imu"] = alone
-    return _judge_frames(summary, oddities)
+    return _judge_frames(summary, condition.oddities)
 
 
 def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:

@@ -13,11 +13,12 @@ from rs_localizer.pipeline.reasons import IMU_REASONS
 _FEW = 0.5
 
 
-def why_alone(state: ImuState) -> str:
-    """What is odd: why the camera goes on alone, and what to look at; empty where it does not."""
-    if state.unused is None or state.share >= _FEW:
-        return ""
-    return f"the IMU is not used: {state.unused} ({IMU_REASONS[state.unused.reason].look_at})"
+def imu_oddity(state: ImuState | None) -> dict[str, str]:
+    """Why the camera goes on alone, and what to look at; nothing where it does not."""
+    if state is None or state.unused is None or state.share >= _FEW:
+        return {}
+    look_at = IMU_REASONS[state.unused.reason].look_at
+    return {"imu": f"the IMU is not used: {state.unused} ({look_at})"}
 
 
 def imu_values(state: ImuState) -> dict[str, str]:

@@ -22,6 +22,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.localizer.broadcaster import Broadcaster
 from rs_localizer.ros.localizer.feed import FRAME_TOPICS, Feed, described, warm_up
 from rs_localizer.ros.localizer.health import Condition, Health, diagnose, of_interest
+from rs_localizer.ros.localizer.imu_health import imu_oddity
 from rs_localizer.ros.localizer.outputs import Outputs
 from rs_localizer.ros.node import parameters, transforms
 from rs_localizer.ros.node.diagnostics import Diagnostics
@@ -194,6 +195,7 @@ class LocalizerNode(RobustLifecycleNode):
         missing = () if frames is None else frames.missing
         silence = {} if self._inputs is None else self._inputs.silence()
         watch = None if frames is None else frames.readout_watch
+        imu = None if frames is None else frames.imu.state
         condition = Condition(
             life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,
@@ -202,9 +204,10 @@ class LocalizerNode(RobustLifecycleNode):
             silence=of_interest(silence, FRAME_TOPICS, missing),
             oddities=self.refusals.recent(_ODD, WINDOW)
             | self._broadcaster.fault()
+            | imu_oddity(imu)
             | ({"readout_time": watch.fault} if watch and watch.fault else {}),
             readout=watch.measured if watch else None,
-            imu=None if frames is None else frames.imu.state,
+            imu=imu,
         )
         health = diagnose(condition, self._statistics.summary())
         return health, "" if frames is None else frames.camera_frame
