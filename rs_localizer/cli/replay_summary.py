@@ -78,7 +78,7 @@ def _inertial(imu: ImuState | None) -> list[tuple[str, str]]:
         return []
     rows = [("localized with the IMU", f"{imu.used / imu.frames:.1%}")]
     rows += [(f"  without: {reason}", str(count)) for reason, count in imu.reasons.items()]
-    if imu.status is not None and imu.status.used:
+    if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
         bias, offset = np.degrees(imu.status.bias), 1e3 * imu.time_offset
         rows += [
             ("  bias of the gyroscope (deg/s)", f"{np.linalg.norm(bias):.2f}"),
