@@ -21,7 +21,6 @@ from rs_localizer.core.so3 import exp
 
 # Gauss' rule on the readout; the sum of the weights is its length.
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(5))
-_POWERS = np.vander(_NODES, 3, increasing=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +37,7 @@ class KnownTurn:
     change: Array
     # (3,3) the parabola, in powers of tau, that is nearest to the rate over the readout
     parabola: Array
+    roughness: float  # rad per readout, root mean square of what the parabola leaves
     # (6,6) of what the gyroscope is off by: a constant rate and its change, rad per readout and
     # per readout squared, along the axes at tau = 0
     error: Array = field(default_factory=lambda: np.zeros((6, 6)))
@@ -76,12 +76,6 @@ class KnownTurn:
         found: tuple[Array, Array] = turns_at(times, self.tau, self.rates, self.rotations)
         return found
 
-    @property
-    def roughness(self) -> float:
-        """Root mean square (rad per readout) of what a parabola leaves of the rate."""
-        rates = self.at_rows(_NODES)[1]
-        return float(np.sqrt(np.mean((rates - _POWERS @ self.parabola) ** 2)))
-
     def late(self, tau: float) -> tuple[Array, Array]:
         """Turn (3,) and rate (3,) at ``tau`` that a delay of one readout would leave.
 
@@ -96,11 +90,11 @@ class KnownTurn:
 
 
 @kernel
-def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array]:
+def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array, float]:
     """What a :class:`KnownTurn` holds of rates (k,3) at row times (k,)."""
     cubics = spline(tau, rates)
     rotations = rotations_at_knots(tau, cubics)
-    found, middle = np.zeros((3, 3)), np.zeros(3)
+    found, squares = np.zeros((3, 3)), np.zeros(3)
     # Projections on Legendre polynomials by Gauss' rule of five nodes, exact up to degree 9.
     for node in range(5):
         x = 2.0 * _NODES[node]
@@ -110,12 +104,19 @@ def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array
             for axis in range(3):
                 part = (2 * degree + 1) * _WEIGHTS[node] * legendre[degree] * here[axis]
                 found[degree, axis] += part
+        for axis in range(3):
+            squares[axis] += _WEIGHTS[node] * here[axis] * here[axis]
     parabola = np.empty((3, 3))
     parabola[0] = found[0] - 0.5 * found[2]
     parabola[1] = 2.0 * found[1]
     parabola[2] = 6.0 * found[2]
-    middle[:] = _rate_at(0.0, tau, cubics)
-    return cubics, rotations, middle, change_at(0.0, tau, cubics), parabola
+    left = 0.0  # by Parseval
+    for axis in range(3):
+        left += squares[axis]
+        for degree in range(3):
+            left -= found[degree, axis] ** 2 / (2 * degree + 1)
+    middle, change = _rate_at(0.0, tau, cubics), change_at(0.0, tau, cubics)
+    return cubics, rotations, middle, change, parabola, np.sqrt(max(left, 0.0) / 3.0)
 
 
 @kernel

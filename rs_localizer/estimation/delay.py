@@ -1,12 +1,15 @@
 """By how much a known turn has to be delayed, by the errors that it leaves.
 
-One that comes too early by ``d`` turns each row by ``d (omega(tau) - omega(0))`` more than it
-should; where the camera vibrates, no motion under constant acceleration looks like that. Given the
-best motion, with the covariance ``P`` of it, the gradient by ``d`` is ``c^T e`` for the column
-``c`` of its derivatives, and what the motion does not take over of it tells its variance (Schur's
-complement):
+One that comes too early by ``d`` turns each row by too much, or too little; where the camera
+vibrates, no motion under constant acceleration looks like that, and a single frame tells the delay
+to a tenth of a millisecond. The phase of a vibration is lost at once, however, so delays are tried
+one by one. Near the motion, with the derivatives ``J`` of the errors ``e`` by it and ``B`` by a
+turn of each row, a delay that turns the rows by ``phi`` leaves of them, by the motion that is best
+beside it,
 
-    1 / var = c^T c - c^T J P J^T c,   d = -var c^T e        (in noise variances)
+    |e + B phi|^2 - g^T (J^T J)^-1 g,   g = J^T (e + B phi)
+
+Nothing else is supposed of the motion: what is known of it may come from the turn.
 """
 
 from __future__ import annotations
@@ -15,70 +18,94 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.known_turn import KnownTurn, multiplied
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.so3 import log
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.residuals import linearized
 
-# Of the information of the column alone; less is rounding errors.
-_LEAST_PART = 1e-6
 # Turns (rad) that are not worth the time: a tenth of what a good frame tells of its pose.
 _LEAST_TURN = 3e-5
+# Delays to try, in standard deviations and readouts: a vibration of four cycles per readout turns
+# by a seventh of its cycle from one to the next.
+_FARTHEST, _NEAREST, _STEP = 3.0, 2.0, 1.0 / 60.0
+# What another delay has to cost beyond the best one (noise variances), at this distance from it
+# (steps), for that to be believed.
+_CLEARLY, _OTHER = 12.0, 3
+_TINY = 1e-12
 
 
 def delay_of(
     observations: Observations, posterior: Posterior, turn: KnownTurn
 ) -> tuple[float, float]:
     """By how many readouts the known turn has to be delayed, and the variance of that."""
-    if turn.roughness * turn.delay < _LEAST_TURN:
-        return 0.0, math.inf
-    errors, by_motion, by_turn, _ = linearized(
+    unknown = 0.0, math.inf
+    if turn.roughness * min(turn.delay, _STEP) < _LEAST_TURN:
+        return unknown
+    count = math.ceil(_FARTHEST * turn.delay / _STEP) if turn.delay > _STEP / _FARTHEST else 1
+    step = min(_FARTHEST * turn.delay / count, _STEP)
+    # As far as there are samples. Where the right one may lie beyond, another might look right.
+    count = min(count, int(min(-0.5 - turn.tau[0], turn.tau[-1] - 0.5) / step))
+    if count < 1 or count * step < _NEAREST * turn.delay:
+        return unknown
+    delays = step * np.arange(-count, count + 1, dtype=np.float64)
+    costs = _costs(observations, posterior, turn, delays)
+    best = int(np.argmin(costs))
+    if not 0 < best < len(costs) - 1:
+        if count > 1:
+            return unknown
+        best = 1
+    bend = float(costs[best - 1] - 2.0 * costs[best] + costs[best + 1])
+    far = np.abs(np.arange(len(costs)) - best) > _OTHER
+    if not bend > 0.0 or np.any(costs[far] < costs[best] + _CLEARLY):
+        return unknown
+    shift = 0.5 * step * float(costs[best - 1] - costs[best + 1]) / bend
+    return float(delays[best]) + shift, 2.0 * step**2 / bend
+
+
+def _costs(
+    observations: Observations, posterior: Posterior, turn: KnownTurn, delays: Array
+) -> Array:
+    """What delays (k,) leave, in noise variances."""
+    count = len(observations)
+    errors, by_motion, by_turn, tau = linearized(
         observations.packed,
-        len(observations),
+        count,
         posterior.state,
         observations.row_time_gradient,
-        np.zeros((len(observations), 6)),
+        np.zeros((count, 6)),
     )
-    rotations, rates = turn.at_rows(observations.tau)
-    covariance = np.ascontiguousarray(posterior.covariance[:PARAMETERS, :PARAMETERS])
-    slope, information = _by_delay(
-        errors, by_motion, by_turn, posterior.inliers, rotations, rates, turn.rate,
-        covariance / posterior.noise**2,
-    )  # fmt: skip
-    if not information > 0.0:
-        return 0.0, math.inf
-    return -slope / information, posterior.noise**2 / information
+    inliers = posterior.inliers & np.isfinite(observations.squared_errors(posterior.state))
+    free = by_motion[inliers].reshape(-1, PARAMETERS)
+    scale = np.sqrt(np.einsum("ni,ni->i", free, free)) + _TINY
+    base, _ = np.linalg.qr(free / scale)
+    shown, _ = turn.at_rows(tau)
+    middles, _ = turn.at_rows(-delays)
+    costs = np.empty(len(delays))
+    for k, delay in enumerate(delays):
+        rotations, _ = turn.at_rows(tau - delay)
+        turned = _turned(errors, by_turn, shown, rotations, middles[k])[inliers].ravel()
+        along = turned @ base
+        costs[k] = turned @ turned - along @ along
+    freedom = max(len(free) - PARAMETERS, 1)
+    # Where no delay is right, their scatter is no smaller than what the best one leaves.
+    return costs / max(posterior.noise**2, float(costs.min()) / freedom)
 
 
 @kernel
-def _by_delay(
-    errors: Array, by_motion: Array, by_turn: Array, inliers: BoolArray, rotations: Array,
-    rates: Array, middle: Array, covariance: Array,
-) -> tuple[float, float]:  # fmt: skip
-    """Slope and information by the delay, px^2, with the motion free."""
-    own, slope = 0.0, 0.0
-    shared, late = np.zeros(PARAMETERS), np.empty(3)
+def _turned(errors: Array, by_turn: Array, shown: Array, rotations: Array, middle: Array) -> Array:
+    """Errors (n,2) px with the rows turned as in ``rotations``, not as they are shown."""
+    turned = np.empty_like(errors)
+    back = middle.T.copy()
     for i in range(len(errors)):
-        if not inliers[i]:
-            continue
-        for k in range(3):  # in the axes of the steadied camera
-            late[k] = middle[k]
-            for j in range(3):
-                late[k] -= rotations[i, j, k] * rates[i, j]
+        # Of the steadied camera: from the turn that it was steadied by to the delayed one.
+        delayed = multiplied(rotations[i], back)
+        phi = log(multiplied(delayed.T.copy(), shown[i]))
         for row in range(2):
-            column = 0.0
+            turned[i, row] = errors[i, row]
             for k in range(3):
-                column += by_turn[i, row, k] * late[k]
-            own += column * column
-            slope += column * errors[i, row]
-            for k in range(PARAMETERS):
-                shared[k] += column * by_motion[i, row, k]
-    taken = 0.0
-    for i in range(PARAMETERS):
-        for j in range(PARAMETERS):
-            taken += shared[i] * covariance[i, j] * shared[j]
-    information = own - taken
-    return slope, information if information > _LEAST_PART * own else 0.0
+                turned[i, row] += by_turn[i, row, k] * phi[k]
+    return turned

@@ -25,7 +25,8 @@ from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
 SEEN = np.r_[TURN, ANGULAR]
 """Of a step: what a gyroscope contradicts."""
-# Points that fit without the gyroscope, beyond those that fit with it, that speak against it.
+# Points that fit with the gyroscope, beyond those that fit without it, that speak for it although
+# it contradicts what the camera sees.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
 
 
@@ -111,15 +112,13 @@ class GyroscopeAid:
             return alone
         found = localized(foreseen)
         step = _step(foreseen, found[0])
-        if step is not None and not _contradicts(foreseen, step):
+        if step is not None and not (_contradicts(foreseen, step) or self.filter.strange):
             self._learn(foreseen, found[0], step)
             return found
         alone = localized(None)
-        if _better(found[0], alone[0]):
-            self._contradicted(middle_ns, None, step is not None)
-            return found
-        self._contradicted(middle_ns, alone[0], True)
-        return alone
+        better = _better(found[0], alone[0])
+        self._contradicted(middle_ns, None if better else alone[0])
+        return found if better else alone
 
     def _foreseen(
         self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
@@ -181,12 +180,10 @@ class GyroscopeAid:
         (delay, variance), unit = found.delay, self._readout_time
         self.filter.hear_delay(unit * delay, unit**2 * variance)
 
-    def _contradicted(
-        self, middle_ns: int, alone: Estimate | Failure | None, by_points: bool
-    ) -> None:
+    def _contradicted(self, middle_ns: int, alone: Estimate | Failure | None) -> None:
         """Take in a frame that does not agree, with the result of the camera alone if it counts."""
         self.filter.forget_motion()
-        self._watch.judge(by_points, _believed(middle_ns, alone) if alone else None)
+        self._watch.judge(bool(alone), _believed(middle_ns, alone) if alone else None)
         self._state = Alone.NONE
         if alone:
             dropped = self._watch.dropped
@@ -199,11 +196,11 @@ class GyroscopeAid:
 
 
 def _better(found: Estimate | Failure, alone: Estimate | Failure) -> bool:
-    """Whether a result with the gyroscope is the better one."""
+    """Whether a result with a gyroscope that contradicts the camera is the better one."""
     if not alone or not found:
         return bool(found) or not alone
-    most = _BETTER_SHARE * np.count_nonzero(found.inliers) + _BETTER_COUNT
-    return bool(np.count_nonzero(alone.inliers) <= most)
+    fewer = _BETTER_SHARE * np.count_nonzero(alone.inliers) + _BETTER_COUNT
+    return bool(np.count_nonzero(found.inliers) > fewer)
 
 
 def _believed(middle_ns: int, found: Estimate) -> Believed:

@@ -34,16 +34,17 @@ from rs_localizer.inertial.turning import BIAS, OFFSET, GyroscopeErrors, TurnBet
 
 # An offset that is not estimated is known to this, s.
 _GIVEN_OFFSET_DEVIATION = 1e-4
+# Biases beyond so many deviations are none.
+_MOST_BIAS = 5.0
 # Of the information that a frame adds at most, so that rounding leaves some variance.
 _MOST_GAIN = 0.9999
 
 RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 """Of a step: what the gyroscope leaves to the points."""
 _TURNS = np.arange(3)
-# What the rows say of the time offset is believed when it is known this well, s (a vibration of
-# 100 Hz turns by two thirds meanwhile), never better than the second, and not if it is beyond
-# chance (squared, in variances).
-_NEAR, _LEAST_DELAY, _MOST_DELAY = 1e-3, 1e-5, 16.0
+# What the rows say of the time offset is never better than this (s), and not believed beyond chance
+# (squared, in variances).
+_LEAST_DELAY, _MOST_DELAY = 1e-5, 16.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +71,11 @@ class GyroscopeFilter:
         deviations = [*3 * [BIAS_DEVIATION], deviation]
         self._set(np.array([0.0, 0.0, 0.0, time_offset]), np.diag(np.square(deviations)))
         self.forget_motion()
+
+    @property
+    def strange(self) -> bool:
+        """Whether no gyroscope has such a bias."""
+        return float(np.abs(self.errors.bias).max()) > _MOST_BIAS * BIAS_DEVIATION
 
     def forget_motion(self) -> None:
         """The next frame does not follow the last one."""
@@ -126,7 +132,7 @@ class GyroscopeFilter:
             between.by_parameters, within.by_parameters, way, velocity,
             np.array([readouts, farther, faster, left]),
         )  # fmt: skip
-        predicted[_TURNS, _TURNS] += between.variance
+        predicted[_TURNS, _TURNS] += between.variances
         predicted[RATE, RATE] += within.variances
         return Predicted(later, predicted, with_parameters)
 
@@ -158,9 +164,7 @@ class GyroscopeFilter:
         covariance = self.errors.covariance
         known = float(covariance[OFFSET, OFFSET])
         total = known + variance + _LEAST_DELAY**2
-        if not self._settings.estimate_time_offset or not known < _NEAR**2:
-            return
-        if delay * delay > _MOST_DELAY * total:
+        if not self._settings.estimate_time_offset or delay * delay > _MOST_DELAY * total:
             return
         gain = covariance[:, OFFSET] / total
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain * delay

@@ -1,4 +1,10 @@
-"""Turns of the camera by the gyroscope: within a frame, and from one to the next."""
+"""Turns of the camera by the gyroscope: within a frame, and from one to the next.
+
+How they depend on the time offset is seen by shifting the samples to and fro by its standard
+deviation (the unscented transform: Julier, Uhlmann, "Unscented filtering and nonlinear estimation",
+2004). While the offset is hardly known, the derivative of a vibration would say nothing of what a
+shift makes of it; what is no line within the deviation counts as noise.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +35,13 @@ BIAS, OFFSET = slice(0, 3), 3
 # The integral of white noise is a random walk. The least-squares parabola of one over an interval
 # of length 1 has a slope and a curvature of these variances (by its Legendre coefficients).
 _WALK_SLOPE, _WALK_CURVATURE = 6.0 / 5.0, 120.0 / 7.0
+# Of the samples, s or readouts.
+_LEAST_SHIFT = 1e-4
+# A vibration of more than this (rad per readout) of whose phase nothing is known, because the
+# offset is not known this well (s), says nothing of bias and offset: one that is in step with the
+# frames is the same in all of them, as a bias is.
+_MOST_ROUGH, _NEAR = 2e-3, 5e-4
+_WAVE_SLOPE = 60.0  # squared slope of a line through a wave, to its mean square; at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +61,7 @@ class TurnBetween:
     rotation: Array  # (3,3) camera_then_from_camera_now
     # (3,4) of a turn of the camera then, in its own axes, by the gyroscope's parameters
     by_parameters: Array
-    variance: float  # rad^2 of each axis, by noise and scale
+    variances: Array  # (3,) rad^2, by noise and scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,58 +106,85 @@ def turn_between(
     spanning = _spanning(samples, to_ns, length, 0.0, errors)
     if spanning is None:
         return None
-    return TurnBetween(*_between(*spanning, length, errors.noise))
+    deviation = math.sqrt(errors.covariance[OFFSET, OFFSET])
+    return TurnBetween(*_between(*spanning, length, errors.noise, deviation))
 
 
 @kernel
 def _within(
     times: Array, rates: Array, readout_time: float, noise: float, of_parameters: Array
-) -> tuple[tuple[Array, Array, Array, Array, Array, Array], Array, Array, Array]:
-    """The turn of a :class:`KnownTurn`, its error, and what :func:`_left_over` gives."""
+) -> tuple[tuple[Array, Array, Array, Array, Array, Array, float], Array, Array, Array]:
+    """The turn of a :class:`KnownTurn`, its error, and the other fields of :class:`TurnWithin`."""
     dense, found = densified(times, rates)
     tau = dense / readout_time
-    cubics, rotations, rate, change, parabola = turn_of(tau, found * readout_time)
-    by_parameters, variances = _left_over(tau, cubics, rotations, readout_time, noise)
-    error = by_parameters @ of_parameters @ by_parameters.T
-    for k in range(6):
-        error[k, k] += variances[k]
-    return (tau, cubics, rotations, rate, change, parabola), error, by_parameters, variances
-
-
-@kernel
-def _left_over(
-    tau: Array, cubics: Array, rotations: Array, readout_time: float, noise: float
-) -> tuple[Array, Array]:
-    """Derivatives (6,4) of what a known turn leaves by the parameters, and its variances (6,)."""
-    ends, rates = turns_at(np.array([-0.5, 0.0, 0.5]), tau, cubics, rotations)
-    by_parameters = np.zeros((6, PARAMETERS))
-    variances = np.empty(6)
-    whole = log(multiplied(ends[2], ends[0].T.copy()))
+    cubics, rotations, rate, change, parabola, rough = turn_of(tau, found * readout_time)
+    deviation = np.sqrt(of_parameters[OFFSET, OFFSET])
+    shift = _shift(deviation / readout_time, tau[0] + 0.5, tau[-1] - 0.5)
+    wanted = np.array([-0.5, 0.0, 0.5])
+    early = _halves(turns_at(wanted - shift, tau, cubics, rotations)[0])
+    middle = _halves(turns_at(wanted, tau, cubics, rotations)[0])
+    late = _halves(turns_at(wanted + shift, tau, cubics, rotations)[0])
+    by_parameters, variances = np.zeros((6, PARAMETERS)), np.empty(6)
     turned, changed = 0.0, 0.0
     for k in range(3):
         by_parameters[k, k] = -readout_time
-        # Samples of later times: each row has the rate of a little earlier.
-        change = rates[2, k] - rates[0, k]
-        bend = 4.0 * (rates[0, k] - 2.0 * rates[1, k] + rates[2, k])
-        by_parameters[k, OFFSET] = -change / readout_time
-        by_parameters[3 + k, OFFSET] = -bend / readout_time
-        turned += whole[k] * whole[k]
-        changed += change * change
+        turned += middle[k] * middle[k]
+        changed += middle[3 + k] * middle[3 + k]
     walk, scale = noise * noise * readout_time, SCALE_DEVIATION * SCALE_DEVIATION
-    variances[:3] = _WALK_SLOPE * walk + scale * turned
-    variances[3:] = _WALK_CURVATURE * walk + scale * changed
-    return by_parameters, variances
+    for k in range(6):
+        # Samples of later times: each row has the rate of a little earlier.
+        by_parameters[k, OFFSET] = -0.5 * (late[k] - early[k]) / (shift * readout_time)
+        variances[k] = (0.5 * (late[k] + early[k]) - middle[k]) ** 2
+        if k < 3:
+            variances[k] += _WALK_SLOPE * walk + scale * turned
+        else:
+            variances[k] += _WALK_CURVATURE * walk + scale * changed
+    if rough * min(deviation / _NEAR, 1.0) > _MOST_ROUGH:
+        for k in range(6):
+            variances[k] += rough * rough * (2.0 if k < 3 else 2.0 * _WAVE_SLOPE)
+            for column in range(PARAMETERS):
+                own = by_parameters[k, column]
+                variances[k] += own * own * of_parameters[column, column]
+        by_parameters[:] = 0.0
+    error = by_parameters @ of_parameters @ by_parameters.T
+    for k in range(6):
+        error[k, k] += variances[k]
+    turn = (tau, cubics, rotations, rate, change, parabola, rough)
+    return turn, error, by_parameters, variances
 
 
 @kernel
-def _between(times: Array, rates: Array, length: float, noise: float) -> tuple[Array, Array, float]:
+def _shift(deviation: float, before: float, after: float) -> float:
+    """As far as the deviation and the samples reach; never so little that rounding decides."""
+    shift: float = max(min(deviation, -before, after), _LEAST_SHIFT)
+    return shift
+
+
+@kernel
+def _halves(rotations: Array) -> Array:
+    """Mean rate and its change (6,) of a turn (3,3,3) over an interval of length 1."""
+    first = log(multiplied(rotations[0], rotations[1].T.copy()))
+    second = log(multiplied(rotations[1], rotations[2].T.copy()))
+    found = np.empty(6)
+    for k in range(3):
+        found[k] = first[k] + second[k]
+        found[3 + k] = 4.0 * (second[k] - first[k])
+    return found
+
+
+@kernel
+def _between(
+    times: Array, rates: Array, length: float, noise: float, deviation: float
+) -> tuple[Array, Array, Array]:
     """The fields of a :class:`TurnBetween`; it ends at time 0."""
     dense, found = densified(times, rates)
     cubics = spline(dense, found)
     rotations = rotations_at_knots(dense, cubics)  # from the camera then
-    ends, end_rates = turns_at(np.array([-length, 0.0]), dense, cubics, rotations)
-    rotation = ends[0].T.copy()
-    angle = log(ends[0].copy())
+    shift = _shift(deviation, dense[0] + length, dense[-1])
+    wanted = np.array([-length, 0.0, -length - shift, -shift, shift - length, shift])
+    turned, _ = turns_at(wanted, dense, cubics, rotations)
+    rotation = multiplied(turned[1], turned[0].T.copy())
+    angle = log(rotation.T.copy())
     x, y, z = angle[0], angle[1], angle[2]
     squared = x * x + y * y + z * z
     _, c, d = coefficients(squared)
@@ -160,13 +200,16 @@ def _between(times: Array, rates: Array, length: float, noise: float) -> tuple[A
     by_parameters[2, 0] = -length * (c * y + d * x * z)
     by_parameters[1, 2] = -length * (c * x + d * y * z)
     by_parameters[2, 1] = -length * (-c * x + d * y * z)
+    # By how much more the camera turns if the samples come later, or earlier.
+    back = rotation.T.copy()
+    late = log(multiplied(multiplied(turned[3], turned[2].T.copy()), back))
+    early = log(multiplied(multiplied(turned[5], turned[4].T.copy()), back))
+    variances = np.empty(3)
     for k in range(3):
-        started = 0.0
-        for j in range(3):
-            started += rotation[k, j] * end_rates[0, j]
-        by_parameters[k, OFFSET] = started - end_rates[1, k]
-    variance = noise * noise * length + SCALE_DEVIATION * SCALE_DEVIATION * squared
-    return rotation, by_parameters, variance
+        by_parameters[k, OFFSET] = -0.5 * (late[k] - early[k]) / shift
+        variances[k] = (0.5 * (late[k] + early[k])) ** 2
+        variances[k] += noise * noise * length + SCALE_DEVIATION * SCALE_DEVIATION * squared
+    return rotation, by_parameters, variances
 
 
 def _spanning(

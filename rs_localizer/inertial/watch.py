@@ -79,7 +79,8 @@ class GyroscopeWatch:
             self._follow(frame)
         if self.dropped is Alone.NONE:
             if sum(self._contradictions) >= _CONTRADICTIONS:
-                self.dropped = Alone.DISAGREES
+                self.dropped, self._untried = Alone.DISAGREES, 0
+                self._filter.reset()  # what it learned of such a gyroscope is nothing
             return
         self._untried += 1
         if self._untried >= _TRY_EVERY:
