@@ -53,6 +53,7 @@ setup(
         "evo": ["evo"],
         "test": [
             "catkin_pkg",
+            "codespell==2.4.*",
             "hypothesis",
             "mypy==2.4.*",  # pinned, as is Ruff: what passes today passes with the next release
             "pytest",

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rs_localizer.estimation.prior import Prior
     from rs_localizer.io.calibration.files import read_calibration
     from rs_localizer.localizer import Localizer
-    from rs_localizer.solvers import solve_minimal
+    from rs_localizer.solvers.minimal import solve_minimal
     from rs_localizer.tracking import Tracker
 
 __version__ = "0.1.0"
@@ -53,7 +53,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "estimation.prior": ("Prior",),
         "io.calibration.files": ("read_calibration",),
         "localizer": ("Localizer",),
-        "solvers": ("solve_minimal",),
+        "solvers.minimal": ("solve_minimal",),
         "tracking": ("Tracker",),
     }
 

@@ -15,6 +15,7 @@ from numbers import Integral, Real
 from typing import Any
 
 from rs_localizer.core.camera import ScanDirection
+from rs_localizer.solvers.table import SOLVERS
 
 
 class PoseTime(StrEnum):
@@ -30,18 +31,6 @@ class PublishTf(StrEnum):
     NONE = "none"
     MAP_TO_CAMERA = "map_to_camera"
     MAP_TO_ODOM = "map_to_odom"
-
-
-SOLVER_NAMES = (
-    "p3p",
-    "r6p",
-    "r6p_vc_wt",
-    "r6p_vct_w",
-    "r6p_vct_wt",
-    "r6p_vcwt",
-    "r9p",
-    "joint",
-)
 
 
 def setting(
@@ -282,7 +271,7 @@ class LocalizerConfig:
     solver: str = setting(
         "r6p_vcwt",
         "Minimal solver that generates the hypotheses",
-        choices=SOLVER_NAMES,
+        choices=tuple(SOLVERS),
     )
     solver_iterations: int = setting(
         5, "Iterations of the iterative linear solvers", minimum=1, maximum=100

@@ -36,7 +36,7 @@ from rs_localizer.estimation.refine import step_between
 from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import Frame, MotionSearch
 from rs_localizer.estimation.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, TurnSeen, settle
-from rs_localizer.solvers import Solver, find_solver
+from rs_localizer.solvers.table import Solver, find_solver
 
 # A prediction may be off by this multiple of the inlier threshold.
 _PREDICTION_SCALE = 16.0

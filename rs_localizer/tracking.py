@@ -42,7 +42,7 @@ from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import InertialStatus
 from rs_localizer.localizer import Localizer
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 # A prediction over a longer gap (s) says less than a fresh search costs.
 _LONGEST_GAP = 0.5

@@ -16,9 +16,7 @@ Field = tuple[str, int, int]  # name, offset, number of its type
 
 
 def _header(stamp: tuple[int, int], frame: str) -> SimpleNamespace:
-    return SimpleNamespace(
-        stamp=SimpleNamespace(sec=stamp[0], nanosec=stamp[1]), frame_id=frame
-    )
+    return SimpleNamespace(stamp=SimpleNamespace(sec=stamp[0], nanosec=stamp[1]), frame_id=frame)
 
 
 def pack_cloud(

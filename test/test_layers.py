@@ -15,7 +15,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "process": set(),
     "data": set(),
     "core": set(),
-    "config": {"core"},
+    "config": {"core", "solvers"},
     "solvers": {"core"},
     "estimation": {"core", "config", "solvers"},
     "inertial": {"core", "estimation"},

@@ -13,7 +13,7 @@ from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.localizer import assumptions
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 CAMERA = rsl.Camera(1000, 1000, np.array([[1207, 0, 499.5], [0, 1207, 499.5], [0, 0, 1.0]]))
 

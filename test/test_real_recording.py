@@ -13,7 +13,7 @@ from rs_localizer.estimation.refine import refine
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.solvers import SOLVERS
+from rs_localizer.solvers.table import SOLVERS
 from rs_localizer.tracking import Tracker
 
 # 0.33 of the assumed frame time; the video has no time stamps.

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from rs_localizer import data
 from rs_localizer.cli.demo_cube import CUBE, CubeScene
-from rs_localizer.config import SOLVER_NAMES, NodeConfig
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.trajectories import read_tum
@@ -33,6 +33,7 @@ from rs_localizer.lab.simulation.recording import write_simulated
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import RecordedMotion
 from rs_localizer.settings import build, load_params_file
+from rs_localizer.solvers.table import SOLVERS
 
 _GLOBAL, _ROLLING = "global_shutter", "rolling_shutter"
 # The part of the hand's motion that is flown (s): it begins slowly and ends in quick turns.
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--solver",
-        choices=[name for name in SOLVER_NAMES if name != "p3p"],
+        choices=[name for name in SOLVERS if name != "p3p"],
         default=NodeConfig().solver,
         help="solver that is compared with p3p (default: %(default)s)",
     )

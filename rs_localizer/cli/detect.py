@@ -48,9 +48,7 @@ from rs_localizer.settings import settings, write_parameters
 _CHESSBOARD, _CIRCLES, _ASYMMETRIC = "chessboard", "circles", "asymmetric_circles"
 _INVERTED = "inverted_"
 _PATTERNS = [
-    inverted + kind
-    for inverted in ("", _INVERTED)
-    for kind in (_CHESSBOARD, _CIRCLES, _ASYMMETRIC)
+    inverted + kind for inverted in ("", _INVERTED) for kind in (_CHESSBOARD, _CIRCLES, _ASYMMETRIC)
 ]
 # A board on its own is the map: its first corner is the origin, x along the rows, y from row to
 # row, z away from the viewer.
@@ -213,9 +211,7 @@ def find_map(args: argparse.Namespace) -> MarkerMap:
     return marker_map
 
 
-def _files(
-    args: argparse.Namespace, clock: ImageClock
-) -> tuple[Iterator[Shot], int | None]:
+def _files(args: argparse.Namespace, clock: ImageClock) -> tuple[Iterator[Shot], int | None]:
     for name in ("image", "camera_info"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")

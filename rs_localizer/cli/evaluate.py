@@ -168,9 +168,7 @@ def _plot(
         print(f"{directory / name}")
 
 
-def _coverage(
-    path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns: int
-) -> str:
+def _coverage(path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> str:
     """How much of what the truth knows has been localized."""
     rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
     try:

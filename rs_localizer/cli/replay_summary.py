@@ -16,7 +16,7 @@ from rs_localizer.io.outputs import Frame
 from rs_localizer.offline.smoothed import SmoothedFrames
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.reasons import explained
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 # Notices of a frame that could not follow the one before.
 _RESTARTS = ("time_went_back", "map_changed")

@@ -7,10 +7,11 @@ import time
 import warnings
 from collections.abc import Callable
 
-from rs_localizer.config import SOLVER_NAMES, NodeConfig
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.lanes.jit import cache_directory
 from rs_localizer.markers import detection
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.solvers.table import SOLVERS
 
 # Any that is known: with it, frames are tracked, too.
 _READOUT_TIME = 0.03
@@ -19,7 +20,7 @@ _READOUT_TIME = 0.03
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--solver",
-        choices=SOLVER_NAMES,
+        choices=SOLVERS,
         action="append",
         help="only what this one needs; may be repeated (default: all solvers)",
     )
@@ -32,7 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
         OSError: when it could not be kept there.
     """
     steps: dict[str, Callable[[], None]] = {"markers": detection.warm_up}
-    for name in arguments.solver or SOLVER_NAMES:
+    for name in arguments.solver or SOLVERS:
         config = NodeConfig(solver=name, readout_time=_READOUT_TIME)
         steps[f"solver {name}"] = FrameLocalizer(config).warm_up
     with warnings.catch_warnings():

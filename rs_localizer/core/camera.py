@@ -95,6 +95,7 @@ class Camera:
     roi: Roi | None = None
 
     if TYPE_CHECKING:  # what may be given; the fields say what it becomes
+
         def __init__(
             self,
             width: int | float,

@@ -31,18 +31,18 @@ def shake_basis(tau: float, degrees: int, values: Array, rates: Array) -> None:
     middle row: there, pose and velocities are the motion's own. They are the smaller the faster
     they change, because what is slow swings farther.
     """
-    at, middle = np.empty(degrees + 1), np.empty(degrees + 1)
-    legendre(2.0 * tau, at)
-    legendre(0.0, middle)
-    slope = np.empty(degrees + 1)
-    slope_at = np.empty(degrees + 1)
-    slope[0], slope[1], slope_at[0], slope_at[1] = 0.0, 1.0, 0.0, 1.0
-    for k in range(2, degrees + 1):
-        slope[k] = k * middle[k - 1]
-        slope_at[k] = k * at[k - 1] + 2.0 * tau * slope_at[k - 1]
+    x = 2.0 * tau
+    # Polynomials of two degrees, here and at the middle row, and their derivatives by x.
+    at, at_before, middle, middle_before = x, 1.0, 0.0, 1.0
+    slope_at = 1.0
+    for k in range(FIRST_DEGREE, degrees + 1):
+        slope_at = k * at + x * slope_at
+        slope = k * middle
+        at, at_before = ((2 * k - 1) * x * at - (k - 1) * at_before) / k, at
+        middle, middle_before = -(k - 1) * middle_before / k, middle
         size = (_WHOLE_SIZE / k) ** 2
-        values[k - FIRST_DEGREE] = size * (at[k] - middle[k] - 2.0 * slope[k] * tau)
-        rates[k - FIRST_DEGREE] = size * 2.0 * (slope_at[k] - slope[k])
+        values[k - FIRST_DEGREE] = size * (at - middle - x * slope)
+        rates[k - FIRST_DEGREE] = size * 2.0 * (slope_at - slope)
 
 
 @kernel

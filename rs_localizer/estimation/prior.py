@@ -347,9 +347,12 @@ def _add_posed(
                 moved += by_move[k, i] * half[3 + k, j]
             information[i, j] += weight * turned
             information[3 + i, j] += weight * moved
+        turned, moved = 0.0, 0.0
         for k in range(3):
-            slope[i] += by_turn[k, i] * pulled[k]
-            slope[3 + i] += by_move[k, i] * pulled[3 + k]
+            turned += by_turn[k, i] * pulled[k]
+            moved += by_move[k, i] * pulled[3 + k]
+        slope[i] += turned
+        slope[3 + i] += moved
     for i in range(6, size):
         slope[i] += pulled[i]
         for j in range(size):

@@ -193,9 +193,7 @@ def row_paces(data: Array, count: int, state: Array, gradient: Array) -> Array:
 
 
 @kernel
-def truncated_cost(
-    data: Array, state: Array, gradient: Array, scale: float, bound: float
-) -> float:
+def truncated_cost(data: Array, state: Array, gradient: Array, scale: float, bound: float) -> float:
     """Sum of the truncated squared errors, px^2; stops early once it exceeds ``bound``."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, gradient, scale, 0.0, uniform)

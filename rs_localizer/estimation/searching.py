@@ -17,7 +17,7 @@ from rs_localizer.estimation.ransac import NOTHING, Candidate, Hypotheses, searc
 from rs_localizer.estimation.sampling import Pool, Random
 from rs_localizer.estimation.scoring import optimize
 from rs_localizer.estimation.settling import Assumed
-from rs_localizer.solvers import Solver, find_solver
+from rs_localizer.solvers.table import Solver, find_solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
 # of the image; it only has to be right to some degrees. In focal lengths.

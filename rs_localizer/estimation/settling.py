@@ -20,8 +20,9 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES
+from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.mirror import mirrored
-from rs_localizer.estimation.model_error import Examined, Sizes, examine
+from rs_localizer.estimation.model_error import Examined, examine
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, Posterior, fit, maximum_a_posteriori
 from rs_localizer.estimation.prior import PriorTerms, held_beside, slower_terms
@@ -64,8 +65,6 @@ _CLEARLY_WORSE = 9.2
 _MOST_SHARED = 0.9  # correlation of neighbours
 # The covariance speaks for poses within so many standard deviations of the orientation.
 _COVERED = 4.0
-
-
 
 
 SHAKE_SIZES, FIELD_SIZES = len(_SHAKE_SIZES), len(_FIELD_SIZES)
@@ -273,9 +272,7 @@ def _volume(terms: PriorTerms, examined: Examined) -> float:
     return float(0.5 * (np.log(known[known > 0.0]).sum() - examined.determined))
 
 
-def _followed(
-    frame: _Frame, best: Posterior, sizes: Sizes, threshold: float
-) -> Posterior | None:
+def _followed(frame: _Frame, best: Posterior, sizes: Sizes, threshold: float) -> Posterior | None:
     """The posterior of a camera that shakes; None if it cannot be followed."""
     observations = frame.observations
     shaken = follow(
@@ -384,9 +381,7 @@ def _normalized(evidence: Array) -> Array:
     return normalized
 
 
-def _mirror(
-    modes: list[_Mode], evidence: Array, steps: Array, covariance: Array
-) -> Mirror | None:
+def _mirror(modes: list[_Mode], evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
     """The farthest pose that is not out of the question: neither unlikely nor of a bad fit."""
     costs = np.array([mode.cost for mode in modes])
     best = int(np.argmax(evidence))

@@ -17,7 +17,8 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import basis_sizes, shake_at
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.model_error import columns_of, neighbours_agree
+from rs_localizer.estimation.columns import columns_of
+from rs_localizer.estimation.model_error import neighbours_agree
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, add_prior
@@ -193,10 +194,12 @@ def _sizes_and_step(
             scaled[i, i] += 1e-14
         inverse = np.linalg.inv(scaled)
         for i in range(count):
-            step[i] = 0.0
             for j in range(count):
                 covariance[i, j] = scale[i] * scale[j] * inverse[i, j]
-                step[i] += covariance[i, j] * right[j]
+            along = 0.0
+            for j in range(count):
+                along += covariance[i, j] * right[j]
+            step[i] = along
         if round_ == _SIZE_ROUNDS - 1:
             break
         # Expected squares of the coefficients, and of the errors.

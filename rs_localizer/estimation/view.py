@@ -147,9 +147,7 @@ class View:
             omega = [
                 n + self.c * p + self.third * q for n, p, q in zip(now, once, twice, strict=True)
             ]
-            velocity = [
-                v + self.tau * a for v, a in zip(velocity, self._acceleration, strict=True)
-            ]
+            velocity = [v + self.tau * a for v, a in zip(velocity, self._acceleration, strict=True)]
         drift = multiply(self.turn, velocity)
         if self._shake:
             turned = multiply(self._shaken, omega)

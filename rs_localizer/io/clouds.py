@@ -175,14 +175,10 @@ def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> n
         code = np.dtype(order + _FORMATS[number])
         end = offset + count * code.itemsize
         if end > point_step:
-            raise MessageError(
-                f"point_step is {point_step}, but field {name!r} ends at byte {end}"
-            )
+            raise MessageError(f"point_step is {point_step}, but field {name!r} ends at byte {end}")
         codes.append((code, (count,)) if name in _ARRAYS else code)
     offsets = [field[1] for field in fields]
-    return np.dtype(
-        {"names": names, "formats": codes, "offsets": offsets, "itemsize": point_step}
-    )
+    return np.dtype({"names": names, "formats": codes, "offsets": offsets, "itemsize": point_step})
 
 
 def select_inliers(table: NDArray[Any], inliers: NDArray[np.bool_], residuals: Array) -> Any:

@@ -90,9 +90,7 @@ def _from_container(path: Path) -> Iterator[VideoImage]:
             seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
             known = seconds > last
             last = max(last, seconds)
-            yield VideoImage(
-                jpeg.tobytes(), np.asarray(grey, np.uint8), seconds if known else None
-            )
+            yield VideoImage(jpeg.tobytes(), np.asarray(grey, np.uint8), seconds if known else None)
     finally:
         video.release()
 

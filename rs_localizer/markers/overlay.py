@@ -168,9 +168,7 @@ def _text(picture: Picture, text: str, pixel: Array, color: tuple[int, int, int]
         cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width, cv2.LINE_AA)
 
 
-def _line(
-    picture: Picture, pixels: Array, color: tuple[int, int, int], width: int = 1
-) -> None:
+def _line(picture: Picture, pixels: Array, color: tuple[int, int, int], width: int = 1) -> None:
     fixed = np.rint(pixels * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
     cv2.polylines(picture, [fixed], False, color, width, cv2.LINE_AA, _SHIFT)
 

@@ -28,9 +28,7 @@ def still_pose(points: Array, rays: Array) -> tuple[Array, Array] | None:
     return turn, np.asarray(translation, np.float64).ravel()
 
 
-def still_errors(
-    camera: Camera, pose: tuple[Array, Array], points: Array, pixels: Array
-) -> Array:
+def still_errors(camera: Camera, pose: tuple[Array, Array], points: Array, pixels: Array) -> Array:
     """From where the pixels (n,2) are to where a pose puts the points (n,3): px."""
     return camera.project(points @ pose[0].T + pose[1]) - pixels
 

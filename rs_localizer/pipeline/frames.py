@@ -41,7 +41,7 @@ from rs_localizer.pipeline.imu import ImuInput, inertial_settings
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.oddities import oddities
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
 
 # Stands in until the first CameraInfo: kernels are compiled and settings checked before it comes.
@@ -452,8 +452,6 @@ def _build(
     camera = calibration.camera(config.readout_time, config.scan_direction)
     localizer = Localizer(camera, config)
     follows = (
-        config.tracking
-        and config.readout_time > 0.0
-        and find_solver(config.solver).rolling_shutter
+        config.tracking and config.readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     )
     return camera, localizer, Tracker(localizer, inertial_settings(config)) if follows else None

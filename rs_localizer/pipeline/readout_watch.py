@@ -11,7 +11,7 @@ from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 from rs_localizer.trajectory.online import REVERSED, MeasuredReadout, ReadoutMonitor
 
 # Frames from one measurement to the next: few at first, more when there is more to compute.

@@ -1,19 +1,40 @@
-"""The solvers by name: the only place that names them all."""
+"""The solvers by name: THE list; settings, commands, tests and experiments read it.
+
+A new solver is a module here with ``SAMPLE_SIZE``, ``SOLUTIONS`` and a batch kernel (see
+:mod:`rs_localizer.solvers.batch`), and a row.
+"""
 
 from __future__ import annotations
 
-import os
+import functools
+import importlib
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from types import ModuleType
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.solvers import joint, p3p, r6p, r6p_two_step, r6p_vcwt, r9p
-from rs_localizer.solvers.batch import MODEL_SIZE, unpack
+class Row(NamedTuple):
+    """Where a solver is: a module of this folder and its batch kernels.
+
+    Names and not functions, because who asks what there is does not want to compile it.
+    """
+
+    module: str
+    solve: str = "solve_batch"
+    as_published: str = ""  # the paper's form where ours differs
+    rolling_shutter: bool = True
+
+
+SOLVERS = {
+    "p3p": Row("p3p", rolling_shutter=False),
+    "r6p": Row("r6p"),
+    "r6p_vc_wt": Row("r6p_two_step", "solve_vc_wt"),
+    "r6p_vct_w": Row("r6p_two_step", "solve_vct_w"),
+    "r6p_vct_wt": Row("r6p_two_step", "solve_vct_wt"),
+    "r6p_vcwt": Row("r6p_vcwt", as_published="solve_batch_frozen"),
+    "r9p": Row("r9p", as_published="solve_batch_as_published"),
+    "joint": Row("joint"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,34 +42,13 @@ class Solver:
     """A minimal solver: its batch kernel (see :mod:`rs_localizer.solvers.batch`) and sizes."""
 
     solve: Callable[..., None]
-    solve_as_published: Callable[..., None]  # the paper's form where ours differs, else the same
+    solve_as_published: Callable[..., None]
     sample_size: int
     solutions: int  # at most, per sample
-    rolling_shutter: bool = True
+    rolling_shutter: bool
 
 
-def _solver(
-    module: ModuleType,
-    solve: Callable[..., None],
-    as_published: Callable[..., None] | None = None,
-    rolling_shutter: bool = True,
-) -> Solver:
-    published = as_published or solve
-    return Solver(solve, published, module.SAMPLE_SIZE, module.SOLUTIONS, rolling_shutter)
-
-
-SOLVERS: dict[str, Solver] = {
-    "p3p": _solver(p3p, p3p.solve_batch, rolling_shutter=False),
-    "r6p": _solver(r6p, r6p.solve_batch),
-    "r6p_vc_wt": _solver(r6p_two_step, r6p_two_step.solve_vc_wt),
-    "r6p_vct_w": _solver(r6p_two_step, r6p_two_step.solve_vct_w),
-    "r6p_vct_wt": _solver(r6p_two_step, r6p_two_step.solve_vct_wt),
-    "r6p_vcwt": _solver(r6p_vcwt, r6p_vcwt.solve_batch, r6p_vcwt.solve_batch_frozen),
-    "r9p": _solver(r9p, r9p.solve_batch, r9p.solve_batch_as_published),
-    "joint": _solver(joint, joint.solve_batch),
-}
-
-
+@functools.cache
 def find_solver(name: str) -> Solver:
     """The solver of that name.
 
@@ -57,85 +57,12 @@ def find_solver(name: str) -> Solver:
     """
     if name not in SOLVERS:
         raise ValueError(f"unknown solver {name!r}; choose one of {', '.join(SOLVERS)}")
-    return SOLVERS[name]
-
-
-def solve_minimal(
-    name: str,
-    points: ArrayLike,
-    rays: ArrayLike,
-    tau: ArrayLike,
-    rotation: ArrayLike | None = None,
-    iterations: int = 5,
-    as_published: bool = False,
-    threads: int = 1,
-) -> tuple[Array, Array, Array, Array]:
-    """Solve many minimal samples at once.
-
-    Args:
-        name: a key of :data:`SOLVERS`.
-        points: (h,n,3) world points, n the solver's sample size.
-        rays: (h,n,2) undistorted bearings ``x/z, y/z``.
-        tau: (h,n) row times, see :mod:`rs_localizer.core.shutter`.
-        rotation: initial rotation camera_from_map, (3,3) or (h,3,3); identity by default. The
-            rolling-shutter solvers need it to tens of degrees; ``p3p`` ignores it.
-        iterations: of the iterative solvers.
-        as_published: r6p_vcwt with v^ frozen and r9p with its gauge free, as in the paper;
-            otherwise relinearised, and with ``trace(R_RS) = 0``.
-        threads: how many parts of a large batch run side by side; 0 = one per core.
-
-    Returns:
-        rotations (h,k,3,3), translations (h,k,3), w (h,k,3) and t (h,k,3) of model A,
-        ``lambda x = exp(tau [w]x) R X + C + tau t``, per unit of ``tau``; NaN where a sample has
-        fewer than k solutions. For ``p3p``, w and t are zero.
-
-    Raises:
-        ValueError: unknown solver, wrong shapes, fewer than one iteration, or threads below 0.
-    """
-    solver = find_solver(name)
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    rays = np.ascontiguousarray(rays, dtype=np.float64)
-    tau = np.ascontiguousarray(tau, dtype=np.float64)
-    n = solver.sample_size
-    h = len(points)
-    if points.shape != (h, n, 3) or rays.shape != (h, n, 2) or tau.shape != (h, n):
-        raise ValueError(
-            f"{name} takes points (h,{n},3), rays (h,{n},2) and tau (h,{n}); "
-            f"got {points.shape}, {rays.shape} and {tau.shape}"
-        )
-    initial = np.eye(3) if rotation is None else np.ascontiguousarray(rotation, dtype=np.float64)
-    if initial.shape not in ((3, 3), (h, 3, 3)):
-        raise ValueError(f"rotation must be (3,3) or ({h},3,3), got {initial.shape}")
-    if iterations < 1:
-        raise ValueError(f"iterations must be 1 or more, got {iterations}")
-    if threads < 0:
-        raise ValueError(f"threads must be 0 (all cores) or more, got {threads}")
-    samples = np.arange(h * n, dtype=np.int64).reshape(h, n)
-    solve = solver.solve_as_published if as_published else solver.solve
-    initial = initial.reshape(-1, 3, 3)
-    k = solver.solutions
-    rotations, translations = np.empty((h, k, 3, 3)), np.empty((h, k, 3))
-    w, t = np.empty((h, k, 3)), np.empty((h, k, 3))
-
-    def solve_part(first: int, end: int) -> None:
-        models = np.empty((k, MODEL_SIZE, end - first))
-        solve(
-            points.reshape(-1, 3),
-            rays.reshape(-1, 2),
-            tau.ravel(),
-            samples[first:end],
-            initial[first:end] if len(initial) > 1 else initial,
-            iterations,
-            models,
-        )
-        unpack(models, first, rotations, translations, w, t)
-
-    bounds = range(0, h, -(-h // (threads or os.cpu_count() or 1)) or 1)
-    if len(bounds) <= 1:
-        if h > 0:
-            solve_part(0, h)
-    else:  # kernels release the interpreter's lock
-        with ThreadPoolExecutor(len(bounds)) as pool:
-            ends = [*bounds[1:], h]
-            list(pool.map(solve_part, bounds, ends))
-    return rotations, translations, w, t
+    row = SOLVERS[name]
+    module = importlib.import_module(f"rs_localizer.solvers.{row.module}")
+    return Solver(
+        getattr(module, row.solve),
+        getattr(module, row.as_published or row.solve),
+        module.SAMPLE_SIZE,
+        module.SOLUTIONS,
+        row.rolling_shutter,
+    )

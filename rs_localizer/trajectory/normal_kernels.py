@@ -122,9 +122,10 @@ def _whitened(sights: Sights, terms: Terms, n: int, by_point: Array, flow: Array
     for i in range(2):
         a, b = sights.by_ray[n, i, 0] * z, sights.by_ray[n, i, 1] * z
         by_point[i, 0], by_point[i, 1], by_point[i, 2] = a, b, -(a * x + b * y) * z
-        flow[0, i] = 0.0
+        total = 0.0
         for j in range(3):
-            flow[0, i] += by_point[i, j] * sights.velocity[n, j]
+            total += by_point[i, j] * sights.velocity[n, j]
+        flow[0, i] = total
     pace = 1.0 - terms.readout_time * (
         terms.gradient[0] * flow[0, 0] + terms.gradient[1] * flow[0, 1]
     )

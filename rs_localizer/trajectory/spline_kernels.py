@@ -129,9 +129,10 @@ def pose(
     product(work[7], work[2], rotation)
     cumulative(u, 0, work[6, 0])
     for i in range(3):
-        position[i] = positions[first, i]
+        reached = positions[first, i]
         for k in range(3):
-            position[i] += work[6, 0, k] * (positions[first + 1 + k, i] - positions[first + k, i])
+            reached += work[6, 0, k] * (positions[first + 1 + k, i] - positions[first + k, i])
+        position[i] = reached
 
 
 @kernel
@@ -269,6 +270,7 @@ def jacobians(
                     by_rate[i, c] = total + carried[a] * turned_b - carried[b] * turned_a
             for i in range(3):
                 rate[i] = carried[i] + slopes[k] * vectors[start + 1 + k, i]
+        pace = 1.0 / spacing
         for i in range(3):
             for c in range(LOCAL):
-                out[m, 6 + i, c] = by_rate[i, c] / spacing
+                out[m, 6 + i, c] = pace * by_rate[i, c]

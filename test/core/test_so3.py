@@ -55,3 +55,12 @@ def test_many_rotations_are_those_of_one_by_one():
     expected = [so3.exp(v) for v in vectors]
     np.testing.assert_array_equal(so3.exp_many(vectors), expected)
     assert so3.hat(vectors).shape == (7, 3, 3)
+
+
+@given(axes, angles, st.integers(0, 2))
+def test_right_jacobian_is_the_derivative_of_the_exponential(axis, angle, direction):
+    at, step = Rotation.from_rotvec(vector(axis, angle)), 1e-6 * np.eye(3)[direction]
+    ahead, behind = (Rotation.from_rotvec(at.as_rotvec() + s) for s in (step, -step))
+    change = (behind.inv() * ahead).as_rotvec() / 2e-6
+    jacobian = so3.right_jacobian(vector(axis, angle))
+    np.testing.assert_allclose(jacobian[:, direction], change, atol=1e-8)

@@ -8,16 +8,9 @@ from numpy.polynomial import legendre
 from scipy.linalg import null_space
 
 from rs_localizer.core.shake import shake_at, shake_basis, shake_in_the_middle
-from rs_localizer.estimation.model_error import (
-    columns_of,
-    evidence_of_sizes,
-    neighbours_agree,
-    possible,
-    project_out,
-    sizes_of,
-    with_model_error,
-    with_prior,
-)
+from rs_localizer.estimation.columns import columns_of, with_prior
+from rs_localizer.estimation.evidence import evidence_of_sizes, possible, project_out, sizes_of
+from rs_localizer.estimation.model_error import neighbours_agree, with_model_error
 from rs_localizer.estimation.prior import motion_terms
 
 from .projection import polynomials
@@ -294,9 +287,7 @@ def test_neighbours_agree_where_errors_are_shared_and_not_where_they_are_noise()
     strewn = np.where(np.arange(60)[:, None] % 3, shared, 100.0 * rng.normal(size=(60, 2)))
     counting = np.arange(60) % 3 > 0
     assert neighbours_agree(strewn, tau, rays, counting) == pytest.approx(
-        neighbours_agree(
-            strewn[counting], tau[counting], rays[counting], everything[counting]
-        )
+        neighbours_agree(strewn[counting], tau[counting], rays[counting], everything[counting])
     )
     assert neighbours_agree(shared, tau, rays, ~everything) == 0.0
     # Nor do those that stand together in the image.

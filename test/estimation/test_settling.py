@@ -15,7 +15,7 @@ from rs_localizer.estimation.prior import held_terms
 from rs_localizer.estimation.refine import step_between
 from rs_localizer.estimation.settling import settle
 from rs_localizer.localizer import assumptions
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 from .projection import disturbed, gradient, in_camera, jacobian_of, pixels_of, row_time
 

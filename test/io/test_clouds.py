@@ -223,9 +223,7 @@ def test_nothing_that_is_sent_raises_another_error(
         point_step=point_step,
         row_step=row_step,
         is_bigendian=big_endian,
-        fields=[
-            SimpleNamespace(name=n, offset=o, datatype=t, count=c) for n, o, t, c in described
-        ],
+        fields=[SimpleNamespace(name=n, offset=o, datatype=t, count=c) for n, o, t, c in described],
         data=np.frombuffer(data, np.uint8),
     )
     try:

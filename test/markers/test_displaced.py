@@ -76,8 +76,6 @@ def test_with_two_markers_nobody_knows_which_is_off() -> None:
     for _ in range(10):
         check.add(
             CAMERA,
-            Detections(
-                ids, MARKERS.points[:8], np.zeros((8, 2)), np.ones(8), (), (), (), ()
-            ),
+            Detections(ids, MARKERS.points[:8], np.zeros((8, 2)), np.ones(8), (), (), (), ()),
         )
     assert check.fault() is None

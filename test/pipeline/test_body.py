@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rs_localizer.pipeline.frames
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
+import rs_localizer.pipeline.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection

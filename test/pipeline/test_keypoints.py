@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rs_localizer.pipeline.frames
 
+import rs_localizer.pipeline.frames
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
@@ -143,9 +143,7 @@ def test_a_map_that_is_missing_and_comes_late(
     assert notices == []
 
 
-def test_correspondences_need_no_map(
-    frames: list[SimulatedFrame], make_camera_info: Any
-) -> None:
+def test_correspondences_need_no_map(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     node = localizer(make_camera_info)
     assert refused(node.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_map"
     assert node.missing == ("a map",)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.config import SOLVER_NAMES
-from rs_localizer.solvers import SOLVERS, find_solver, solve_minimal
+from rs_localizer.solvers.minimal import solve_minimal
+from rs_localizer.solvers.table import SOLVERS, find_solver
 
 LINEAR = ["r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p"]
 VARIANTS = [(name, False) for name in LINEAR] + [("r6p_vcwt", True), ("r9p", True)]
@@ -31,7 +31,7 @@ def angles(rotations, truth):
 @pytest.mark.parametrize(("name", "as_published"), VARIANTS)
 def test_every_linear_solver_is_its_numpy_oracle(minimal, name, as_published, iterations):
     # Thirteen samples: one full block of lanes and a part of another.
-    p = minimal.problem(13, SOLVERS[name].sample_size, 0.1, 0.1, 0.1, noise=1e-3, seed=1)
+    p = minimal.problem(13, find_solver(name).sample_size, 0.1, 0.1, 0.1, noise=1e-3, seed=1)
     found = solve(name, p, iterations=iterations, as_published=as_published)
     for i in range(13):
         expected = minimal.oracle(
@@ -59,7 +59,7 @@ MODEL_ERROR = {"r6p_vcwt": (2e-3, 1e-4), "r9p": (5e-3, 3e-4), "joint": (2e-3, 1e
 @pytest.mark.parametrize("name", MODEL_ERROR)
 def test_small_motion_without_noise_is_recovered_to_the_model_s_own_error(minimal, name):
     p = minimal.problem(
-        400, SOLVERS[name].sample_size, np.radians(1.0), 0.01, np.radians(0.5), seed=3
+        400, find_solver(name).sample_size, np.radians(1.0), 0.01, np.radians(0.5), seed=3
     )
     rotation, c, w, t = solve(name, p)
     errors = angles(rotation, p.rotation)
@@ -74,7 +74,7 @@ def test_small_motion_without_noise_is_recovered_to_the_model_s_own_error(minima
 
 @pytest.mark.parametrize("name", LINEAR)
 def test_without_motion_and_error_the_truth_stays(minimal, name):
-    p = minimal.problem(64, SOLVERS[name].sample_size, seed=4)
+    p = minimal.problem(64, find_solver(name).sample_size, seed=4)
     rotation, c, w, t = solve(name, p)
     assert np.median(angles(rotation, p.rotation)) < 1e-9
     for found, truth in ((c, p.c), (w, p.w), (t, p.t)):
@@ -154,7 +154,7 @@ def test_joint_gives_the_solutions_of_both(minimal):
 
 @pytest.mark.parametrize("name", ROLLING)
 def test_one_initial_rotation_serves_all_samples(minimal, name):
-    p = minimal.problem(11, SOLVERS[name].sample_size, 0.05, 0.05, 0.05, seed=10)
+    p = minimal.problem(11, find_solver(name).sample_size, 0.05, 0.05, 0.05, seed=10)
     one = solve_minimal(name, p.points, p.rays, p.tau, p.start[0])
     many = solve_minimal(name, p.points, p.rays, p.tau, np.repeat(p.start[:1], 11, axis=0))
     turned = solve_minimal(name, p.points @ p.start[0].T, p.rays, p.tau)
@@ -167,7 +167,7 @@ def test_one_initial_rotation_serves_all_samples(minimal, name):
 
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_turning_the_world_turns_only_the_rotation(minimal, name):
-    p = minimal.problem(9, SOLVERS[name].sample_size, 0.05, 0.05, 0.05, seed=11)
+    p = minimal.problem(9, find_solver(name).sample_size, 0.05, 0.05, 0.05, seed=11)
     turn = Rotation.random(random_state=12).as_matrix()
     rotation, c, w, t = solve(name, p)
     p.points, p.start = p.points @ turn.T, p.start @ turn.T
@@ -202,7 +202,7 @@ def degenerate_samples(size, count, seed):
 
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_no_sample_breaks_a_solver(name):
-    samples = degenerate_samples(SOLVERS[name].sample_size, 100_000, seed=13)
+    samples = degenerate_samples(find_solver(name).sample_size, 100_000, seed=13)
     found = 0
     for part in zip(*(np.array_split(values, 20) for values in samples), strict=True):
         with warnings.catch_warnings():
@@ -215,10 +215,6 @@ def test_no_sample_breaks_a_solver(name):
         assert (finite.all(axis=2) == finite.any(axis=2)).all()
         found += finite[..., 0].sum()
     assert found > 0
-
-
-def test_the_table_is_what_the_configuration_knows():
-    assert tuple(SOLVERS) == SOLVER_NAMES
 
 
 def test_an_unknown_solver_is_refused():
@@ -249,7 +245,7 @@ def test_wrong_input_is_refused_with_what_was_found(changes, said):
 @pytest.mark.parametrize("name", ["p3p", "r6p_vcwt", "r9p"])
 @pytest.mark.parametrize("one_rotation", [True, False])
 def test_threads_change_nothing_but_the_time(minimal, name, one_rotation):
-    p = minimal.problem(101, SOLVERS[name].sample_size, 0.05, 0.05, 0.05, noise=1e-3, seed=14)
+    p = minimal.problem(101, find_solver(name).sample_size, 0.05, 0.05, 0.05, noise=1e-3, seed=14)
     if one_rotation:
         p.start = p.start[0]
     for threads in (0, 2, 7, 200):
@@ -259,6 +255,6 @@ def test_threads_change_nothing_but_the_time(minimal, name, one_rotation):
 
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_no_samples_give_no_solutions(name):
-    n, k = SOLVERS[name].sample_size, SOLVERS[name].solutions
+    n, k = find_solver(name).sample_size, find_solver(name).solutions
     found = solve_minimal(name, np.zeros((0, n, 3)), np.zeros((0, n, 2)), np.zeros((0, n)))
     assert [part.shape for part in found] == [(0, k, 3, 3), (0, k, 3), (0, k, 3), (0, k, 3)]

@@ -175,9 +175,7 @@ def traced(body: Callable[[list[Lanes]], Sequence[Number]], *inputs: int) -> Any
     return one_source if len(inputs) == 1 else two_sources
 
 
-def traced_sums(
-    inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Number]], int]
-) -> Any:
+def traced_sums(inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Number]], int]) -> Any:
     """Make a Numba-callable ``function(source, blocks, target)`` of sums over points.
 
     Args:

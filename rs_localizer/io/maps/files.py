@@ -33,9 +33,7 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
         if database is not None:
             raise MapError("it is no folder of COLMAP, which alone has a database")
         if path.suffix not in _READERS:
-            raise MapError(
-                f"expected a folder of COLMAP or a file ending in {', '.join(_READERS)}"
-            )
+            raise MapError(f"expected a folder of COLMAP or a file ending in {', '.join(_READERS)}")
         return _READERS[path.suffix](path, frame)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rs_localizer.config import SOLVER_NAMES
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.io.trajectories import read_tum
@@ -23,6 +22,7 @@ from rs_localizer.lab.experiments.methods import available
 from rs_localizer.lab.experiments.plain_ransac import best_of_samples, observe
 from rs_localizer.lab.experiments.results import Context, Result, Table
 from rs_localizer.localizer import Localizer
+from rs_localizer.solvers.table import SOLVERS
 
 # As published; and R9P as the package has it.
 _PLAIN = (*m.PAPERS, m.R9P_OURS)
@@ -61,7 +61,7 @@ def run(context: Context) -> Result:
         method.name: np.concatenate([_plain_errors(f, method, context.seed) for f in deep])
         for method in available(_PLAIN)
     }
-    estimates = {solver: _localize(shown, solver) for solver in SOLVER_NAMES}
+    estimates = {solver: _localize(shown, solver) for solver in SOLVERS}
     products = {solver: np.concatenate(found.errors) for solver, found in estimates.items()}
     clip = cube_clip(trajectory, context.trials, context.seed, context.track)
     found = Frames(

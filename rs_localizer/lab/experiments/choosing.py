@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.results import Result, Table
 from rs_localizer.lab.experiments.trials import POINTS
-from rs_localizer.solvers import SOLVERS
+from rs_localizer.solvers.table import find_solver
 
 # In the form in which a user gets them.
 _METHODS = (m.P3P, m.R6P, m.VC_WT, m.VCT_W, m.VCT_WT, m.VCWT_OURS, m.R9P_OURS, m.JOINT)
@@ -41,7 +41,7 @@ def choosing_section(results: Mapping[str, Result]) -> list[str]:
         "|" + "---|" * len(headings),
     ]
     for method in m.available(_METHODS):
-        solver = SOLVERS[method.solver]
+        solver = find_solver(method.solver)
         cells = [f"`{method.solver}`", str(solver.sample_size), str(solver.solutions),
                  f"{_microseconds(tables['timings'], method.solver):.2f}"]  # fmt: skip
         lines.append(f"| {' | '.join([*cells, *_errors(tables, method.name)])} |")

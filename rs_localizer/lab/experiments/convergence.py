@@ -131,8 +131,7 @@ def _once_is_enough(after: Mapping[int, Curves]) -> Claim:
 def _others_slow(after: Mapping[int, Curves]) -> Claim:
     once = after[1].medians(m.VCWT)[1:, :_POSE]
     worse = min(
-        float(np.min(after[_SHOWN[-1]].medians(method)[1:, :_POSE] / once))
-        for method in m.TWO_STEP
+        float(np.min(after[_SHOWN[-1]].medians(method)[1:, :_POSE] / once)) for method in m.TWO_STEP
     )
     gain = min(
         float(np.min(after[5].medians(method)[1:, :_POSE]

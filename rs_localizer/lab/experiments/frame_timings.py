@@ -15,7 +15,7 @@ from rs_localizer.lab.experiments.plain_ransac import observe
 from rs_localizer.lab.experiments.stopwatch import Subject
 from rs_localizer.lab.experiments.trials import Setting, camera, draw_trials
 from rs_localizer.localizer import Localizer, assumptions
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 FRAME = Setting(angular=17.0, linear=0.3, noise=0.5, points=200)
 OUTLIERS = 0.5

@@ -21,7 +21,12 @@ from rs_localizer.estimation.scoring import optimize, state_of_model
 
 @kernel
 def best_solutions(
-    models: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array,
+    models: Array,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    by_ray: Array,
+    gradient: Array,
     scale: float,
 ) -> Array:
     """Of the solutions (h,k,18) of each frame the one with the least truncated error: (h,18).
@@ -46,8 +51,14 @@ def best_solutions(
 
 @kernel
 def refine_frames(
-    models: Array, points: Array, rays: Array, tau: Array, by_ray: Array, gradient: Array,
-    threshold: float, prior: PriorTerms,
+    models: Array,
+    points: Array,
+    rays: Array,
+    tau: Array,
+    by_ray: Array,
+    gradient: Array,
+    threshold: float,
+    prior: PriorTerms,
 ) -> Array:
     """Local optimisation and final refinement of the Localizer on all points: states (h,24)."""
     states = np.full((len(models), STATE_SIZE), np.nan)

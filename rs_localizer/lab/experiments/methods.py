@@ -19,7 +19,8 @@ from rs_localizer.lab.experiments.errors import angles
 from rs_localizer.lab.experiments.kernels import best_solutions, refine_frames
 from rs_localizer.lab.experiments.trials import POINTS, Motions, Trials, camera
 from rs_localizer.localizer import assumptions
-from rs_localizer.solvers import SOLVERS, find_solver, solve_minimal
+from rs_localizer.solvers.minimal import solve_minimal
+from rs_localizer.solvers.table import SOLVERS, find_solver
 
 _SIX = 6
 _TRIPLETS = np.array(list(combinations(range(_SIX), 3)))
@@ -158,9 +159,7 @@ def _best(models: Array, trials: Trials, scale: float) -> Array:
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
     prior, _ = assumptions(camera(), LocalizerConfig(), find_solver("r6p_vcwt"))
-    found = refine_frames(
-        np.ascontiguousarray(models), *view_arguments(trials), threshold, prior
-    )
+    found = refine_frames(np.ascontiguousarray(models), *view_arguments(trials), threshold, prior)
     w, velocity = -found[:, 12:15], found[:, 15:18]
     translation = found[:, 9:12]
     return Motions(found[:, :9].reshape(-1, 3, 3), translation, w,

@@ -14,7 +14,7 @@ from rs_localizer.estimation.ransac import MODEL_SIZE
 from rs_localizer.estimation.sampling import draw, generator
 from rs_localizer.estimation.scoring import best_models
 from rs_localizer.lab.experiments.methods import Method
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 
 def observe(camera: Camera, points: Array, pixels: Array) -> Observations:
@@ -31,7 +31,11 @@ def observe(camera: Camera, points: Array, pixels: Array) -> Observations:
 
 
 def best_of_samples(
-    observations: Observations, method: Method, rotation: Array, samples: int, threshold: float,
+    observations: Observations,
+    method: Method,
+    rotation: Array,
+    samples: int,
+    threshold: float,
     seed: int,
 ) -> tuple[Array, int]:
     """State (24,) of the best minimal model and its number of inliers.

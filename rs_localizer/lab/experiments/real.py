@@ -93,9 +93,7 @@ def _figure(sequence: Sequence, rows: Inliers) -> Figure:
     for method in available(m.PAPERS):
         style = charts.look(method)
         charts.line(axes, x, rows[method.name].astype(float), style, method.label)
-    charts.line(
-        axes, x, rows[OURS].astype(float), charts.look(m.REFINED), "ours: the Localizer"
-    )
+    charts.line(axes, x, rows[OURS].astype(float), charts.look(m.REFINED), "ours: the Localizer")
     axes.set_ylim(bottom=0.0)
     axes.set_title(sequence.title)
     charts.tidy(axes, "frame", "inliers")

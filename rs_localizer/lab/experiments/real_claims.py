@@ -120,10 +120,7 @@ def _unstable(found: Mapping[str, Inliers]) -> Claim:
 
 
 def _r9p_hardest(found: Mapping[str, Inliers]) -> Claim:
-    means = {
-        x.label: float(np.mean(found[_HARDEST][x.name]))
-        for x in available(m.PAPERS)
-    }
+    means = {x.label: float(np.mean(found[_HARDEST][x.name])) for x in available(m.PAPERS)}
     best = max(means, key=lambda label: means[label])
     fixed = float(np.mean(found[_HARDEST][m.R9P_OURS.name]))
     return judge(
@@ -142,9 +139,7 @@ def _r9p_hardest(found: Mapping[str, Inliers]) -> Claim:
 
 def _ours_most(found: Mapping[str, Inliers]) -> Claim:
     ratios = {
-        name: float(
-            np.mean(rows[OURS]) / max(np.mean(rows[x.name]) for x in available(METHODS))
-        )
+        name: float(np.mean(rows[OURS]) / max(np.mean(rows[x.name]) for x in available(METHODS)))
         for name, rows in found.items()
     }
     return judge(

@@ -86,9 +86,7 @@ def _recorded(recording: Path, readout_time: float) -> Iterator[tuple[Camera, Fr
     with open_bag(recording) as bag:
         for topic, _, message in bag.messages([CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC]):
             if topic == CAMERA_INFO_TOPIC:
-                camera = read_camera_info(message).camera(
-                    readout_time, ScanDirection.TOP_TO_BOTTOM
-                )
+                camera = read_camera_info(message).camera(readout_time, ScanDirection.TOP_TO_BOTTOM)
             elif camera is not None:
                 cloud = read_correspondences(message)
                 yield camera, Frame(cloud.points, cloud.pixels)

@@ -18,7 +18,7 @@ start_of_work = time.process_time()
 import json
 import numpy as np
 import rs_localizer as rsl
-from rs_localizer.solvers import SOLVERS
+from rs_localizer.solvers.table import SOLVERS, find_solver
 
 def passed():
     return time.perf_counter() - start, time.process_time() - start_of_work
@@ -27,8 +27,8 @@ K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 rsl.Localizer(rsl.Camera(width=640, height=480, K=K)).warm_up()
 first = passed()
 rng = np.random.default_rng(0)
-for name, solver in SOLVERS.items():
-    n = solver.sample_size
+for name in SOLVERS:
+    n = find_solver(name).sample_size
     sample = rng.normal(size=(1, n, 3)), rng.normal(size=(1, n, 2)), rng.uniform(-0.5, 0.5, (1, n))
     for as_published in (False, True):
         rsl.solve_minimal(name, *sample, as_published=as_published)

@@ -20,9 +20,7 @@ class Subject:
     count: int
 
 
-def interleaved(
-    subjects: Mapping[str, Subject], repeats: int, track: Track
-) -> dict[str, Array]:
+def interleaved(subjects: Mapping[str, Subject], repeats: int, track: Track) -> dict[str, Array]:
     """Times (repeats,) per piece of work of each subject, in microseconds.
 
     All subjects take turns, so that a slow moment of the machine hits all of them alike: compare

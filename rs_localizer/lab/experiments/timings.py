@@ -21,7 +21,8 @@ from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, 
 from rs_localizer.lab.experiments.startup import Startup, cold_and_warm
 from rs_localizer.lab.experiments.stopwatch import Subject, interleaved, ratio
 from rs_localizer.lab.experiments.trials import Setting, Trials, draw_trials
-from rs_localizer.solvers import SOLVERS, find_solver, solve_minimal
+from rs_localizer.solvers.minimal import solve_minimal
+from rs_localizer.solvers.table import SOLVERS, find_solver
 
 _BATCH = 4096
 _REFERENCE = "numpy.linalg.solve of 12x12"

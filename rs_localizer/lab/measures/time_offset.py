@@ -70,9 +70,7 @@ def shifted(trajectory: Trajectory, seconds: float) -> Trajectory:
     return Trajectory(stamps, trajectory.positions, trajectory.quaternions)
 
 
-def interpolated(
-    trajectory: Trajectory, stamps_ns: Stamps
-) -> tuple[NDArray[np.bool_], Trajectory]:
+def interpolated(trajectory: Trajectory, stamps_ns: Stamps) -> tuple[NDArray[np.bool_], Trajectory]:
     """Poses at other times; which of these (n,) lie between poses that follow each other closely.
 
     Positions run straight and orientations at a constant rate in between.
@@ -201,9 +199,7 @@ def _refined(estimate: Trajectory, truth: Trajectory, seconds: float) -> float:
     return seconds + float(found.x if found.fun < costs[best] else shifts[best])
 
 
-def _errors(
-    estimate: Trajectory, truth: Trajectory, shift: float
-) -> tuple[Array, Array] | None:
+def _errors(estimate: Trajectory, truth: Trajectory, shift: float) -> tuple[Array, Array] | None:
     """Distances (m) and angles (deg); None where too little overlaps."""
     moved = shifted(estimate, shift)
     inside, true = interpolated(truth, moved.stamps_ns)

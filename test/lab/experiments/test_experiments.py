@@ -177,7 +177,7 @@ def test_everything_is_said_and_shown(name: str) -> None:
 
 
 def test_every_solver_is_timed() -> None:
-    from rs_localizer.solvers import SOLVERS
+    from rs_localizer.solvers.table import SOLVERS
 
     timed = {row[0] for row in result("timings").tables["timings"].rows}
     assert timed == set(SOLVERS)

@@ -19,7 +19,7 @@ from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstr
 from rs_localizer.lab.independent.rotations import logarithm
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
 from rs_localizer.pipeline.moments import twist_at
-from rs_localizer.solvers import find_solver
+from rs_localizer.solvers.table import find_solver
 
 CAMERA_INFO, CORRESPONDENCES = "/camera/camera_info", "/camera/correspondences"
 FRAMES = 450

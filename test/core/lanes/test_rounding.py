@@ -1,0 +1,107 @@
+"""Same input, same bits: what LLVM may round in two ways, kernels of the estimate do not write.
+
+Before a loop that stores, the vectorizer asks at run time whether the arrays overlap, and asks with
+care: where the heap has put them side by side it runs the loop one by one. A sum is then added in
+another order, and a division by a constant is no multiplication by its reciprocal.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import rs_localizer
+
+PACKAGE = Path(rs_localizer.__file__).parent
+FOLDERS = ("core", "solvers", "estimation", "inertial")
+
+
+def innermost_loops(source: str) -> Iterator[ast.For]:
+    for function in ast.walk(ast.parse(source)):
+        if isinstance(function, ast.FunctionDef) and any(
+            isinstance(mark, ast.Name) and mark.id == "kernel" for mark in function.decorator_list
+        ):
+            for loop in ast.walk(function):
+                if isinstance(loop, ast.For) and not any(
+                    isinstance(inner, ast.For) for line in loop.body for inner in ast.walk(line)
+                ):
+                    yield loop
+
+
+def names(node: ast.AST) -> set[str]:
+    return {item.id for item in ast.walk(node) if isinstance(item, ast.Name)}
+
+
+def two_ways(loop: ast.For) -> Iterator[ast.stmt]:
+    """Statements of a loop whose result depends on whether it is vectorized."""
+    counter = names(loop.target)
+    steps = [item for item in ast.walk(loop) if isinstance(item, ast.Assign | ast.AugAssign)]
+    stores = [
+        step
+        for step in steps
+        if any(
+            isinstance(target, ast.Subscript)
+            for target in (step.targets if isinstance(step, ast.Assign) else [step.target])
+        )
+    ]
+    changing = counter | {
+        item.id
+        for step in steps
+        if isinstance(step, ast.Assign)
+        for target in step.targets
+        for item in ast.walk(target)
+        if isinstance(item, ast.Name)
+    }
+    for step in steps:
+        if not isinstance(step, ast.AugAssign):
+            continue
+        in_memory = isinstance(step.target, ast.Subscript)
+        fixed_place = in_memory and not counter & names(step.target.slice)
+        if fixed_place and counter & names(step.value):
+            yield step  # a sum in memory
+        if not in_memory and stores and counter & names(step.value):
+            yield step  # a sum beside a store
+        if in_memory and isinstance(step.op, ast.Div) and not changing & names(step.value):
+            yield step  # a division that another loop would multiply
+
+
+def test_the_rule_sees_what_it_is_for() -> None:
+    bad = """
+@kernel
+def f(a, b, c):
+    for i in range(3):
+        for k in range(9):
+            a[i] += b[k] * c[k]
+        for k in range(9):
+            a[k] /= b[i]
+        for k in range(9):
+            a[k] = b[k]
+            total += b[k] * c[k]
+"""
+    assert len([found for loop in innermost_loops(bad) for found in two_ways(loop)]) == 3
+    good = """
+@kernel
+def f(a, b, c):
+    for i in range(3):
+        total, inverse = 0.0, 1.0 / b[i]
+        for k in range(9):
+            total += b[k] * c[k]
+        for k in range(9):
+            a[k] *= inverse
+"""
+    assert not [found for loop in innermost_loops(good) for found in two_ways(loop)]
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_kernels_round_in_one_way(folder: str) -> None:
+    found = [
+        f"{path.relative_to(PACKAGE)}:{step.lineno}: {ast.unparse(step)}"
+        for path in sorted((PACKAGE / folder).rglob("*.py"))
+        for loop in innermost_loops(path.read_text())
+        for step in two_ways(loop)
+        if not isinstance(loop.iter, ast.Call) or ast.unparse(loop.iter) != "range(3)"
+    ]
+    assert found == []
