@@ -102,9 +102,7 @@ class GyroscopeWatch:
         times = np.concatenate([part[0] for part in self._samples])
         rates = np.concatenate([part[1] for part in self._samples])
         fit = fit_offset(times, rates, self._turns)
-        if fit is None:
-            return
-        if fit.explains and self._settings.estimate_time_offset:
+        if fit is not None and fit.explains and self._settings.estimate_time_offset:
             self._filter.reset(fit.time_offset, 2.0 * fit.deviation)
             self._take_up()
             return

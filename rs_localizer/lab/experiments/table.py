@@ -22,6 +22,7 @@ from rs_localizer.lab.experiments import (
     translation,
 )
 from rs_localizer.lab.experiments.honesty import experiment as honesty
+from rs_localizer.lab.experiments.inertial import experiment as inertial
 from rs_localizer.lab.experiments.results import Context, Result
 
 EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
@@ -35,6 +36,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
     "planes": planes.run,
     "honesty": honesty.run,
     "tracking": tracking.run,
+    "inertial": inertial.run,
     "robustness": robustness.run,
     "timings": timings.run,
     "matching": matching.run,

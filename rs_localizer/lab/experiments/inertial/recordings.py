@@ -1,0 +1,132 @@
+"""Recordings of the independent simulator with a gyroscope, through tracker and localizer."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.turning import GyroscopeErrors, turn_within
+from rs_localizer.lab.experiments.honesty.estimating import believed, truth_of
+from rs_localizer.lab.experiments.honesty.scores import Score, Scores, score_at
+from rs_localizer.lab.independent.cameras import Camera
+from rs_localizer.lab.independent.frames import Frames, MakeMotions, first_row_times, simulate
+from rs_localizer.lab.independent.gyroscopes import Imu
+from rs_localizer.lab.independent.motions import Motions
+from rs_localizer.lab.independent.scenes import Scene
+from rs_localizer.localizer import Localizer
+from rs_localizer.tracking import Tracker
+
+_BIAS_WALK = 1e-4  # rad/s^2/sqrt(Hz)
+_BEFORE, _AFTER = 0.6, 0.03  # s of samples before the middle row and behind it
+# What a tracker knows of bias and time offset after some seconds.
+_BIAS_DEVIATION, _OFFSET_DEVIATION = math.radians(0.05), 5e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """Frames, and the samples of the IMU beside each recording."""
+
+    frames: Frames
+    samples: tuple[ImuSamples, ...]
+    imu: Imu
+
+    def around(self, frame: int) -> ImuSamples:
+        """The samples that come with a frame."""
+        every = self.samples[int(self.frames.recording[frame])]
+        middle = self.frames.middle_ns(frame)
+        first, last = np.searchsorted(
+            every.times_ns, [middle - round(1e9 * _BEFORE), middle + round(1e9 * _AFTER)]
+        )
+        return ImuSamples(every.times_ns[first:last], every.angular_velocity[first:last])
+
+    @property
+    def settings(self) -> InertialSettings:
+        return InertialSettings(self.imu.noise, _BIAS_WALK, True)
+
+
+def record(
+    camera: Camera,
+    make_motions: MakeMotions,
+    scene: Scene,
+    recordings: int,
+    length: int,
+    seed: int,
+    imu: Imu | None = None,
+) -> Recorded:
+    """Simulate recordings and their IMU."""
+    imu = imu or Imu()
+    made: list[Motions] = []
+
+    def remembered(count: int, rng: np.random.Generator) -> Motions:
+        made.append(make_motions(count, rng))
+        return made[-1]
+
+    frames = simulate(camera, remembered, scene, recordings, length, seed)
+    first = first_row_times(camera, length)
+    begin = int(frames.stamp_ns[0]) - round(1e9 * first[0])  # time 0 of the motions
+    rng = np.random.default_rng(seed)
+    samples = []
+    for which in range(recordings):
+        stamps, rates, _ = imu.record(made[0], which, first[0] - 0.3, first[-1] + 0.3, rng)
+        samples.append(ImuSamples(stamps + begin, rates))
+    return Recorded(frames, tuple(samples), imu)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """What a tracker made of recordings."""
+
+    scores: Scores
+    seconds: list[float]  # of each frame
+    time_offsets: list[float]  # s, at the end of each recording
+
+
+def follow(recorded: Recorded, noise: float, aided: bool, skipped: int) -> Followed:
+    """Track all recordings; the first frames of each are not counted."""
+    frames = recorded.frames
+    camera = believed(frames.camera)
+    tracker = Tracker(Localizer(camera), recorded.settings if aided else None)
+    scores: list[Score] = []
+    seconds, offsets = [], []
+    for frame in range(len(frames)):
+        place, recording = int(frames.place[frame]), int(frames.recording[frame])
+        if place == 0:
+            tracker.reset()
+        points, pixels = frames.seen(frame, noise)
+        imu = recorded.around(frame) if aided else None
+        start = time.thread_time()
+        found = tracker.localize(frames.middle_ns(frame), points, pixels, None, imu)
+        taken = time.thread_time() - start
+        if place >= skipped:
+            seconds.append(taken)
+            truth = truth_of(frames.middle, frame)
+            scores.append(score_at(found, 0.0, camera.readout_time, truth, recording))
+        if place == frames.place.max() and tracker.inertial is not None:
+            offsets.append(tracker.inertial.time_offset)
+    return Followed(Scores(scores), seconds, offsets)
+
+
+def alone_and_aided(
+    recorded: Recorded, localizer: Localizer, frame: int, points: Array, pixels: Array
+) -> tuple[Estimate | Failure, Estimate | Failure]:
+    """Results of a single frame without and with a gyroscope that is known by now."""
+    samples, errors = recorded.around(frame), _known_errors(recorded)
+    middle, readout_time = recorded.frames.middle_ns(frame), localizer.camera.readout_time
+    within = turn_within(samples, middle, readout_time, errors)
+    assert within is not None
+    return (
+        localizer.localize(points, pixels),
+        localizer.localize(points, pixels, turn=within.known),
+    )
+
+
+def _known_errors(recorded: Recorded) -> GyroscopeErrors:
+    deviations = [*3 * [_BIAS_DEVIATION], _OFFSET_DEVIATION]
+    return GyroscopeErrors(np.zeros(3), 0.0, np.diag(np.square(deviations)), recorded.imu.noise)
