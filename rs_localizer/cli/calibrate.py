@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.detect import find_map
+from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
@@ -21,6 +22,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.topics import IMU
 from rs_localizer.io.video import has_times
 from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.offline.image_sources import (
@@ -36,7 +38,7 @@ from rs_localizer.offline.image_sources import (
     image_files,
 )
 from rs_localizer.offline.recordings import read_recording
-from rs_localizer.offline.replay import find_topics
+from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import build, load_params_file, parse_assignment
@@ -44,8 +46,6 @@ from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
 from rs_localizer.trajectory.observe import Observed, in_order
-
-_CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,11 +81,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="one setting; scan_direction gives the axis (its reverse is tried as well)",
     )
     topics = parser.add_argument_group("topics of a bag (default: found by name and type)")
-    topics.add_argument("--correspondences", metavar="TOPIC")
-    topics.add_argument("--keypoints", metavar="TOPIC")
-    topics.add_argument("--map-points", metavar="TOPIC")
+    add_topics(topics, but=(IMU,))
     topics.add_argument("--image", metavar="TOPIC")
-    topics.add_argument("--camera-info", metavar="TOPIC")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.yaml", help="parameters for node and replay --params"
     )
@@ -140,7 +137,7 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         with _files(args) as shots:
             return _detected(args, shots)
     with open_bag(path) as bag:
-        if args.image is None and any(kind == _CLOUD_TYPE for kind in bag.topics.values()):
+        if args.image is None and has_frames(bag):
             return _correspondences(args, bag, config)
         topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
         given = None if args.calibration is None else read_calibration(args.calibration)
@@ -153,9 +150,7 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
 def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:
     if args.board is not None:
         raise UsageError("--board is for images; the recording has correspondences")
-    topics = find_topics(
-        bag, args.correspondences, args.camera_info, args.keypoints, args.map_points
-    )
+    topics = find_topics(bag, given_topics(args))
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     recorded = read_recording(bag, topics, config.matching, landmarks)
     camera = recorded.calibration.camera(0.0, config.scan_direction)

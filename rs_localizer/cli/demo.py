@@ -95,7 +95,9 @@ def run(args: argparse.Namespace) -> None:
         ):
             total = len(recording.clouds)
             with tqdm(total=total, unit="frame", desc=title, disable=None) as bar:
-                answers = session.play(recording, readout_time, methods, bar.update)
+                answers = session.play(
+                    recording, readout_time, methods, bar.update, lossless=(_ROLLING,)
+                )
             results = {names[name]: compare(answers[name], recording.truth) for name in methods}
             acts.append(Act(recording, readout_time, results))
             print(f"\n{table(title, recording, results)}", flush=True)

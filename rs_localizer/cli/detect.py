@@ -28,7 +28,7 @@ from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
-from rs_localizer.offline.detect import Recorded, record
+from rs_localizer.offline.detect import Options, Recorded, record
 from rs_localizer.offline.image_sources import (
     IMAGE_TYPES,
     INFO_TYPE,
@@ -239,9 +239,11 @@ def _record(
             shots,
             detector,
             args.out,
-            storage=args.storage,
-            with_images=args.with_images,
-            scan_direction=args.scan_direction or ScanDirection.TOP_TO_BOTTOM,
+            Options(
+                args.storage,
+                args.with_images,
+                args.scan_direction or ScanDirection.TOP_TO_BOTTOM,
+            ),
             done=progress.update,
             tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )

@@ -24,14 +24,15 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
+from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.topics import IMU, KEYPOINTS, MAP_POINTS
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
     Topics,
-    find_imu,
     find_topics,
     find_transforms,
     has_frames,
@@ -48,13 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "bag", type=Path, metavar="BAG", help="rosbag2 (MCAP, sqlite3) or ROS 1 bag"
     )
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
-    topics.add_argument("--correspondences", metavar="TOPIC")
-    topics.add_argument("--camera-info", metavar="TOPIC")
-    topics.add_argument("--keypoints", metavar="TOPIC", help="instead of correspondences")
-    topics.add_argument("--map-points", metavar="TOPIC", help="the map of the keypoints")
-    inertial = topics.add_mutually_exclusive_group()
-    inertial.add_argument("--imu", metavar="TOPIC", help="of the IMU, if there are several")
-    inertial.add_argument("--no-imu", action="store_true", help="the camera alone")
+    add_topics(topics)
+    topics.add_argument("--no-imu", action="store_true", help="the camera alone")
     offline = parser.add_argument_group(
         "offline (default): at full speed, no ROS needed",
         "With the settings base_frame and publish_tf, transforms come from the recording's "
@@ -111,10 +107,11 @@ def run(args: argparse.Namespace) -> None:
     _check_usage(args)
     if not is_bag(args.bag) and (pictures := holds_images(args.bag)):
         raise ValueError(f"{args.bag} {pictures}, not matches: first {_detect_command(args.bag)}")
+    named = given_topics(args)
     if args.ros:
         with open_bag(args.bag) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
-            topics = None if only_images else _find_topics(bag, args)
+            topics = None if only_images else find_topics(bag, named)
             play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
@@ -125,13 +122,16 @@ def run(args: argparse.Namespace) -> None:
             raise ValueError(
                 f"{args.bag} holds images, not matches: first {_detect_command(args.bag)}"
             )
-        topics = _find_topics(bag, args)
-        if topics.keypoints and not topics.map_points and not config.map_file:
+        topics = find_topics(bag, named)
+        if args.no_imu or config.imu.use == ImuUse.NONE:
+            topics = topics.without(IMU)
+        elif IMU not in topics.of and (several := imu_topics(bag)):
+            print(f"no IMU is used: choose {' or '.join(several)} with --imu")
+        if KEYPOINTS in topics.of and MAP_POINTS not in topics.of and not config.map_file:
             raise ValueError(
                 f"{args.bag} has keypoints and no map on map_points; give one with --map"
             )
-        imu = None if args.no_imu or config.imu.use == ImuUse.NONE else find_imu(bag, args.imu)
-        transforms = find_transforms(bag, topics, config, imu)
+        transforms = find_transforms(bag, topics, config)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         localizer.load_map()
         if args.smooth and config.readout_time == 0.0:
@@ -139,9 +139,7 @@ def run(args: argparse.Namespace) -> None:
         out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         with fresh(out, args.overwrite):
             _hint(args.bag, args.params)
-            if imu is None and not args.no_imu and len(several := imu_topics(bag)) > 1:
-                print(f"no IMU is used: choose {' or '.join(several)} with --imu")
-            tally = _replay(bag, topics, imu, localizer, notices, out, args)
+            tally = _replay(bag, topics, localizer, notices, out, args)
         _tell(tally, config, out)
         if not tally.frames:
             raise ValueError(
@@ -160,19 +158,16 @@ def _detect_command(path: Path) -> str:
     )
 
 
-def _find_topics(bag: BagReader, args: argparse.Namespace) -> Topics:
-    return find_topics(bag, args.correspondences, args.camera_info, args.keypoints, args.map_points)
-
-
 def _played_imus(bag: BagReader, args: argparse.Namespace) -> list[str]:
     """Topics of IMUs that live nodes shall hear."""
     if args.no_imu:
         return []
-    given = find_imu(bag, args.imu) if args.imu else None
-    return imu_topics(bag) if given is None else [given]
+    return imu_topics(bag) if args.imu is None else [args.imu]
 
 
 def _check_usage(args: argparse.Namespace) -> None:
+    if args.imu is not None and args.no_imu:
+        raise UsageError("give --imu or --no-imu, not both")
     if args.correspondences is not None and args.keypoints is not None:
         raise UsageError("give --correspondences or --keypoints, not both")
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
@@ -217,7 +212,6 @@ def _hint(bag: Path, params: Path | None) -> None:
 def _replay(
     bag: BagReader,
     topics: Topics,
-    imu: str | None,
     localizer: FrameLocalizer,
     notices: Counter[str],
     out: Path,
@@ -231,7 +225,7 @@ def _replay(
         BagWriter(out / RESULT, args.storage) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
-        for recorded_ns, result in replay(bag, topics, localizer, imu):
+        for recorded_ns, result in replay(bag, topics, localizer):
             if result:
                 tally.frames.append(result)
                 if not args.smooth:

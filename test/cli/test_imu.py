@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 
 from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagError, BagWriter, open_bag
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.recording import write_frame
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.lab.simulation.imu import ImuSettings
 from rs_localizer.lab.simulation.imu_recording import make_imu
-from rs_localizer.offline.replay import find_imu
+from rs_localizer.offline.replay import find_topics
 
+CAMERA = Camera(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
 TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")
 CLEAN = (
     "--gyroscope-noise", "0", "--gyroscope-bias", "0", "--gyroscope-bias-walk", "0",
@@ -135,8 +138,10 @@ def test_the_topic_is_found_by_its_type(tmp_path: Path) -> None:
         with BagWriter(path) as writer:
             for name in names:
                 writer.write(name, make_imu(1, np.zeros(3), np.ones(3), settings), 1)
+            write_frame(writer, CAMERA, 1, np.zeros((1, 3)), np.zeros((1, 2)), np.zeros(1, int))
         with open_bag(path) as bag:
-            assert find_imu(bag) == expected
-            assert find_imu(bag, names[-1]) == names[-1]
+            assert find_topics(bag).of.get("imu") == expected
+            assert find_topics(bag, {"imu": names[-1]}).of["imu"] == names[-1]
+            assert "imu" not in find_topics(bag).without("imu").of
             with pytest.raises(BagError, match="does not exist; topics of type sensor_msgs/msg/Im"):
-                find_imu(bag, "/other")
+                find_topics(bag, {"imu": "/other"})

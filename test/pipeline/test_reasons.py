@@ -7,6 +7,7 @@ from pathlib import Path
 
 import rs_localizer
 from rs_localizer.core.types import Reason
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.pipeline.reasons import IMU_REASONS, REASONS, ImuReason, explained
 
 PACKAGE = Path(rs_localizer.__file__).parent
@@ -18,9 +19,10 @@ def test_the_table_is_that_of_the_code() -> None:
     used = {str(reason) for reason in Reason}
     for path in PACKAGE.rglob("*.py"):
         used |= set(re.findall(r"Refusal\(\s*\"(\w+)\"", path.read_text()))
-    used |= {"bad_camera_info", "bad_map", "bad_imu"}  # of replay.py, put together
-    frames = (PACKAGE / "pipeline" / "frames.py").read_text()
-    used |= set(re.findall(r"_NO_TRANSFORM = \"(\w+)\"", frames))
+    used |= {item.refused for item in INPUTS.values()}
+    used |= set(
+        re.findall(r"_NO_TRANSFORM = \"(\w+)\"", (PACKAGE / "pipeline" / "frames.py").read_text())
+    )
     assert set(REASONS) == used - OF_IMAGES
 
 

@@ -6,26 +6,24 @@ becomes an update, which the worker's thread carries out between two frames.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 
 from rs_localizer.config import ImuUse, NodeConfig
-from rs_localizer.io.camera_info import Calibration, read_camera_info
-from rs_localizer.io.imu import read_imu
-from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
+from rs_localizer.io.outputs import Frame
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, Topic
+from rs_localizer.pipeline.inputs import INPUTS, Input, Role
+from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.ros.node.conversion import message_class
+from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.refusals import Refusals
-from rs_localizer.ros.node.worker import Localize, Worker
-
-FRAME_TOPICS = ("correspondences", "keypoints")
-"""Inputs that are localized; the others say with what."""
+from rs_localizer.ros.node.worker import Need, Worker
 
 # In a serialized message, which begins with four bytes of CDR and the stamp of its header.
 _AFTER_STAMP = 12
@@ -41,12 +39,12 @@ class Feed:
         frames: that of the worker, here only to be read.
         refusals: told of messages that cannot be used.
         say: takes a line for the log.
-        needs_tf: called once when an IMU comes whose axes are not the camera's.
+        needs_tf: called once when readings come whose axes are not the camera's.
     """
 
     def __init__(
         self,
-        worker: Worker,
+        worker: Worker[FrameLocalizer, Frame],
         frames: FrameLocalizer,
         refusals: Refusals,
         say: Callable[[str], Any],
@@ -57,24 +55,18 @@ class Feed:
         self._refusals = refusals
         self._say = say
         self._needs_tf: Callable[[], None] | None = needs_tf
-        # The last that was handed on.
-        self._camera_info = b""
-        self._calibration: Calibration | None = None
+        # The last that was handed on of what is repeated, and what it says; by topic.
+        self._repeated: dict[str, tuple[bytes, Any]] = {}
         self.changing = False  # whether the worker compiles kernels for new settings
 
     def topics(self) -> dict[str, Topic]:
         """The inputs; what changes the state comes before the frames."""
-        return {
-            "camera_info": Topic(CameraInfo, self._take_camera_info, LATCHED, raw=True),
-            "map_points": Topic(PointCloud2, self._take_map, LATCHED, lasting=True),
-            "imu": Topic(Imu, self._take_imu, FAST_DATA, raw=True),
-            "correspondences": self._localized_by(
-                "correspondences", lambda frames, message: frames.localize(message)
-            ),
-            "keypoints": self._localized_by(
-                "keypoints", lambda frames, message: frames.localize_keypoints(message)
-            ),
+        make = {
+            Role.FRAMES: self._frames_topic,
+            Role.STATE: self._state_topic,
+            Role.SAMPLES: self._samples_topic,
         }
+        return {name: make[item.role](item) for name, item in INPUTS.items()}
 
     def take_config(self, config: NodeConfig) -> None:
         """Use these settings from the next frame on."""
@@ -86,63 +78,79 @@ class Feed:
 
     # -- in the thread of the inputs ---------------------------------------------------------
 
-    def _localized_by(self, topic: str, localize: Localize) -> Topic:
-        """A topic whose messages are frames, which the worker localizes in this way."""
+    def _frames_topic(self, item: Input) -> Topic:
+        """A topic whose messages the worker localizes."""
 
-        def take(message: PointCloud2) -> None:
-            wait = self._frames.config.imu.wait
-            self._worker.localize(topic, message, localize, _awaits_imu, wait)
+        def localize(frames: FrameLocalizer, message: Any) -> Frame | Refusal:
+            result = item.take(frames, message)
+            assert result is not None  # a frame has one
+            return result
 
-        return Topic(PointCloud2, take)
+        def take(message: Any) -> None:
+            need = Need(_lacks_samples, self._frames.config.imu.wait)
+            self._worker.process(item.topic, message, localize, need)
 
-    def _take_imu(self, serialized: bytes) -> None:
+        return Topic(message_class(item.type), take)
+
+    def _samples_topic(self, item: Input) -> Topic:
+        """A topic whose messages are all used here; frames wait for them."""
+        take = functools.partial(self._take_sample, item)
+        return Topic(message_class(item.type), take, FAST_DATA, raw=True)
+
+    def _take_sample(self, item: Input, serialized: bytes) -> None:
         if self._frames.config.imu.use == ImuUse.NONE:
             return
-        try:
-            reading = read_imu(deserialize_message(serialized, Imu))
-        except MessageError as error:
-            self._refusals.add("bad_imu", str(error))
+        message = deserialize_message(serialized, message_class(item.type))
+        refusal = item.take(self._frames, message)
+        if isinstance(refusal, Refusal):
+            self._refusals.add(refusal.reason, refusal.detail)
             return
-        self._frames.imu.add(reading)
         self._worker.look()
-        if self._needs_tf is not None and reading.frame != self._frames.camera_frame:
+        if self._needs_tf is not None and self._frames.imu.frame != self._frames.camera_frame:
             self._needs_tf()
             self._needs_tf = None
 
-    def _take_camera_info(self, serialized: bytes) -> None:
-        # Drivers repeat it with every image, and only its stamp is new.
-        content = serialized[_AFTER_STAMP:]
-        if content == self._camera_info and self._calibration == self._frames.calibration:
-            return
-        try:
-            calibration = read_camera_info(deserialize_message(serialized, CameraInfo))
-        except MessageError as error:
-            self._refusals.add("bad_camera_info", str(error))
-            return
-        self._camera_info, self._calibration = content, calibration
-        self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
+    def _state_topic(self, item: Input) -> Topic:
+        """A topic whose messages are read here; the worker uses them."""
+        return Topic(
+            message_class(item.type),
+            functools.partial(self._take if item.held is None else self._take_repeated, item),
+            LATCHED if item.latched else SENSOR_DATA,
+            lasting=item.lasting,
+            raw=item.held is not None,
+        )
 
-    def _take_map(self, message: PointCloud2) -> None:
-        # Meanwhile frames are localized by the previous one.
+    def _take(self, item: Input, message: Any) -> Any:
+        """What the message says, which the worker will use; None if it cannot be read."""
         try:
-            landmarks = read_map(message)
+            content = item.read(message)
         except MessageError as error:
-            self._refusals.add("bad_map", str(error))
+            self._refusals.add(item.refused, str(error))
+            return None
+        self._worker.update(item.topic, lambda frames: self._use(frames, item, content))
+        return content
+
+    def _take_repeated(self, item: Input, serialized: bytes) -> None:
+        # Drivers repeat it with every image, and only its stamp is new.
+        assert item.held is not None
+        rest = serialized[_AFTER_STAMP:]
+        last, said = self._repeated.get(item.topic, (b"", None))
+        if rest == last and said == item.held(self._frames):
             return
-        self._worker.update("map", lambda frames: self._use_map(frames, landmarks))
+        content = self._take(item, deserialize_message(serialized, message_class(item.type)))
+        if content is not None:
+            self._repeated[item.topic] = rest, content
 
     # -- in the worker's thread, between two frames ------------------------------------------
 
-    def _calibrate(self, frames: FrameLocalizer, calibration: Calibration) -> None:
+    def _use(self, frames: FrameLocalizer, item: Input, content: Any) -> None:
+        before = frames.map
         try:
-            frames.calibrate(calibration)
+            item.use(frames, content)
         except MessageError as error:
-            self._refusals.add("bad_camera_info", str(error))
-
-    def _use_map(self, frames: FrameLocalizer, landmarks: Map) -> None:
-        if frames.map is None or not landmarks.equals(frames.map):
-            frames.use_map(landmarks)
-            self._say(described(landmarks))
+            self._refusals.add(item.refused, str(error))
+        if frames.map is not None and frames.map is not before:
+            self._say(described(frames.map))
 
     def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
         self.changing = True
@@ -155,7 +163,7 @@ class Feed:
             self._say(f"kernels for the new settings are ready after {seconds:.1f} s")
 
 
-def _awaits_imu(frames: FrameLocalizer, message: PointCloud2) -> bool:
+def _lacks_samples(frames: FrameLocalizer, message: Any) -> bool:
     return frames.awaits_imu(stamp_ns(message), frames.config.imu.wait)
 
 

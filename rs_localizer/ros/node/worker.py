@@ -1,4 +1,4 @@
-"""Localizes beside the executor, so that a slow frame delays nothing but frames.
+"""Works beside the executor, so that a slow frame delays nothing but frames.
 
 The kernels release the GIL: meanwhile the executor takes messages, answers services, changes
 parameters and publishes diagnostics.
@@ -11,50 +11,58 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from rs_localizer.io.outputs import Frame
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.errors import describe
 from rs_localizer.ros.node.mailbox import Mailbox, Update, Work
 from rs_localizer.ros.node.statistics import Statistics
 
-Localize = Callable[[FrameLocalizer, Any], Frame | Refusal]
+State = TypeVar("State")
+Result = TypeVar("Result")
+Process = Callable[[State, Any], Result | Refusal]
+"""What is done with a message, given what the worker alone touches."""
+
 _NAME = "rs_localizer worker"
-Awaits = Callable[[FrameLocalizer, Any], bool]
-# How often frames are looked at that wait for something, in s, and how many may.
+# How often frames and results are looked at that wait for something, in s, and how many may.
 _LATE_PERIOD = 0.005
 _MOST_LATE = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
-    """A frame that has come."""
+class Need(Generic[State]):
+    """What a frame waits for before it is processed."""
 
-    topic: str
-    message: Any
-    localize: Localize
-    received: float  # s, time.monotonic()
-    awaits: Awaits | None  # whether something that it needs may still come
+    missing: Callable[[State, Any], bool]  # whether something is, and may still come
     patience: float  # s for which it waits
 
 
 @dataclass(frozen=True, slots=True)
-class _Late:
-    """A frame that is localized and waits for its mounting."""
+class Arrival(Generic[State, Result]):
+    """A frame that has come."""
 
-    work: Work[FrameLocalizer, Arrival]
-    arrival: Arrival
+    message: Any
+    process: Process[State, Result]
+    received: float  # s, time.monotonic()
+    need: Need[State] | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Late(Generic[State, Result]):
+    """A frame whose result waits for something."""
+
+    work: Work[State, Arrival[State, Result]]
+    arrival: Arrival[State, Result]
     result: Waiting
     deadline: float  # s, time.monotonic()
 
 
-class Worker:
-    """A thread, and what it alone touches: the localizer of the frames.
+class Worker(Generic[State, Result]):
+    """A thread, and what it alone touches.
 
     Args:
-        frames: localizes; from now on only through updates and arrivals.
-        publish: called in the thread with each localized frame, never after :meth:`pause`.
+        state: that; from now on only through updates and arrivals.
+        publish: called in the thread with each result, never after :meth:`pause`.
         statistics: told what becomes of each frame.
         failed: told in one sentence of errors in updates that nobody foresaw; the thread goes on.
             Those in frames are refusals, ``internal_error``.
@@ -62,41 +70,40 @@ class Worker:
 
     def __init__(
         self,
-        frames: FrameLocalizer,
-        publish: Callable[[Frame], None],
-        statistics: Statistics,
+        state: State,
+        publish: Callable[[Result], None],
+        statistics: Statistics[Result, Any],
         failed: Callable[[str], None],
     ) -> None:
-        self._frames = frames
+        self._state = state
         self._publish = publish
         self._statistics = statistics
         self._failed = failed
-        self._mailbox: Mailbox[FrameLocalizer, Arrival] = Mailbox()
-        # Frames that wait for what they need, and localized ones for their mounting.
-        self._early: deque[tuple[Work[FrameLocalizer, Arrival], Arrival]] = deque()
-        self._late: deque[_Late] = deque()
+        self._mailbox: Mailbox[State, Arrival[State, Result]] = Mailbox()
+        # Frames that wait for what they need, and results.
+        self._early: deque[Work[State, Arrival[State, Result]]] = deque()
+        self._late: deque[_Late[State, Result]] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
         in_thread(self._run)
 
-    def update(self, kind: str, update: Update[FrameLocalizer]) -> None:
+    def update(self, kind: str, update: Update[State]) -> None:
         """Have this done before the next frame (see :meth:`Mailbox.update`)."""
         self._mailbox.update(kind, update)
 
-    def localize(
+    def process(
         self,
         topic: str,
         message: Any,
-        localize: Localize,
-        awaits: Awaits | None = None,
-        patience: float = 0.0,
+        process: Process[State, Result],
+        need: Need[State] | None = None,
     ) -> None:
-        """Have this frame localized and published, unless a newer one comes first.
+        """Have this frame processed and published, unless a newer one comes first.
 
-        It, and those behind it, waits while it ``awaits`` something, but for ``patience`` (s) only.
+        While it needs something it waits, and those behind it, too.
         """
         self._statistics.received(topic, message)
-        arrival = Arrival(topic, message, localize, time.monotonic(), awaits, patience)
+        arrival = Arrival(message, process, time.monotonic(), need)
         if self._mailbox.put(topic, arrival):
             self._statistics.replaced()
 
@@ -120,28 +127,33 @@ class Worker:
     def _run(self) -> None:
         while (work := self._mailbox.take(self._timeout())) is not None:
             for update in work.updates:
-                self._guarded(update, self._frames)
+                self._guarded(update, self._state)
             self._finish_late()
             if work.frame is not None:
-                self._early.append((work, work.frame))
-            if self._early and not self._waits(self._early[0][1]):
-                self._begin(*self._early.popleft())
+                self._early.append(work)
+            if self._is_ready():
+                self._begin(self._early.popleft())
 
     def _timeout(self) -> float | None:
         """How long nothing has to be done, unless something comes."""
-        if self._early and not self._waits(self._early[0][1]):
+        if self._is_ready():
             return 0.0
         return _LATE_PERIOD if self._late or self._early else None
 
-    def _waits(self, arrival: Arrival) -> bool:
-        overdue = time.monotonic() >= arrival.received + arrival.patience
-        if overdue or arrival.awaits is None or len(self._early) > _MOST_LATE:
-            return False
-        return self._attempt(lambda: arrival.awaits(self._frames, arrival.message)) is True
+    def _is_ready(self) -> bool:
+        """Whether there is a frame that need not wait."""
+        arrival = self._early[0].frame if self._early else None
+        if arrival is None or (need := arrival.need) is None:
+            return arrival is not None
+        overdue = time.monotonic() >= arrival.received + need.patience
+        if overdue or len(self._early) > _MOST_LATE:
+            return True
+        return self._attempt(lambda: need.missing(self._state, arrival.message)) is not True
 
-    def _begin(self, work: Work[FrameLocalizer, Arrival], arrival: Arrival) -> None:
+    def _begin(self, work: Work[State, Arrival[State, Result]]) -> None:
+        assert work.frame is not None
         if self._mailbox.is_current(work):
-            self._localize(work, arrival)
+            self._process(work, work.frame)
         else:
             self._statistics.dropped(1)
 
@@ -151,9 +163,11 @@ class Worker:
         except Exception as error:  # of one message: the others go on
             self._failed(describe(error))
 
-    def _localize(self, work: Work[FrameLocalizer, Arrival], arrival: Arrival) -> None:
+    def _process(
+        self, work: Work[State, Arrival[State, Result]], arrival: Arrival[State, Result]
+    ) -> None:
         self._statistics.started()
-        result = self._attempt(lambda: arrival.localize(self._frames, arrival.message))
+        result = self._attempt(lambda: arrival.process(self._state, arrival.message))
         self._statistics.ended()
         if isinstance(result, Waiting) and len(self._late) < _MOST_LATE:
             deadline = time.monotonic() + result.patience
@@ -180,7 +194,10 @@ class Worker:
             return Refusal("internal_error", describe(error))
 
     def _finish(
-        self, work: Work[FrameLocalizer, Arrival], arrival: Arrival, result: Frame | Refusal
+        self,
+        work: Work[State, Arrival[State, Result]],
+        arrival: Arrival[State, Result],
+        result: Result | Refusal,
     ) -> None:
         """Publish it, unless nobody wants it any more, and count it."""
         if isinstance(result, Refusal):

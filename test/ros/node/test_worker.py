@@ -10,22 +10,23 @@ from typing import Any
 import pytest
 from sensor_msgs.msg import Image
 
-from rs_localizer.pipeline.frames import Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
-from rs_localizer.ros.node.worker import Worker, wait_for_workers
+from rs_localizer.ros.node.worker import Need, Worker, wait_for_workers
 
 PATIENCE = 10.0  # s, of a machine that is busy
 
 
-class Count(Statistics):
-    """Frames are plain text here, of which there are no details and no stamps."""
+class Count(Statistics[str, str]):
+    """Frames are plain text here, without stamps."""
 
     def received(self, topic: str, message: Any) -> None:
         super().received(topic, Image())
 
-    def answered(self, frame: Any, received: float) -> None:
+    def answered(self, result: str, received: float) -> None:
         assert received <= time.monotonic()
+        super().answered(result, received)
 
 
 class Fake:
@@ -42,18 +43,12 @@ class Fake:
         self.awaited: set[str] = set()
         self.patience = 10.0
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Count(self.refusals)
-        frames: Any = self
-        self.worker = Worker(frames, self._publish, self.statistics, self._fail)
+        self.statistics = Count(self.refusals, lambda text: (0, text))
+        self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, self._fail)
 
     def send(self, frame: str, topic: str = "frames", patience: float = PATIENCE) -> None:
-        self.worker.localize(
-            topic,
-            frame,
-            lambda frames, message: self._localize(message),
-            lambda frames, message: message in self.awaited,
-            patience,
-        )
+        need: Need[Fake] = Need(lambda frames, message: message in self.awaited, patience)
+        self.worker.process(topic, frame, lambda frames, message: self._localize(message), need)
 
     def wait(self, semaphore: threading.Semaphore) -> None:
         assert semaphore.acquire(timeout=PATIENCE)
@@ -149,67 +144,6 @@ def test_updates_do_not_wait_for_a_frame(fake: Fake) -> None:
     done = threading.Event()
     fake.worker.update("camera", lambda frames: done.set())
     assert done.wait(PATIENCE)
-
-
-def test_a_frame_waits_for_what_it_needs_and_those_behind_keep_their_order(fake: Fake) -> None:
-    fake.awaited = {"one", "three"}
-    fake.go_on.release(10)
-    for frame in ("one", "two", "three", "four"):
-        fake.send(frame)
-        time.sleep(0.02)  # the worker is idle: it takes each of them
-    fake.send("other", topic="others")
-    assert not fake.done.acquire(timeout=0.1)
-    updated = threading.Event()
-    fake.worker.update("settings", lambda frames: updated.set())
-    assert updated.wait(PATIENCE)  # settings do not wait
-    fake.awaited = {"three"}
-    fake.worker.look()
-    fake.wait(fake.done)
-    fake.wait(fake.done)
-    assert not fake.done.acquire(timeout=0.1)
-    assert fake.published == ["one old", "two old"]
-    fake.awaited = set()
-    fake.worker.look()
-    for _ in range(3):
-        fake.wait(fake.done)
-    assert fake.published[2:] == ["three old", "four old", "other old"]
-    assert fake.statistics.summary().replaced == 0
-
-
-def test_a_frame_waits_no_longer_than_it_may(fake: Fake) -> None:
-    fake.awaited = {"one"}
-    fake.go_on.release(10)
-    started = time.monotonic()
-    fake.send("one", patience=0.1)
-    fake.send("two", topic="others")
-    fake.wait(fake.done)
-    assert 0.1 <= time.monotonic() - started < 0.1 + PATIENCE
-    fake.wait(fake.done)
-    assert fake.published == ["one old", "two old"]
-
-
-def test_a_frame_that_waits_while_the_node_is_deactivated_is_dropped(fake: Fake) -> None:
-    fake.awaited = {"one"}
-    fake.go_on.release(10)
-    fake.send("one")
-    time.sleep(0.05)
-    fake.worker.pause()
-    fake.awaited = set()
-    fake.worker.look()
-    fake.send("two")
-    fake.wait(fake.done)
-    assert fake.published == ["two old"]
-    assert fake.statistics.summary().dropped == 1
-
-
-def test_what_fails_to_say_whether_it_waits_does_not(fake: Fake) -> None:
-    def fail(frames: Any, message: Any) -> bool:
-        raise TypeError("a bug")
-
-    fake.go_on.release(10)
-    fake.worker.localize("frames", "one", lambda frames, m: fake._localize(m), fail, PATIENCE)
-    fake.wait(fake.done)
-    assert fake.published == ["one old"]
 
 
 def test_errors_and_refusals_are_told_and_it_goes_on(fake: Fake) -> None:
