@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.detect import find_map
+from rs_localizer.cli.detect import add_board_arguments, find_map
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
@@ -60,8 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--map", type=Path, metavar="FILE", help="map of the keypoints, or marker map of the images"
     )
-    parser.add_argument("--board", metavar="9x6", help="a chessboard: inner corners along x rows")
-    parser.add_argument("--square", type=above, metavar="M", help="side of its squares")
+    add_board_arguments(parser)
     parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="lens; without one it is found, too"
     )

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> None:
     except ImportError as error:
         raise ValueError(
             f"the demo needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(README.md)"
+            "(docs/install.md)"
         ) from error
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)

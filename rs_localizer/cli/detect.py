@@ -65,23 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     markers = parser.add_argument_group("what to look for")
     markers.add_argument("--map", type=Path, metavar="FILE", help="marker map")
-    markers.add_argument(
-        "--board",
-        metavar="6x4",
-        help="instead: a board, inner corners (or circles) along a row x rows",
-    )
-    markers.add_argument(
-        "--pattern",
-        choices=_PATTERNS,
-        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
-    )
     above = number(0.0, above=True)
-    markers.add_argument(
-        "--square",
-        type=above,
-        metavar="M",
-        help="side of its squares in metres, or distance of its rows of circles",
-    )
+    add_board_arguments(markers)
     markers.add_argument(
         "--min-side",
         type=number(0.0),
@@ -174,6 +159,26 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
     print(
         f"time per image: {1e3 * seconds / images:.2f} ms, of which OpenCV's search took "
         f"{1e3 * in_opencv / images:.2f} ms and all else {100 * (1 - in_opencv / seconds):.1f} %"
+    )
+
+
+def add_board_arguments(parser: argparse._ActionsContainer) -> None:
+    """A board of its own instead of a map, for :func:`find_map`."""
+    parser.add_argument(
+        "--board",
+        metavar="6x4",
+        help="instead: a board, inner corners (or circles) along a row x rows",
+    )
+    parser.add_argument(
+        "--pattern",
+        choices=_PATTERNS,
+        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
+    )
+    parser.add_argument(
+        "--square",
+        type=number(0.0, above=True),
+        metavar="M",
+        help="side of its squares in metres, or distance of its rows of circles",
     )
 
 

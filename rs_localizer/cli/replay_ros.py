@@ -29,7 +29,7 @@ def play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) ->
     except ImportError as error:
         raise ValueError(
             f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(README.md)"
+            "(docs/install.md)"
         ) from error
     images = image_topics(bag)
     inputs = images + (_of_type(bag, INFO_TYPE) if topics is None else list(topics.names))

@@ -23,6 +23,31 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--map {wall}",
+        "--board 9x6 --square 0.02",
+        "--board 4x11 --square 0.02 --pattern asymmetric_circles",
+    ],
+)
+def test_what_is_looked_for_in_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str
+) -> None:
+    """As ``detect`` has it: the images of a video are what is missing here."""
+    assert main(["markers", "make", str(tmp_path / "wall"), "--standing"]) == 0
+    video = tmp_path / "grey.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
+    for _ in range(5):
+        writer.write(np.full((240, 320, 3), 128, np.uint8))
+    writer.release()
+    wanted = words.format(wall=tmp_path / "wall.yaml").split()
+    assert main(["calibrate", str(video), *wanted]) == 1
+    said = capsys.readouterr()
+    assert "0 of 5 images show the map" in said.out
+    assert "Traceback" not in said.err
+
+
 def test_the_webcam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, plots = tmp_path / "webcam.yaml", tmp_path / "plots"
     recording = str(data.path(data.WEBCAM))

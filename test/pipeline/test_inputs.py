@@ -25,8 +25,10 @@ def bag(**topics: str) -> Any:
     return SimpleNamespace(path="bag", topics={f"/{name}": kind for name, kind in topics.items()})
 
 
-def test_the_readme_has_every_input_with_its_type() -> None:
-    rows = re.findall(r"^\| in \| `(\w+)`.*? \| (.*?) \|", (ROOT / "README.md").read_text(), re.M)
+def test_the_page_of_the_node_has_every_input_with_its_type() -> None:
+    rows = re.findall(
+        r"^\| in \| `(\w+)`.*? \| (.*?) \|", (ROOT / "docs" / "node.md").read_text(), re.M
+    )
     assert [name for name, _ in rows] == sorted(INPUTS, key=[name for name, _ in rows].index)
     for name, kind in rows:
         assert kind.startswith(INPUTS[name].type.replace("/msg/", "/"))
