@@ -11,13 +11,13 @@ from __future__ import annotations
 import enum
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import rs_localizer
-from rs_localizer.pipeline.reasons import REASONS
+from rs_localizer.pipeline.reasons import IMU_REASONS, REASONS, Meaning
 
 PAGE = Path(__file__).with_name("api.md")
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
@@ -28,6 +28,14 @@ _REASONS_INTRODUCTION = """\
 
 Written by `python docs/make_api.py` from `rs_localizer/pipeline/reasons.py`. The reasons are the
 same in the library (`Failure.reason`), in what `replay` prints, in the log and in `/diagnostics`.
+
+| reason | means | look at |
+|---|---|---|
+"""
+_IMU_INTRODUCTION = """
+## Why the IMU is not used for an image
+
+The camera goes on alone, and the image has its pose all the same: [imu.md](imu.md).
 
 | reason | means | look at |
 |---|---|---|
@@ -147,10 +155,14 @@ def _text(item: Any) -> str:
 
 def reasons_page() -> str:
     """The page of the reasons, with the part that is written by hand as it stands."""
-    rows = (f"| `{name}` | {means} | {look_at} |" for name, (means, look_at) in REASONS.items())
     written = REASONS_PAGE.read_text(encoding="utf-8")
     by_hand = written[written.index(_BY_HAND) :]
-    return _REASONS_INTRODUCTION + "\n".join(rows) + "\n" + by_hand
+    tables = _REASONS_INTRODUCTION + _rows(REASONS) + _IMU_INTRODUCTION + _rows(IMU_REASONS)
+    return tables + by_hand
+
+
+def _rows(reasons: Mapping[str, Meaning]) -> str:
+    return "".join(f"| `{name}` | {means} | {look} |\n" for name, (means, look) in reasons.items())
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ TOPICS = {
     "keypoints": "pixels with ids or descriptors, to be matched (sensor_msgs/PointCloud2)",
     "map_points": "the map for keypoints, latched (sensor_msgs/PointCloud2)",
     "camera_info": "the camera's calibration (sensor_msgs/CameraInfo)",
+    "imu": "the IMU beside the camera (sensor_msgs/Imu)",
 }
 
 

@@ -7,7 +7,8 @@ ranges here are what users see in ``ros2 param describe``.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from numbers import Integral, Real
@@ -77,16 +78,33 @@ def _check(config: Any, prefix: str = "") -> None:
             valid = isinstance(value, Integral) and not isinstance(value, bool)
         elif isinstance(default, float):
             valid = isinstance(value, Real) and not isinstance(value, bool)
+        elif isinstance(default, tuple):
+            valid = _are_numbers(value, len(default))
         else:
             valid = isinstance(value, str)
         if not valid:
-            raise ValueError(f"{name} must be of type {type(default).__name__}, got {value!r}")
+            raise ValueError(f"{name} must be {type_of(default)}, got {value!r}")
         choices = item.metadata["choices"]
         if choices and value not in choices:
             raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}")
         low, high = item.metadata["minimum"], item.metadata["maximum"]
         if low is not None and not (low <= value <= high):
             raise ValueError(f"{name} must lie between {low} and {high}, got {value!r}")
+
+
+def type_of(default: Any) -> str:
+    """In words, what a setting with this default is."""
+    if isinstance(default, tuple):
+        return f"{len(default)} numbers, as {list(default)}"
+    return f"of type {type(default).__name__}"
+
+
+def _are_numbers(value: Any, count: int) -> bool:
+    return (
+        isinstance(value, Sequence)
+        and len(value) == count
+        and all(isinstance(item, Real) and math.isfinite(item) for item in value)
+    )
 
 
 # Of a velocity prior; anything less would hold the camera still with infinite force.
@@ -190,6 +208,60 @@ class Matching:
 
     def __post_init__(self) -> None:
         _check(self, "matching.")
+
+
+class ImuUse(StrEnum):
+    """Whether an IMU is used."""
+
+    AUTO = "auto"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Imu:
+    """The IMU beside the camera, and how far it is believed."""
+
+    use: str = setting(
+        ImuUse.AUTO.value,
+        "auto: use the IMU if messages come on imu and TF knows how it is turned against the "
+        "camera; none: never",
+        choices=tuple(use.value for use in ImuUse),
+    )
+    time_offset: float = setting(
+        0.0,
+        "Time to add to the stamps of the IMU to get the camera's time, in s",
+        minimum=-10.0,
+        maximum=10.0,
+    )
+    estimate_time_offset: bool = setting(
+        True, "Estimate what is left of the time offset, from the camera's motion"
+    )
+    gyroscope_noise: float = setting(
+        2e-4,
+        "Noise density of the gyroscope, in rad/s/sqrt(Hz)",
+        minimum=1e-7,
+        maximum=1.0,
+    )
+    gyroscope_bias_walk: float = setting(
+        2e-5,
+        "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    gravity: bool = setting(
+        False,
+        "Use the direction of gravity that the accelerometer shows; needs gravity_in_map",
+    )
+    wait: float = setting(
+        0.02,
+        "How long a frame waits for the messages of its exposure before the camera goes on alone, "
+        "in s",
+        minimum=0.0,
+        maximum=1.0,
+    )
+
+    def __post_init__(self) -> None:
+        _check(self, "imu.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,10 +413,16 @@ class NodeConfig(LocalizerConfig):
     )
     map_frame: str = setting("map", "Frame of the points in map_file", fixed=True)
     matching: Matching = field(default_factory=Matching)
+    imu: Imu = field(default_factory=Imu)
+    gravity_in_map: tuple[float, ...] = setting(
+        (0.0, 0.0, -1.0), "Direction in which things fall in the map, of any length: imu.gravity"
+    )
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 
     def __post_init__(self) -> None:
         LocalizerConfig.__post_init__(self)
+        if not any(self.gravity_in_map):
+            raise ValueError("gravity_in_map must have a direction, got zeros")
         for name in ("base_frame", "odom_frame", "map_frame"):
             if getattr(self, name).startswith("/"):
                 raise ValueError(

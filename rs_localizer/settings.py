@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -91,8 +92,14 @@ def _build(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
         if is_dataclass(default):
             chosen[item.name] = _build(default, values, f"{prefix}{item.name}.")
         else:
-            chosen[item.name] = values.get(prefix + item.name, default)
+            value = values.get(prefix + item.name, default)
+            chosen[item.name] = _as_tuple(value) if isinstance(default, tuple) else value
     return type(config)(**chosen)
+
+
+def _as_tuple(value: Any) -> Any:
+    """What ROS and YAML have as a list or an array of numbers; anything else as it is."""
+    return tuple(value) if isinstance(value, (list, array)) else value
 
 
 def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
@@ -165,7 +172,10 @@ def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any
 def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
     if name not in settings(kind):
         raise SettingsError(f"{where}: {unknown(name, kind) or f'{name!r} is no setting'}")
-    if isinstance(value, str) and isinstance(settings(kind)[name].default, float):
+    default = settings(kind)[name].default
+    if isinstance(default, tuple):
+        return _as_tuple(value)
+    if isinstance(value, str) and isinstance(default, float):
         # ROS reads 1e-3 as a number, PyYAML as text.
         with contextlib.suppress(ValueError):
             return float(value)

@@ -133,6 +133,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ("solver:=p3p", "solver", "p3p"),
         ("readout_time:=0.03", "readout_time", 0.03),
         ("velocity_prior.linear:=1e-2", "velocity_prior.linear", 0.01),
+        ("gravity_in_map:=[0, 1.5, 0]", "gravity_in_map", (0, 1.5, 0)),
         ("seed:=3", "seed", 3),
         ("autostart:=false", "autostart", False),
     ],
@@ -154,6 +155,11 @@ def test_assignments_that_are_none(text: str) -> None:
         ({"seed": 1.5}, "seed must be of type int, got 1.5"),
         ({"velocity_prior.linear": -1.0}, "velocity_prior.linear must lie between"),
         ({"readout_time": "long"}, "readout_time must be of type float, got 'long'"),
+        ({"imu.use": "yes"}, "imu.use must be one of auto, none; got 'yes'"),
+        ({"imu.wait": -0.1}, "imu.wait must lie between"),
+        ({"gravity_in_map": [0.0, 1.0]}, r"must be 3 numbers, as \[0.0, 0.0, -1.0\]"),
+        ({"gravity_in_map": [0.0, 0.0, 0.0]}, "gravity_in_map must have a direction, got zeros"),
+        ({"gravity_in_map": "down"}, "gravity_in_map must be 3 numbers, .* got 'down'"),
     ],
 )
 def test_wrong_values(values: dict[str, Any], fault: str) -> None:

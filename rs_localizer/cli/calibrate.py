@@ -24,6 +24,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.topics import IMU
 from rs_localizer.io.video import has_times
 from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.offline.image_sources import (
@@ -92,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="one setting; scan_direction gives the axis (its reverse is tried as well)",
     )
     topics = parser.add_argument_group("topics of a bag (default: found by name and type)")
-    add_topics(topics)
+    add_topics(topics, but=(IMU,))
     topics.add_argument("--image", metavar="TOPIC")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.yaml", help="parameters for node and replay --params"

@@ -25,10 +25,10 @@ from rs_localizer.cli.replay_result import (
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
 from rs_localizer.cli.topics import add_topics, given_topics
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.topics import KEYPOINTS, MAP_POINTS
+from rs_localizer.io.topics import IMU, KEYPOINTS, MAP_POINTS
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
@@ -36,6 +36,7 @@ from rs_localizer.offline.replay import (
     find_topics,
     find_transforms,
     has_frames,
+    imu_topics,
     replay,
 )
 from rs_localizer.offline.smoothed import smooth_frames
@@ -49,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
     add_topics(topics)
+    topics.add_argument("--no-imu", action="store_true", help="the camera alone")
     offline = parser.add_argument_group(
         "offline (default): at full speed, no ROS needed",
         "With the settings base_frame and publish_tf, transforms come from the recording's "
@@ -110,7 +112,7 @@ def run(args: argparse.Namespace) -> None:
         with open_bag(args.bag) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
             topics = None if only_images else find_topics(bag, named)
-            play(bag, topics, args.rate or 1.0)
+            play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
     config = _config(args.params, args.assignments + given)
@@ -121,6 +123,10 @@ def run(args: argparse.Namespace) -> None:
                 f"{args.bag} holds images, not matches: first {_detect_command(args.bag)}"
             )
         topics = find_topics(bag, named)
+        if args.no_imu or config.imu.use == ImuUse.NONE:
+            topics = topics.without(IMU)
+        elif IMU not in topics.of and (several := imu_topics(bag)):
+            print(f"no IMU is used: choose {' or '.join(several)} with --imu")
         if KEYPOINTS in topics.of and MAP_POINTS not in topics.of and not config.map_file:
             raise ValueError(
                 f"{args.bag} has keypoints and no map on map_points; give one with --map"
@@ -152,7 +158,16 @@ def _detect_command(path: Path) -> str:
     )
 
 
+def _played_imus(bag: BagReader, args: argparse.Namespace) -> list[str]:
+    """Topics of IMUs that live nodes shall hear."""
+    if args.no_imu:
+        return []
+    return imu_topics(bag) if args.imu is None else [args.imu]
+
+
 def _check_usage(args: argparse.Namespace) -> None:
+    if args.imu is not None and args.no_imu:
+        raise UsageError("give --imu or --no-imu, not both")
     if args.correspondences is not None and args.keypoints is not None:
         raise UsageError("give --correspondences or --keypoints, not both")
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
@@ -226,6 +241,7 @@ def _replay(
                 tally.not_sent += not write_frame(writer, frame, localizer, frame.input_stamp_ns)
             write_bridged(out, tally.smoothed.bridged)
     tally.seconds = time.perf_counter() - start
+    tally.imu = localizer.imu.state
     tally.repeated = write_texts(out, tally.written, localizer.config)
     return tally
 

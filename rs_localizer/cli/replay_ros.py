@@ -11,16 +11,15 @@ from rs_localizer.offline.image_sources import INFO_TYPE, image_topics
 from rs_localizer.offline.replay import TF_TYPE, Topics, tf_topics
 from rs_localizer.settings import NODE_NAME
 
-_IMU_TYPE = "sensor_msgs/msg/Imu"
 
-
-def play(bag: BagReader, topics: Topics | None, rate: float) -> None:
+def play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -> None:
     """Publish the inputs of the nodes: matches or keypoints, images, their camera_info, and TF.
 
     Args:
         bag: the recording.
         topics: of the localizer's inputs; None: it has none, only images.
         rate: times real time.
+        imus: topics of inertial measurements.
 
     Raises:
         ValueError: without ROS, without anything to play, or when nobody listens.
@@ -36,7 +35,7 @@ def play(bag: BagReader, topics: Topics | None, rate: float) -> None:
     inputs = images + (_of_type(bag, INFO_TYPE) if topics is None else list(topics.names))
     if not images and topics is None:
         raise BagError(f"{bag.path} has nothing to play: no matches, keypoints or images")
-    names = tuple(dict.fromkeys((*_transforms(bag), *_of_type(bag, _IMU_TYPE), *inputs)))
+    names = tuple(dict.fromkeys((*_transforms(bag), *imus, *inputs)))
     total = bag.count(names)
     latched = [] if topics is None else [t for t, item in topics.inputs.items() if item.lasting]
     played = play(

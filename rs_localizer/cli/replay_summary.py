@@ -14,6 +14,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.io.image_clock import readout_fault
 from rs_localizer.io.outputs import Frame
 from rs_localizer.offline.smoothed import SmoothedFrames
+from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.reasons import explained
 from rs_localizer.solvers.table import find_solver
 
@@ -35,6 +36,7 @@ class Tally:
     repeated: int = 0
     seconds: float = 0.0
     smoothed: SmoothedFrames | None = None
+    imu: ImuState | None = None
 
     @property
     def written(self) -> list[Frame]:
@@ -57,18 +59,32 @@ def print_summary(tally: Tally, config: NodeConfig) -> None:
         ("without a transform on /tf", tally.not_sent),
     ):
         rows += [(name, str(count))] if count else []
-    rows += _quality(frames, config)
+    rows += _quality(frames, config) + _inertial(tally.imu)
     rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
     if tally.smoothed:
         rows += _smoothing(tally.smoothed)
     for name, text in rows:
         print(f"{name:40} {text:>8}")
-    for reason in tally.refused:
+    for reason in (*tally.refused, *(tally.imu.reasons if tally.imu else ())):
         if text := explained(reason):
             print(textwrap.fill(f"{reason}: {text}", _WIDTH, subsequent_indent="    "))
     fault = readout_fault(config.readout_time, _period(frames))
     if fault is not None:
         print(f"warning: {fault}")
+
+
+def _inertial(imu: ImuState | None) -> list[tuple[str, str]]:
+    if imu is None:
+        return []
+    rows = [("localized with the IMU", f"{imu.used / imu.frames:.1%}")]
+    rows += [(f"  without: {reason}", str(count)) for reason, count in imu.reasons.items()]
+    if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
+        bias, offset = np.degrees(imu.status.bias), 1e3 * imu.time_offset
+        rows += [
+            ("  bias of the gyroscope (deg/s)", f"{np.linalg.norm(bias):.2f}"),
+            ("  time offset of the IMU (ms)", f"{offset:.2f}"),
+        ]
+    return rows
 
 
 def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:

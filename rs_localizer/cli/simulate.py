@@ -18,8 +18,9 @@ from rs_localizer.cli.simulated_camera import (
     option,
     stamps_of,
 )
+from rs_localizer.cli.simulated_imu import add_imu_arguments, bag_of
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.bags import STORAGES, BagWriter
+from rs_localizer.io.bags import STORAGES
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
 from rs_localizer.io.whole import whole
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="bag directory to create")
     add_motion_arguments(parser.add_argument_group("motion"))
     add_camera_arguments(parser.add_argument_group("camera"))
+    add_imu_arguments(parser.add_argument_group("IMU"))
     frames = FrameSettings()
     seen = parser.add_argument_group("what it sees: points")
     option(seen, "--points", integer(1), frames.points, "N", "of a frame, if it sees so many")
@@ -112,7 +114,7 @@ def _write_points(args: argparse.Namespace) -> None:
     landmarks = described(room(_way(motion), rng), MAP_FRAME, rng)
     counts: list[int] = []
     with whole(args.out):
-        with BagWriter(args.out, args.storage) as bag:
+        with bag_of(args, motion) as bag:
             frames = simulate_frames(
                 camera, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
             )
@@ -150,7 +152,7 @@ def _write_images(args: argparse.Namespace) -> None:
     renderer = Renderer(camera, scene.planes, settings)
     encoding = Encoding(args.format, round(args.quality))
     with whole(args.out):
-        with BagWriter(args.out, args.storage) as bag:
+        with bag_of(args, motion) as bag:
             frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
             for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
                 write_rendered(bag, camera, frame)

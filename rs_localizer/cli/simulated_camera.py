@@ -20,6 +20,7 @@ from rs_localizer.lab.simulation.true_motion import (
     RecordedMotion,
     TrueMotion,
 )
+from rs_localizer.lab.simulation.vibration import shaken
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import settings
 
@@ -29,6 +30,8 @@ _LINEAR_VELOCITY = (0.3, 0.0, 0.0)
 _DURATION = 10.0
 # A time of 0 means "none" to ROS.
 _START_NS = 1_000_000_000
+# The random numbers of a vibration are its own.
+_STREAM = 60
 # Stands for the bundled trajectory.
 _BUNDLED = "tum_vi_room5"
 
@@ -84,6 +87,15 @@ def add_motion_arguments(group: argparse._ArgumentGroup) -> None:
         metavar=("X", "Y", "Z"),
         help="m/s along the camera axes at the start "
         f"(without any motion given: {_words(_LINEAR_VELOCITY)})",
+    )
+    group.add_argument(
+        "--vibration",
+        type=number(0.0),
+        nargs=2,
+        metavar=("DEG", "HZ"),
+        action="append",
+        default=[],
+        help="shake the camera besides, to and fro by DEG about any axis; may be repeated",
     )
     option(group, "--start", number(0.0), 0.0, "S", "seconds to skip")
     group.add_argument(
@@ -152,7 +164,12 @@ def camera_of(args: argparse.Namespace) -> Camera:
 
 
 def motion_of(args: argparse.Namespace) -> TrueMotion:
-    """The recorded motion, or one at constant velocity."""
+    """The recorded motion, or one at constant velocity, with its vibrations."""
+    vibrations = [(degrees, hertz) for degrees, hertz in args.vibration]
+    return shaken(_unshaken(args), vibrations, np.random.default_rng([args.seed, _STREAM]))
+
+
+def _unshaken(args: argparse.Namespace) -> TrueMotion:
     velocities = (args.angular_velocity, args.linear_velocity)
     if args.trajectory is not None:
         if velocities != (None, None):

@@ -10,6 +10,7 @@ CORRESPONDENCES = "correspondences"  # which the marker detector publishes
 KEYPOINTS = "keypoints"
 MAP_POINTS = "map_points"
 CAMERA_INFO = "camera_info"
+IMU = "imu"
 # Inputs of the marker detector.
 IMAGE = "image"
 COMPRESSED_IMAGE = "image/compressed"

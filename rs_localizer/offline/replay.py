@@ -8,12 +8,14 @@ from typing import Any
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Frame
-from rs_localizer.io.topics import CAMERA_INFO, TF, TF_STATIC
+from rs_localizer.io.topics import CAMERA_INFO, IMU, TF, TF_STATIC
 from rs_localizer.io.transforms.rigid import TransformError
 from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.offline.imu_first import LOOK_AHEAD, imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.inputs import INPUTS, Input, Role, with_role
+from rs_localizer.pipeline.inputs import IMU_TYPE, INPUTS, Input, Role, with_role
 from rs_localizer.pipeline.refusal import Refusal
 
 # Reasons of messages that are no frames.
@@ -21,7 +23,7 @@ NO_FRAMES = tuple(item.refused for item in INPUTS.values() if item.role != Role.
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 _OLD_TF_TYPE = "tf/msg/tfMessage"  # of ROS 1 before tf2
-CARRIED_TYPES = (TF_TYPE, _OLD_TF_TYPE, "sensor_msgs/msg/Imu")
+CARRIED_TYPES = (TF_TYPE, _OLD_TF_TYPE, IMU_TYPE)
 """Types of topics that a recording made from another one keeps, because replay may need them."""
 
 
@@ -46,12 +48,17 @@ class Topics:
         """The inputs by their topics in the recording."""
         return {topic: INPUTS[name] for name, topic in self.of.items()}
 
+    def without(self, name: str) -> Topics:
+        """The topics but for that of an input."""
+        return Topics({other: topic for other, topic in self.of.items() if other != name})
+
 
 def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -> Topics:
     """The topics of the inputs, given (by input; None: not given) or found.
 
     Found are those that end in the node's own names, else the only one of the type; of what is not
-    necessary, only the former.
+    necessary, only the former. An IMU is found by its type, too; several that could be meant are
+    none.
 
     Raises:
         BagError: when a given topic is not there, or none or several could be meant.
@@ -62,6 +69,8 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
     for name, item in INPUTS.items():
         if item.role == Role.FRAMES:
             needed = item is frames
+        elif item.role == Role.SAMPLES:
+            needed = name in wanted or len(_named(bag, item) or imu_topics(bag)) == 1
         elif item.only_with in ("", frames.topic):
             needed = item.necessary or name in wanted or bool(_named(bag, item))
         else:
@@ -84,6 +93,11 @@ def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
             f"{' or '.join(item.option for item in found)}"
         )
     return found[0] if found else kinds[0]
+
+
+def imu_topics(bag: BagReader) -> list[str]:
+    """All topics of inertial measurements."""
+    return sorted(topic for topic, kind in bag.topics.items() if kind == IMU_TYPE)
 
 
 def has_frames(bag: BagReader) -> bool:
@@ -138,7 +152,8 @@ def as_tf2(message: Any) -> Any:
 def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> TransformTree:
     """The transforms of the recording that the settings need; an empty tree where they need none.
 
-    All are known from the start. A live node hears them as they come.
+    All are known from the start. A live node hears them as they come. An IMU that is not connected
+    with the camera is not used.
 
     Raises:
         BagError: when the camera's frame is not connected to ``base_frame``, or to ``odom_frame``
@@ -150,14 +165,16 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     if config.publish_tf == PublishTf.MAP_TO_ODOM:
         wanted["odom_frame"] = config.odom_frame
     tree = TransformTree()
-    camera = next((m.header.frame_id for _, _, m in bag.messages((topics.of[CAMERA_INFO],))), None)
-    if not wanted or camera is None:
+    camera = _frame_of(bag, topics.of[CAMERA_INFO])
+    imu = _frame_of(bag, topics.of[IMU]) if IMU in topics.of else None
+    ends = [*wanted.values(), *([] if imu is None else [imu])]
+    if not ends or camera is None:
         return tree
     found = tf_topics(bag, TF_TYPE, _OLD_TF_TYPE)
     for topic in found:
         for _, _, message in bag.messages((topic,)):
             tree.add(message, static=topic == TF_STATIC)
-        if topic == TF_STATIC and all(_connected(tree, f, camera) for f in wanted.values()):
+        if topic == TF_STATIC and all(_connected(tree, frame, camera) for frame in ends):
             break  # /tf is long
     for name, frame in wanted.items():
         try:
@@ -169,6 +186,11 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
                 f"{error} (found {where})"
             ) from error
     return tree
+
+
+def _frame_of(bag: BagReader, topic: str) -> str | None:
+    """Of the first message on a topic."""
+    return next((message.header.frame_id for _, _, message in bag.messages((topic,))), None)
 
 
 def _connected(tree: TransformTree, target: str, source: str) -> bool:
@@ -184,11 +206,17 @@ def replay(
 ) -> Iterator[tuple[int, Frame | Refusal]]:
     """Time of recording (ns) and result of every frame, as the node would have answered.
 
-    A CameraInfo or a map that cannot be used gives a Refusal of its own, for a reason of
+    A message that is no frame and cannot be used gives a Refusal of its own, for a reason of
     :data:`NO_FRAMES`.
     """
     inputs = topics.inputs
-    for topic, recorded_ns, message in bag.messages(topics.names):
+
+    def awaits(item: tuple[str, int, Any]) -> bool:
+        topic, _, message = item
+        return topic == topics.frames and localizer.awaits_imu(stamp_ns(message), LOOK_AHEAD)
+
+    messages = imu_first(bag.messages(topics.names), topics.of.get(IMU), awaits)
+    for topic, recorded_ns, message in messages:
         result = inputs[topic].take(localizer, message)
         if result is not None:
             yield recorded_ns, result

@@ -26,6 +26,7 @@ from rs_localizer.io.clouds import (
     read_correspondences,
     select_inliers,
 )
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import Keypoints, read_keypoints, read_map
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
@@ -37,6 +38,7 @@ from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
+from rs_localizer.pipeline.imu import ImuInput, inertial_settings
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.oddities import oddities
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
@@ -77,7 +79,8 @@ class FrameLocalizer:
         notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
             (a recording that starts over), ``map_changed`` (another frame of the points),
             ``map_replaced``, ``map_incomplete``, ``camera_changed``, ``too_many_keypoints``,
-            ``readout_time`` (the motion contradicts it, or it was estimated) and those of
+            ``readout_time`` (the motion contradicts it, or it was estimated), a
+            :class:`rs_localizer.pipeline.reasons.ImuReason` and those of
             :func:`rs_localizer.pipeline.oddities.oddities`. Frames are localized all the same.
         transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
@@ -99,6 +102,7 @@ class FrameLocalizer:
         self._matcher: Matcher | None = None
         self._lacks_map = False
         self.readout_watch = ReadoutWatch(notice)
+        self.imu = ImuInput(notice)
         self._given = config  # the readout time may be found on the way
         self._use(_ANY_CALIBRATION, config)
 
@@ -177,6 +181,23 @@ class FrameLocalizer:
                     f"to {calibration.frame!r}, {calibration.width} x {calibration.height}; the "
                     "previous frames are forgotten (if it goes to and fro, two cameras publish it)",
                 )
+
+    def take_imu(self, message: Any) -> None:
+        """Keep this sensor_msgs/Imu for the frames of its time.
+
+        Raises:
+            MessageError: for one that cannot be used, saying what was found.
+        """
+        self.imu.add(read_imu(message))
+
+    def awaits_imu(self, stamp_ns: int, patience: float) -> bool:
+        """Whether readings of the frame with this stamp are missing that may come within so many
+        seconds.
+        """
+        if self._tracker is None:
+            return False
+        time_ns = self._middle_row_ns(stamp_ns)
+        return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
     def load_map(self) -> None:
         """Use the map of the setting ``map_file``, if there is one.
@@ -298,9 +319,14 @@ class FrameLocalizer:
             self._notice(name, text)
         given = (cloud.points, cloud.pixels, cloud.scores)
         if self._tracker is None:
+            self.imu.without_tracker(self._config)
             result = self._localizer.localize(*given)
         else:
-            result = self._tracker.localize(self._middle_row_ns(cloud.stamp_ns), *given)
+            time_ns = self._middle_row_ns(cloud.stamp_ns)
+            camera_frame = self._calibration.frame
+            result = self.imu.track(
+                self._tracker, self._config, time_ns, camera_frame, self.transforms, given
+            )
         if not result:
             return Refusal(str(result.reason), result.detail)
         frame = self._frame(cloud, result, self._calibration.frame)
@@ -402,4 +428,4 @@ def _build(
     follows = (
         config.tracking and config.readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     )
-    return camera, localizer, Tracker(localizer) if follows else None
+    return camera, localizer, Tracker(localizer, inertial_settings(config)) if follows else None

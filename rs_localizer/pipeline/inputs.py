@@ -13,6 +13,7 @@ from typing import Any
 
 from rs_localizer.io import topics
 from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
@@ -21,6 +22,7 @@ from rs_localizer.pipeline.refusal import Refusal
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+IMU_TYPE = "sensor_msgs/msg/Imu"
 
 
 class Role(Enum):
@@ -28,6 +30,7 @@ class Role(Enum):
 
     FRAMES = auto()  # each is localized, unless a newer one comes first
     STATE = auto()  # the latest one says how frames are localized
+    SAMPLES = auto()  # each counts, and is used where it comes: ``use`` may run in any thread
 
 
 def _as_it_is(message: Any) -> Any:
@@ -97,6 +100,15 @@ _ROWS = (
         latched=True,
         lasting=True,
         help="the map of the keypoints",
+    ),
+    Input(
+        topics.IMU,
+        IMU_TYPE,
+        Role.SAMPLES,
+        read=read_imu,
+        use=lambda localizer, reading: localizer.imu.add(reading),
+        refused="bad_imu",
+        help="of the IMU, if there are several",
     ),
     Input(
         topics.CORRESPONDENCES,

@@ -32,7 +32,7 @@ def documented(where: set[str]) -> Iterator[tuple[str, str, str]]:
         if table.page in where:
             rows = zip(table.column("parameter"), table.column("default"), strict=True)
             for names, defaults in rows:
-                given, values = pages.names_in(names), re.split(r", *", defaults)
+                given, values = pages.names_in(names), re.split(r", *(?![^[]*\])", defaults)
                 assert len(values) in (1, len(given)), (table.page, names)
                 values *= len(given) if len(values) == 1 else 1
                 yield from ((table.page, *item) for item in zip(given, values, strict=True))
@@ -52,6 +52,8 @@ def read(cell: str, like: Any) -> Any:
     said = re.sub(r": none$", "", cell).strip("`")
     if isinstance(like, bool):
         return {"true": True, "false": False}[said]
+    if isinstance(like, tuple):
+        return tuple(map(float, said.strip("[]").split(",")))
     return said.strip('"') if isinstance(like, str) else type(like)(said)
 
 

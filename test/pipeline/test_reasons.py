@@ -8,7 +8,7 @@ from pathlib import Path
 import rs_localizer
 from rs_localizer.core.types import Reason
 from rs_localizer.pipeline.inputs import INPUTS
-from rs_localizer.pipeline.reasons import REASONS, explained
+from rs_localizer.pipeline.reasons import IMU_REASONS, REASONS, ImuReason, explained
 
 PACKAGE = Path(rs_localizer.__file__).parent
 # Of single images, which detect and marker_detector tell of themselves.
@@ -31,3 +31,9 @@ def test_a_reason_says_what_it_means_and_what_to_look_at() -> None:
     assert "do not determine the motion" in text
     assert "look at it from an angle" in text
     assert explained("unheard_of") == ""
+
+
+def test_every_reason_to_go_without_the_imu_has_its_sentence() -> None:
+    assert set(IMU_REASONS) == set(ImuReason)
+    assert not set(IMU_REASONS) & set(REASONS)
+    assert "which message belongs to which row" in explained(ImuReason.NO_READOUT_TIME)

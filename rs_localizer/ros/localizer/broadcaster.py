@@ -15,7 +15,7 @@ from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError, make_transform
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
-from rs_localizer.ros.localizer.transforms import Tf, import_tf2_ros
+from rs_localizer.ros.localizer.transforms import Tf, import_tf2_ros, needed
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
@@ -64,7 +64,7 @@ class Broadcaster:
         """
         self.tf.configure(config)
         if config.publish_tf != PublishTf.NONE and self._broadcaster is None:
-            self._broadcaster = import_tf2_ros(config).TransformBroadcaster(self._node)
+            self._broadcaster = import_tf2_ros(needed(config)).TransformBroadcaster(self._node)
 
     def forget(self) -> None:
         """Send nothing of the frames so far."""

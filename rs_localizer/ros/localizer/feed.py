@@ -13,17 +13,17 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.messages import MessageError
+from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Frame
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.conversion import message_class
-from rs_localizer.ros.node.inputs import LATCHED, SENSOR_DATA, Topic
+from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.refusals import Refusals
-from rs_localizer.ros.node.worker import Worker
+from rs_localizer.ros.node.worker import Need, Worker
 
 # In a serialized message, which begins with four bytes of CDR and the stamp of its header.
 _AFTER_STAMP = 12
@@ -39,6 +39,7 @@ class Feed:
         frames: that of the worker, here only to be read.
         refusals: told of messages that cannot be used.
         say: takes a line for the log.
+        needs_tf: called once when readings come whose axes are not the camera's.
     """
 
     def __init__(
@@ -47,18 +48,24 @@ class Feed:
         frames: FrameLocalizer,
         refusals: Refusals,
         say: Callable[[str], Any],
+        needs_tf: Callable[[], None] = lambda: None,
     ) -> None:
         self._worker = worker
         self._frames = frames
         self._refusals = refusals
         self._say = say
+        self._needs_tf: Callable[[], None] | None = needs_tf
         # The last that was handed on of what is repeated, and what it says; by topic.
         self._repeated: dict[str, tuple[bytes, Any]] = {}
         self.changing = False  # whether the worker compiles kernels for new settings
 
     def topics(self) -> dict[str, Topic]:
         """The inputs; what changes the state comes before the frames."""
-        make = {Role.FRAMES: self._frames_topic, Role.STATE: self._state_topic}
+        make = {
+            Role.FRAMES: self._frames_topic,
+            Role.STATE: self._state_topic,
+            Role.SAMPLES: self._samples_topic,
+        }
         return {name: make[item.role](item) for name, item in INPUTS.items()}
 
     def take_config(self, config: NodeConfig) -> None:
@@ -79,10 +86,29 @@ class Feed:
             assert result is not None  # a frame has one
             return result
 
-        return Topic(
-            message_class(item.type),
-            lambda message: self._worker.process(item.topic, message, localize),
-        )
+        def take(message: Any) -> None:
+            need = Need(_lacks_samples, self._frames.config.imu.wait)
+            self._worker.process(item.topic, message, localize, need)
+
+        return Topic(message_class(item.type), take)
+
+    def _samples_topic(self, item: Input) -> Topic:
+        """A topic whose messages are all used here; frames wait for them."""
+        take = functools.partial(self._take_sample, item)
+        return Topic(message_class(item.type), take, FAST_DATA, raw=True)
+
+    def _take_sample(self, item: Input, serialized: bytes) -> None:
+        if self._frames.config.imu.use == ImuUse.NONE:
+            return
+        message = deserialize_message(serialized, message_class(item.type))
+        refusal = item.take(self._frames, message)
+        if isinstance(refusal, Refusal):
+            self._refusals.add(refusal.reason, refusal.detail)
+            return
+        self._worker.look()
+        if self._needs_tf is not None and self._frames.imu.frame != self._frames.camera_frame:
+            self._needs_tf()
+            self._needs_tf = None
 
     def _state_topic(self, item: Input) -> Topic:
         """A topic whose messages are read here; the worker uses them."""
@@ -135,6 +161,10 @@ class Feed:
             self.changing = False
         if seconds > _LONG_CHANGE:
             self._say(f"kernels for the new settings are ready after {seconds:.1f} s")
+
+
+def _lacks_samples(frames: FrameLocalizer, message: Any) -> bool:
+    return frames.awaits_imu(stamp_ns(message), frames.config.imu.wait)
 
 
 def described(landmarks: Map) -> str:

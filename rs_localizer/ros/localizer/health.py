@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.inputs import INPUTS, Role
 from rs_localizer.ros.localizer.answers import Answer
+from rs_localizer.ros.localizer.imu_health import imu_values
 from rs_localizer.ros.node.health import (
     COMPILING,
     LOST,
@@ -41,6 +43,7 @@ class Condition:
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
     readout: MeasuredReadout | None = None  # as the camera's motion shows it
+    imu: ImuState | None = None  # None: there is none
 
 
 def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[str, Silence]:
@@ -156,6 +159,8 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
     if condition.readout is not None:
         seen, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
         values["Readout time seen (ms)"] = f"{seen:.2f} +- {deviation:.2f}"
+    if condition.imu is not None:
+        values |= imu_values(condition.imu)
     values |= {
         "Frames received": str(sum(summary.received.values())),
         "Poses published": str(summary.answered),

@@ -18,6 +18,7 @@ from rs_localizer.ros.localizer.answers import Answer, tell
 from rs_localizer.ros.localizer.broadcaster import Broadcaster
 from rs_localizer.ros.localizer.feed import Feed, described, warm_up
 from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest
+from rs_localizer.ros.localizer.imu_health import imu_oddity
 from rs_localizer.ros.localizer.outputs import Outputs
 from rs_localizer.ros.node.health import Health
 from rs_localizer.ros.node.managed import ManagedNode
@@ -42,6 +43,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Frame, Answer]):
         self._reset_service: Service | None = None
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
+        # Triggered by the inputs' thread: subscriptions are the executor's.
+        self._imu_came = self.create_guard_condition(lambda: self._broadcaster.tf.listen("the IMU"))
 
     def kernels(self) -> Callable[[], None]:
         frames = FrameLocalizer(self.config)
@@ -71,7 +74,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Frame, Answer]):
         )
         self._localizer = frames
         worker = self.employ(frames, self._outputs.publish)
-        self._feed = Feed(worker, frames, self.refusals, self.get_logger().info)
+        say, needs_tf = self.get_logger().info, self._imu_came.trigger
+        self._feed = Feed(worker, frames, self.refusals, say, needs_tf)
         self._reset_service = self.create_service(Trigger, "~/reset", self._reset)
 
     def close(self) -> None:
@@ -109,6 +113,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Frame, Answer]):
         frames = self._localizer
         missing = () if frames is None else frames.missing
         watch = None if frames is None else frames.readout_watch
+        imu = None if frames is None else frames.imu.state
         condition = Condition(
             life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,
@@ -116,8 +121,10 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Frame, Answer]):
             silence=of_interest(self.silence, missing),
             oddities=self.refusals.recent(_ODD, WINDOW)
             | self._broadcaster.fault()
+            | imu_oddity(imu)
             | ({"readout_time": watch.fault} if watch and watch.fault else {}),
             readout=watch.measured if watch else None,
+            imu=imu,
         )
         health = diagnose(condition, self.statistics.summary())
         return health, "" if frames is None else frames.camera_frame

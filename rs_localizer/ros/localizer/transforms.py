@@ -30,8 +30,8 @@ _MEMORY = 10_000_000_000
 
 def check(config: NodeConfig) -> None:
     """Raise ``ValueError`` if settings need tf2_ros and it is not installed."""
-    if needed(config):
-        import_tf2_ros(config)
+    if what := needed(config):
+        import_tf2_ros(what)
 
 
 def needed(config: NodeConfig) -> str:
@@ -41,12 +41,13 @@ def needed(config: NodeConfig) -> str:
     return f"publish_tf {config.publish_tf}" if config.publish_tf != PublishTf.NONE else ""
 
 
-def import_tf2_ros(config: NodeConfig) -> ModuleType:
+def import_tf2_ros(what: str) -> ModuleType:
+    """The package, which ``what`` needs; ``ValueError`` with what to do where it is missing."""
     try:
         return importlib.import_module("tf2_ros")
     except ImportError as error:
         raise ValueError(
-            f"{needed(config)} needs the Python package tf2_ros, which cannot be imported "
+            f"{what} needs the Python package tf2_ros, which cannot be imported "
             f"({error}): it comes with ROS 2, sudo apt install ros-jazzy-tf2-ros-py"
         ) from error
 
@@ -72,6 +73,7 @@ class Tf:
         self._failed = failed
         self._buffer: Any = None
         self._errors: Any = None  # tf2_ros
+        self._deaf = "TF is not listened to"  # why it is not
         self._undo = contextlib.ExitStack()
 
     def configure(self, config: NodeConfig) -> None:
@@ -80,9 +82,19 @@ class Tf:
         Raises:
             ValueError: without tf2_ros.
         """
-        if not needed(config) or self._buffer is not None:
+        if what := needed(config):
+            self._listen(import_tf2_ros(what))
+
+    def listen(self, what: str) -> None:
+        """Listen because of what has come; without tf2_ros, whoever asks is told."""
+        try:
+            self._listen(import_tf2_ros(what))
+        except ValueError as error:
+            self._deaf = str(error)
+
+    def _listen(self, tf2_ros: Any) -> None:
+        if self._buffer is not None:
             return
-        tf2_ros = import_tf2_ros(config)
         buffer = tf2_ros.Buffer()
         # By its own clock tf2 would not see the time of a simulation or a recording go back.
         jumps = self._node.get_clock().create_jump_callback(
@@ -124,7 +136,7 @@ class Tf:
         """The geometry_msgs/TransformStamped that tf2 has now."""
         buffer = self._buffer
         if buffer is None:
-            raise TransformError("TF is not listened to")
+            raise TransformError(self._deaf)
         if stamp_ns is not None and stamp_ns <= 0:  # which would mean the latest
             raise TransformError(f"there are no transforms of the time {stamp_ns * 1e-9:.3f} s")
         try:

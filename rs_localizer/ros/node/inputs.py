@@ -32,6 +32,8 @@ from rs_localizer.ros.node.refusals import Refusals
 # while this process does not get the CPU shall be counted by the mailbox, which keeps the newest,
 # and not be lost unseen.
 SENSOR_DATA = {"depth": 20, "reliability": ReliabilityPolicy.BEST_AVAILABLE}
+# Messages that come some hundred times a second.
+FAST_DATA = SENSOR_DATA | {"depth": 200}
 # Also what was published before we came.
 LATCHED = {
     "depth": 1,

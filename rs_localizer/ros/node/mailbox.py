@@ -32,7 +32,7 @@ class Mailbox(Generic[State, Item]):
         self._updates: dict[str, Update[State]] = {}
         self._frames: dict[str, Item] = {}
         self._session = 0
-        self._closed = False
+        self._closed = self._woken = False
 
     def update(self, kind: str, update: Update[State]) -> None:
         """Have this done before the next frame, after all updates of other kinds so far.
@@ -56,16 +56,25 @@ class Mailbox(Generic[State, Item]):
     def take(self, timeout: float | None = None) -> Work[State, Item] | None:
         """Wait for all updates, and the oldest frame if there is any; None once it is closed.
 
-        After ``timeout`` (s) it is nothing that is to be done.
+        After ``timeout`` (s), or when it is woken, it may be nothing that is to be done.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._updates or self._frames or self._closed, timeout)
+            self._changed.wait_for(
+                lambda: self._updates or self._frames or self._closed or self._woken, timeout
+            )
+            self._woken = False
             if self._closed:
                 return None
             updates, self._updates = self._updates, {}
             oldest = next(iter(self._frames), None)
             frame = None if oldest is None else self._frames.pop(oldest)
             return Work(updates.values(), frame, self._session)
+
+    def wake(self) -> None:
+        """Let :meth:`take` return, whatever there is."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify()
 
     def drop_frames(self) -> int:
         """Forget the frames that wait, how many there are, and end the session of the one that is

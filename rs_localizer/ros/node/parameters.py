@@ -14,6 +14,7 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from rs_localizer.config import type_of
 from rs_localizer.settings import Config, Kind, Setting, build, settings, unknown
 
 _UNCONFIGURED = "unconfigured"
@@ -38,7 +39,7 @@ def declare(node: Node, kind: type[Config]) -> Config:
             if isinstance(setting.default, float) and type(given) is int:
                 hint = f" (write {float(given)!r})"
             raise ValueError(
-                f"{name} must be of type {type(setting.default).__name__}, got {given!r}{hint}"
+                f"{name} must be {type_of(setting.default)}, got {given!r}{hint}"
             ) from error
         except InvalidParameterValueException as error:
             raise ValueError(str(error)) from error

@@ -24,9 +24,17 @@ Process = Callable[[State, Any], Result | Refusal]
 """What is done with a message, given what the worker alone touches."""
 
 _NAME = "rs_localizer worker"
-# How often results are looked at that wait for something, in s, and how many may.
+# How often frames and results are looked at that wait for something, in s, and how many may.
 _LATE_PERIOD = 0.005
 _MOST_LATE = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Need(Generic[State]):
+    """What a frame waits for before it is processed."""
+
+    missing: Callable[[State, Any], bool]  # whether something is, and may still come
+    patience: float  # s for which it waits
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +44,7 @@ class Arrival(Generic[State, Result]):
     message: Any
     process: Process[State, Result]
     received: float  # s, time.monotonic()
+    need: Need[State] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +80,8 @@ class Worker(Generic[State, Result]):
         self._statistics = statistics
         self._failed = failed
         self._mailbox: Mailbox[State, Arrival[State, Result]] = Mailbox()
+        # Frames that wait for what they need, and results.
+        self._early: deque[Work[State, Arrival[State, Result]]] = deque()
         self._late: deque[_Late[State, Result]] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
@@ -80,12 +91,26 @@ class Worker(Generic[State, Result]):
         """Have this done before the next frame (see :meth:`Mailbox.update`)."""
         self._mailbox.update(kind, update)
 
-    def process(self, topic: str, message: Any, process: Process[State, Result]) -> None:
-        """Have this frame processed and published, unless a newer one comes first."""
+    def process(
+        self,
+        topic: str,
+        message: Any,
+        process: Process[State, Result],
+        need: Need[State] | None = None,
+    ) -> None:
+        """Have this frame processed and published, unless a newer one comes first.
+
+        While it needs something it waits, and those behind it, too.
+        """
         self._statistics.received(topic, message)
-        arrival = Arrival(message, process, time.monotonic())
+        arrival = Arrival(message, process, time.monotonic(), need)
         if self._mailbox.put(topic, arrival):
             self._statistics.replaced()
+
+    def look(self) -> None:
+        """Something has come that a frame may have waited for."""
+        if self._early:
+            self._mailbox.wake()
 
     def pause(self) -> None:
         """Forget the frames so far, the one that is worked on included."""
@@ -100,12 +125,37 @@ class Worker(Generic[State, Result]):
     # -- in the thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
-        while (work := self._mailbox.take(_LATE_PERIOD if self._late else None)) is not None:
+        while (work := self._mailbox.take(self._timeout())) is not None:
             for update in work.updates:
                 self._guarded(update, self._state)
             self._finish_late()
             if work.frame is not None:
-                self._process(work, work.frame)
+                self._early.append(work)
+            if self._is_ready():
+                self._begin(self._early.popleft())
+
+    def _timeout(self) -> float | None:
+        """How long nothing has to be done, unless something comes."""
+        if self._is_ready():
+            return 0.0
+        return _LATE_PERIOD if self._late or self._early else None
+
+    def _is_ready(self) -> bool:
+        """Whether there is a frame that need not wait."""
+        arrival = self._early[0].frame if self._early else None
+        if arrival is None or (need := arrival.need) is None:
+            return arrival is not None
+        overdue = time.monotonic() >= arrival.received + need.patience
+        if overdue or len(self._early) > _MOST_LATE:
+            return True
+        return self._attempt(lambda: need.missing(self._state, arrival.message)) is not True
+
+    def _begin(self, work: Work[State, Arrival[State, Result]]) -> None:
+        assert work.frame is not None
+        if self._mailbox.is_current(work):
+            self._process(work, work.frame)
+        else:
+            self._statistics.dropped(1)
 
     def _guarded(self, function: Callable[..., None], *arguments: Any) -> None:
         try:

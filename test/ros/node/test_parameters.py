@@ -134,11 +134,21 @@ def test_values_at_start(context: Context) -> None:
         ("inlier_threshold:=-3", r"got -3 \(write -3\.0\)$"),
         ("readout_time:=true", "readout_time must be of type float, got True$"),
         ("seed:=high", "seed must be of type int, got 'high'$"),
+        ("gravity_in_map:=[0, 0, 1]", r"must be 3 numbers, as \[0.0, 0.0, -1.0\], got .*1"),
     ],
 )
 def test_bad_values_at_start(context: Context, assignment: str, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         Recorder(context, "-p", assignment)
+
+
+def test_numbers_in_a_row(context: Context) -> None:
+    recorder = Recorder(context, "-p", "gravity_in_map:=[0.0, 1.0, 0.0]")
+    assert recorder.config.gravity_in_map == (0.0, 1.0, 0.0)
+    assert recorder.set_all(gravity_in_map=[0.0, -9.81, 0.0]) == (True, "")
+    assert recorder.applied[-1].gravity_in_map == (0.0, -9.81, 0.0)
+    assert recorder.set_all(gravity_in_map=[0.0, 1.0])[1].startswith("gravity_in_map must be 3")
+    recorder.node.destroy_node()
 
 
 def test_names_that_no_parameter_has(context: Context) -> None:

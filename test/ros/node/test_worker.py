@@ -13,7 +13,7 @@ from sensor_msgs.msg import Image
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
-from rs_localizer.ros.node.worker import Worker, wait_for_workers
+from rs_localizer.ros.node.worker import Need, Worker, wait_for_workers
 
 PATIENCE = 10.0  # s, of a machine that is busy
 
@@ -40,13 +40,15 @@ class Fake:
         self.done = threading.Semaphore(0)
         self.errors: list[str] = []
         self.mounted: set[str] = set()
+        self.awaited: set[str] = set()
         self.patience = 10.0
         self.refusals = Refusals(lambda text: None)
         self.statistics = Count(self.refusals, lambda text: (0, text))
         self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, self._fail)
 
-    def send(self, frame: str, topic: str = "frames") -> None:
-        self.worker.process(topic, frame, lambda frames, message: self._localize(message))
+    def send(self, frame: str, topic: str = "frames", patience: float = PATIENCE) -> None:
+        need: Need[Fake] = Need(lambda frames, message: message in self.awaited, patience)
+        self.worker.process(topic, frame, lambda frames, message: self._localize(message), need)
 
     def wait(self, semaphore: threading.Semaphore) -> None:
         assert semaphore.acquire(timeout=PATIENCE)

@@ -19,6 +19,7 @@ _MOST_REPLACED = 0.001  # share of the frames
 _MOST_P50, _MOST_P99 = 4.0, 12.0  # ms
 _MOST_GROWTH = 5.0  # MB after the first minute
 _LEAST_RATE = 250.0  # Hz
+_ROUND = 8.0  # s of different frames where there is an IMU
 
 
 def main() -> int:
@@ -31,10 +32,15 @@ def main() -> int:
     parser.add_argument("--outliers", type=number(0.0, 0.9), default=0.3, help="share of them")
     parser.add_argument("--cameras", type=integer(1), default=1, help="each with its own node")
     parser.add_argument(
+        "--imu", type=number(100.0), default=0.0, metavar="HZ", help="of an IMU beside each camera"
+    )
+    parser.add_argument(
         "--max-rate", action="store_true", help="instead: how fast frames are answered at most"
     )
     args = parser.parse_args()
-    frames = simulated(args.points, args.outliers, args.rate)
+    # Frames and readings start over together.
+    different = round(_ROUND * args.rate) if args.imu else 500
+    frames = simulated(args.points, args.outliers, args.rate, different, args.imu)
     print(f"{args.points} points, {args.outliers:.0%} outliers", flush=True)
     if args.max_rate:
         rate = fastest(frames, 60.0 * args.minutes)
@@ -56,7 +62,7 @@ def _report(index: int, result: Result) -> bool:
     print(
         f"camera {index}: {result.frames} frames, {result.answered} answered, "
         f"{result.replaced} replaced ({replaced:.3%}), {result.refused} refused, "
-        f"{result.lost} lost\n"
+        f"{result.lost} lost{f', {result.imu} with the IMU' if result.imu else ''}\n"
         f"  latency p50 {p50:.2f} ms, p99 {p99:.2f} ms, most {most:.1f} ms\n"
         f"  memory {after_a_minute:.1f} MB after a minute, {growth:+.1f} MB at the end; "
         f"CPU {result.cpu:.0%} of a core"

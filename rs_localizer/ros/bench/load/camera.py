@@ -11,12 +11,15 @@ import numpy as np
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 
-from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES
-from rs_localizer.ros.bench.load.frames import Frames
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, IMU
+from rs_localizer.ros.bench.load.frames import READOUT_TIME, Frames
 
 _DISCOVERY_TIMEOUT = 60.0  # s
+# From the last row to the correspondences, as long as a driver and a detector take, in s. An IMU
+# tells of a row at once.
+_PROCESSING = 0.015
 
 
 class Camera:
@@ -30,6 +33,8 @@ class Camera:
         self._clouds = node.create_publisher(
             PointCloud2, f"{namespace}/{CORRESPONDENCES}", qos_profile_sensor_data
         )
+
+        self._imus = node.create_publisher(Imu, f"{namespace}/{IMU}", qos_profile_sensor_data)
 
     def wait(self) -> None:
         """Until somebody listens."""
@@ -48,14 +53,28 @@ class Camera:
         self._clouds.publish(cloud)
         return now
 
+    def send_imu(self, index: int) -> None:
+        """Publish a reading."""
+        self._imus.publish(self._frames.imu(index))
+
 
 def publish(camera: Camera, frames: Frames, sent: Any) -> None:
     """Publish at the rate of the frames, and write down when: time.monotonic() of each."""
     start = time.monotonic()
+    reading = 0
     for index in range(len(sent)):
-        while (left := start + index / frames.rate - time.monotonic()) > 0.0:
-            time.sleep(left)
+        due = index / frames.rate + READOUT_TIME + _PROCESSING
+        while frames.imus and reading / frames.imu_rate <= due:
+            _sleep_until(start + reading / frames.imu_rate)
+            camera.send_imu(reading)
+            reading += 1
+        _sleep_until(start + due)
         sent[index] = camera.send(index)
+
+
+def _sleep_until(when: float) -> None:
+    while (left := when - time.monotonic()) > 0.0:
+        time.sleep(left)
 
 
 def main(namespace: str, frames_file: str, sent_file: str) -> None:

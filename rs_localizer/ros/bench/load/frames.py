@@ -13,12 +13,14 @@ from rclpy.serialization import serialize_message
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
+from rs_localizer.io.recording import CAMERA_FRAME, CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.imu import ImuSettings, Lever, simulate_imu
+from rs_localizer.lab.simulation.imu_recording import make_imu
 from rs_localizer.lab.simulation.recording import write_simulated
 from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.lab.simulation.true_motion import RecordedMotion, TrueMotion, sampled_way
 from rs_localizer.ros.node.conversion import copy_message
 
 READOUT_TIME = 0.02
@@ -40,6 +42,12 @@ class Frames:
     rate: float  # Hz
     camera_info: bytes
     clouds: list[bytearray]
+    imus: list[bytearray]  # readings of the same time; may be empty
+
+    @property
+    def imu_rate(self) -> float:
+        """Hz."""
+        return self.rate * len(self.imus) / len(self.clouds)
 
     def save(self, path: Path) -> None:
         """For another process, as an NPZ file."""
@@ -49,6 +57,7 @@ class Frames:
             camera_info=np.frombuffer(self.camera_info, np.uint8),
             clouds=np.frombuffer(b"".join(self.clouds), np.uint8),
             ends=np.cumsum([len(cloud) for cloud in self.clouds]),
+            imus=np.array([np.frombuffer(imu, np.uint8) for imu in self.imus]),
         )
 
     @classmethod
@@ -59,14 +68,17 @@ class Frames:
                 float(file["rate"]),
                 file["camera_info"].tobytes(),
                 [bytearray(cloud.tobytes()) for cloud in clouds],
+                [bytearray(imu.tobytes()) for imu in file["imus"]],
             )
 
     def cloud(self, index: int) -> bytes:
         """The cloud of the frame with this number; it never ends."""
-        cloud = self.clouds[index % len(self.clouds)]
-        seconds, nanoseconds = divmod(self.stamp_ns(index), 1_000_000_000)
-        cloud[_STAMP] = np.array([seconds, nanoseconds], "<u4").tobytes()
-        return bytes(cloud)
+        return _stamped(self.clouds[index % len(self.clouds)], self.stamp_ns(index))
+
+    def imu(self, index: int) -> bytes:
+        """The reading with this number, by the clock of the frames."""
+        stamp_ns = _FIRST_NS + round(index * 1e9 / self.imu_rate)
+        return _stamped(self.imus[index % len(self.imus)], stamp_ns)
 
     def stamp_ns(self, index: int) -> int:
         return _FIRST_NS + round(index * 1e9 / self.rate)
@@ -77,8 +89,17 @@ class Frames:
         return round((seconds * 1_000_000_000 + nanoseconds - _FIRST_NS) * 1e-9 * self.rate)
 
 
-def simulated(points: int, outliers: float, rate: float, different: int = _DIFFERENT) -> Frames:
-    """Frames of a camera that is moved by hand through a room, so many before it starts over."""
+def simulated(
+    points: int,
+    outliers: float,
+    rate: float,
+    different: int = _DIFFERENT,
+    imu_rate: float = 0.0,
+) -> Frames:
+    """Frames of a camera that is moved by hand through a room, so many before it starts over.
+
+    With a rate (Hz) of its own there is an IMU, too, in the axes of the camera.
+    """
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     camera = Camera(640, 480, _K, _D, readout_time=READOUT_TIME)
     world = room(sampled_way(motion).positions, np.random.default_rng(0), count=20_000)
@@ -97,4 +118,25 @@ def simulated(points: int, outliers: float, rate: float, different: int = _DIFFE
             for topic, _, message in recording.messages(topics):
                 serialized = serialize_message(copy_message(message, message.__msgtype__))
                 (infos if topic == CAMERA_INFO_TOPIC else clouds).append(bytearray(serialized))
-    return Frames(rate, bytes(infos[0]), clouds)
+    imus = _readings(motion, start, round(different / rate * imu_rate), imu_rate)
+    return Frames(rate, bytes(infos[0]), clouds, imus)
+
+
+def _readings(motion: TrueMotion, start_ns: int, count: int, rate: float) -> list[bytearray]:
+    if count == 0:
+        return []
+    settings = ImuSettings(rate=rate)
+    track = simulate_imu(motion, settings, Lever(np.eye(3), np.zeros(3)), np.random.default_rng(0))
+    first = int(np.searchsorted(track.times_ns, start_ns))
+    found = []
+    for i in range(first, first + count):
+        message = make_imu(
+            0, track.angular_velocities[i], track.specific_forces[i], settings, CAMERA_FRAME
+        )
+        found.append(bytearray(serialize_message(copy_message(message, message.__msgtype__))))
+    return found
+
+
+def _stamped(message: bytearray, stamp_ns: int) -> bytes:
+    message[_STAMP] = np.array(divmod(stamp_ns, 1_000_000_000), "<u4").tobytes()
+    return bytes(message)

@@ -52,6 +52,7 @@ class Result:
     latencies: Array  # s, of the answered frames, from publishing to the pose's arrival
     memory: Array  # MB, once a second: the node's resident set
     cpu: float  # of one core, on the average: the node's
+    imu: str = ""  # share of the last frames that were localized with the IMU
 
     @property
     def lost(self) -> int:
@@ -66,6 +67,7 @@ class Ear:
         self.arrived = np.full(count, np.nan)
         self.answered = 0
         self.counts = {"Frames received": 0, "Frames replaced": 0, "Frames refused": 0}
+        self.imu = ""
         self._frames = frames
         self._name = f"{namespace.lstrip('/')}/{NODE_NAME}: localizer"
         prefix = f"{namespace}/{NODE_NAME}"
@@ -101,6 +103,7 @@ class Ear:
             if status.name == self._name:
                 values = {item.key: item.value for item in status.values}
                 self.counts = {key: int(values[key]) for key in self.counts}
+                self.imu = values.get("IMU used (share of the last frames)", "")
 
 
 @contextlib.contextmanager
@@ -166,6 +169,7 @@ def steady(frames: Frames, cameras: int, count: int) -> list[Result]:
                 latencies=(ear.arrived - sent)[np.isfinite(ear.arrived)],
                 memory=of_node,
                 cpu=float(cpu_time / spent[0]) if spent[0] > 0.0 else float("nan"),
+                imu=ear.imu,
             )
             for ear, sent, of_node, cpu_time in zip(
                 ears, sents, np.array(memory).T, spent[1:], strict=True

@@ -1,0 +1,255 @@
+"""Inertial readings by their stamps: whatever order they come in, those of an exposure.
+
+Bounded: it remembers some seconds, and never more than a fixed number of readings. Methods may be
+called from any thread.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+
+Vector = tuple[float, float, float]
+
+MEMORY_NS = 3_000_000_000
+"""For how long readings are remembered, before the newest."""
+MOST = 16_384
+"""How many readings are remembered."""
+# Readings that come so much behind the newest are no stragglers: the clock was set back.
+_SET_BACK_NS = 500_000_000
+# At a longer period than this, a shaking of 30 Hz turns by half a cycle between two readings.
+_LONGEST_PERIOD_NS = 16_000_000
+# Readings farther apart than so many periods are a gap: one that is missing can be told from its
+# neighbours, as far as a vibration goes that they can show, two cannot.
+_MOST_PERIODS = 2.5
+# A gyroscope that shows its greatest value so many times in a row, and at least this (rad/s; the
+# smallest range there is), shows the end of its range.
+_SATURATED_COUNT, _SATURATED_RATE = 4, 2.0
+# The rate is that of the last readings.
+_RATE_COUNT = 64
+
+
+class Lack(StrEnum):
+    """Why there are no readings of an exposure."""
+
+    NEVER = "never"  # none has come so far
+    NOT_YET = "not_yet"  # the newest is of before its end, and others may follow
+    STOPPED = "stopped"  # the newest is of long before its beginning
+    TOO_LATE = "too_late"  # the oldest that is remembered is of after its beginning
+    GAP = "gap"  # some have been lost
+    TOO_SLOW = "too_slow"  # they come at too low a rate
+    SATURATED = "saturated"  # the camera turns faster than the gyroscope can tell
+
+
+@dataclass(frozen=True, slots=True)
+class Lacking:
+    """No readings, with one sentence that says what was found; false in a condition."""
+
+    lack: Lack
+    detail: str
+
+    def __bool__(self) -> bool:
+        return False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """Readings without a gap, in the axes of the IMU."""
+
+    stamps_ns: IntArray  # (n,) by the IMU's clock, increasing
+    angular_velocities: Array  # (n,3) rad/s
+    specific_forces: Array | None  # (n,3) m/s^2; None: not all have one
+
+
+class ReadingBuffer:
+    """Takes readings as they come, and gives those of an interval."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        # The readings stand from _first to _last; at the end of the arrays they move to the front.
+        self._stamps = np.zeros(2 * MOST, np.int64)
+        # Rate, force (NaN: it has none), and the greatest rate of each axis so far: by the stamps,
+        # so that what came early or late in a recording makes no difference.
+        self._values = np.zeros((2 * MOST, 9))
+        self._first = self._last = 0
+        self.frame = ""  # of the readings' axes
+        self.repeated = 0  # readings with a stamp that was there already
+        self.jumps = 0  # times that the clock was set back
+
+    def __len__(self) -> int:
+        return self._last - self._first
+
+    def clear(self) -> None:
+        """Forget all readings."""
+        with self._lock:
+            self._first = self._last = 0
+
+    def add(
+        self,
+        stamp_ns: int,
+        frame: str,
+        angular_velocity: Vector,
+        specific_force: Vector | None = None,
+    ) -> bool:
+        """Take a reading; whether it went on in time, and the clock was not set back."""
+        with self._lock:
+            newest = int(self._stamps[self._last - 1]) if len(self) else stamp_ns
+            set_back = stamp_ns < newest - _SET_BACK_NS
+            if set_back or frame != self.frame:
+                self._first = self._last = 0
+                self.frame = frame
+                self.jumps += set_back
+            place = self._insert(stamp_ns)
+            if place is None:
+                self.repeated += 1
+                return not set_back
+            row = self._values[place]
+            row[:3] = angular_velocity
+            row[3:6] = np.nan if specific_force is None else specific_force
+            row[6:] = np.abs(row[:3])
+            if place > self._first:
+                np.maximum(row[6:], self._values[place - 1, 6:], out=row[6:])
+            return not set_back
+
+    def _insert(self, stamp_ns: int) -> int | None:
+        """Make room for a reading: its row; None where its stamp is there already."""
+        if self._last == len(self._stamps):
+            self._compact()
+        place = self._last
+        if len(self) and stamp_ns <= self._stamps[place - 1]:  # mostly it is the newest
+            known = self._stamps[self._first : self._last]
+            place = self._first + int(known.searchsorted(stamp_ns))
+            if self._stamps[place] == stamp_ns:
+                return None
+            for array in (self._stamps, self._values):
+                array[place + 1 : self._last + 1] = array[place : self._last].copy()
+        self._stamps[place] = stamp_ns
+        self._last += 1
+        return place
+
+    def _compact(self) -> None:
+        first = max(self._oldest(), self._last - MOST)
+        count = self._last - first
+        for array in (self._stamps, self._values):
+            array[:count] = array[first : self._last].copy()
+        self._first, self._last = 0, count
+
+    def _oldest(self) -> int:
+        """The row of the first reading that is remembered."""
+        stamps = self._stamps[self._first : self._last]
+        return self._first + int(np.searchsorted(stamps, stamps[-1] - MEMORY_NS))
+
+    def lag(self, stamp_ns: int) -> int:
+        """By how many ns the newest reading is older than this moment; without one, its stamp."""
+        with self._lock:
+            return stamp_ns - (int(self._stamps[self._last - 1]) if len(self) else 0)
+
+    def rate(self) -> float:
+        """Readings per second, by the median of the last steps; NaN for less than two."""
+        with self._lock:
+            stamps = self._stamps[self._first : self._last].copy()
+        return 1e9 / _period(stamps) if len(stamps) > 1 else float("nan")
+
+    def between(
+        self, start_ns: int, end_ns: int, since_ns: int | None = None, until_ns: int | None = None
+    ) -> Readings | Lacking:
+        """The readings that cover an interval, and those around it.
+
+        Args:
+            start_ns, end_ns: of the IMU's clock; from the last reading before to the first after
+                it, none may be missing.
+            since_ns, until_ns: as far as these go on without a gap.
+        """
+        since_ns = start_ns if since_ns is None else min(since_ns, start_ns)
+        until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
+        with self._lock:
+            if not len(self):
+                return Lacking(Lack.NEVER, "no message has come")
+            self._first = self._oldest()
+            known = self._stamps[self._first : self._last]
+            if (outside := _outside(known, start_ns, end_ns)) is not None:
+                return outside
+            begin = max(int(known.searchsorted(since_ns, "right")) - 1, 0)
+            end = int(known.searchsorted(until_ns)) + 1
+            stamps = known[begin:end].copy()
+            values = self._values[self._first + begin : self._first + end].copy()
+        first = int(stamps.searchsorted(start_ns, "right")) - 1
+        last = int(stamps.searchsorted(end_ns)) + 1
+        steps = stamps[1:] - stamps[:-1]
+        period = float(np.median(steps)) if len(steps) else 0.0
+        if period > _LONGEST_PERIOD_NS:
+            return Lacking(
+                Lack.TOO_SLOW,
+                f"a reading comes every {_span(period)}; at most {_span(_LONGEST_PERIOD_NS)} tell "
+                "how a camera shakes",
+            )
+        stops = np.flatnonzero(steps > _MOST_PERIODS * period) + 1
+        if ((stops > first) & (stops < last)).any():
+            step = _span(float(steps[first : last - 1].max()))
+            return Lacking(Lack.GAP, f"for {step} within the exposure there is no reading")
+        greatest = values[-1, 6:]
+        if greatest.max() >= _SATURATED_RATE:
+            ends = _at_the_end_of_the_range(values[:, :3], greatest)
+            if np.any(ends[first:last]):
+                most = float(np.abs(values[first:last, :3]).max())
+                return Lacking(
+                    Lack.SATURATED,
+                    f"the gyroscope shows {most:.2f} rad/s and no more: the end of its range",
+                )
+            # Cut on both sides of what it could not tell.
+            stops = np.concatenate([stops, np.flatnonzero(ends), np.flatnonzero(ends) + 1])
+        begin = max(stops[stops <= first].tolist(), default=0)
+        end = min(stops[stops >= last].tolist(), default=len(stamps))
+        forces = values[begin:end, 3:6]
+        return Readings(
+            stamps[begin:end],
+            values[begin:end, :3],
+            None if np.isnan(forces).any() else forces,
+        )
+
+
+def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:
+    oldest, newest = int(stamps[0]), int(stamps[-1])
+    if start_ns < oldest:
+        return Lacking(
+            Lack.TOO_LATE,
+            f"the first reading is {_span(oldest - start_ns)} younger than the first row (did it "
+            "begin later, or has it another clock?)",
+        )
+    if newest < start_ns - _SET_BACK_NS:
+        return Lacking(
+            Lack.STOPPED,
+            f"the last reading is {_span(start_ns - newest)} older than the first row (has it "
+            "stopped, or has it another clock?)",
+        )
+    if newest < end_ns:
+        return Lacking(
+            Lack.NOT_YET, f"the last reading is {_span(end_ns - newest)} older than the last row"
+        )
+    return None
+
+
+def _period(stamps: IntArray) -> float:
+    """Median step in ns of the last readings (2 or more)."""
+    return float(np.median(np.diff(stamps[-_RATE_COUNT:]))) if len(stamps) > 1 else 0.0
+
+
+def _at_the_end_of_the_range(rates: Array, greatest: Array) -> BoolArray:
+    """Which of the readings (n,3) show the greatest value so far, several times in a row."""
+    found = np.zeros(len(rates), np.bool_)
+    for axis in np.flatnonzero(greatest >= _SATURATED_RATE):
+        same = np.abs(rates[:, axis]) == greatest[axis]
+        if same.sum() >= _SATURATED_COUNT:
+            row = np.ones(_SATURATED_COUNT)
+            begins = np.convolve(same, row, "valid") >= _SATURATED_COUNT
+            found |= np.convolve(begins, row) > 0.0
+    return found
+
+
+def _span(nanoseconds: float) -> str:
+    return f"{1e-6 * nanoseconds:.1f} ms" if nanoseconds < 1e9 else f"{1e-9 * nanoseconds:.1f} s"

@@ -1,0 +1,248 @@
+"""What the frames get of an IMU: the readings of their exposure, in the camera's axes.
+
+Node and replay share it. Readings may be added from any thread; all else belongs to the one that
+localizes. What a frame gets depends on stamps alone, not on when a reading came, so that a
+recording gives the same poses live and offline.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rs_localizer.config import ImuUse, NodeConfig
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.inertial.buffer import Lack, Lacking, ReadingBuffer
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.status import Alone, InertialStatus
+from rs_localizer.io.imu import ImuReading
+from rs_localizer.io.transforms.rigid import TransformError, Transforms
+from rs_localizer.pipeline.imu_axes import in_camera_axes
+from rs_localizer.pipeline.reasons import IMU_REASONS, ImuReason
+from rs_localizer.tracking import Tracker
+
+# Beside the exposure: the spline through the readings wants neighbours, and the tracker those since
+# the last frame.
+_AROUND_NS, _BEFORE_NS = 10_000_000, 600_000_000
+# Drivers send readings in bundles: those of so much time (s) may come at once.
+_BUNDLE = 0.05
+# Frames over which the share is told, and in a row before the log is told: at the beginning some
+# are without, and now and then a message is lost.
+_MANY, _LONG = 100, 5
+
+_OF_LACK = {
+    Lack.NEVER: ImuReason.NEVER,
+    Lack.NOT_YET: ImuReason.LATE,
+    Lack.STOPPED: ImuReason.STOPPED,
+    Lack.TOO_LATE: ImuReason.BEGINS_LATER,
+    Lack.GAP: ImuReason.GAP,
+    Lack.TOO_SLOW: ImuReason.TOO_SLOW,
+    Lack.SATURATED: ImuReason.SATURATED,
+}
+_OF_ALONE = {
+    Alone.NO_SAMPLES: ImuReason.LATE,
+    Alone.NOT_COVERED: ImuReason.LATE,
+    Alone.DOUBTED: ImuReason.DOUBTED,
+    Alone.DISAGREES: ImuReason.DISAGREES,
+    Alone.TURNED: ImuReason.TURNED,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Unused:
+    """Why a frame was localized by the camera alone."""
+
+    reason: ImuReason
+    detail: str = ""  # what was found
+
+    def __str__(self) -> str:
+        means = IMU_REASONS[self.reason].means
+        return f"{means}: {self.detail}" if self.detail else means
+
+
+@dataclass(frozen=True, slots=True)
+class ImuState:
+    """How it stands with the IMU, for people."""
+
+    frames: int  # since its first reading
+    used: int  # of them
+    share: float  # of the last of them
+    unused: Unused | None  # of the last frame; None: it was used
+    reasons: dict[str, int]  # of the others, how many for which
+    rate: float  # Hz; NaN: unknown
+    time_offset: float  # s to be added to its stamps, in all; NaN: unknown
+    status: InertialStatus | None  # what the frames say of the gyroscope
+
+
+class ImuInput:
+    """Takes readings, tracks frames with theirs, and counts how many could use them.
+
+    Args:
+        notice: told, by the reason and one sentence, when the camera has to go on alone for some
+            frames in a row.
+    """
+
+    def __init__(self, notice: Callable[[str, str], None]) -> None:
+        self._notice = notice
+        self._buffer = ReadingBuffer()
+        self._recently: deque[bool] = deque(maxlen=_MANY)
+        self._frames = self._used = 0
+        self._unused: Unused | None = None
+        self._reasons: Counter[str] = Counter()
+        self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
+        self._told: ImuReason | None = None
+        self._status: InertialStatus | None = None
+        self._given_offset = 0.0
+
+    def add(self, reading: ImuReading) -> None:
+        """Take a reading."""
+        self._buffer.add(
+            reading.stamp_ns, reading.frame, reading.angular_velocity, reading.linear_acceleration
+        )
+
+    @property
+    def frame(self) -> str:
+        """Of the readings' axes; empty as long as none has come."""
+        return self._buffer.frame
+
+    @property
+    def state(self) -> ImuState | None:
+        """For the diagnostics; None as long as no frame has met an IMU."""
+        recently = tuple(self._recently)
+        if not recently:
+            return None
+        left = math.nan if self._status is None else self._status.time_offset
+        return ImuState(
+            self._frames,
+            self._used,
+            sum(recently) / len(recently),
+            self._unused,
+            dict(self._reasons),
+            self._buffer.rate(),
+            self._given_offset + left,
+            self._status,
+        )
+
+    def awaits(self, tracker: Tracker, config: NodeConfig, time_ns: int, patience: float) -> bool:
+        """Whether readings of this exposure are missing that may come within so many seconds."""
+        if not self._wanted(config):
+            return False
+        _, end_ns = _exposure(config, time_ns, tracker)
+        missing_ns = self._buffer.lag(end_ns + _AROUND_NS)
+        return 0 < missing_ns <= round((patience + _BUNDLE) * 1e9)
+
+    def track(
+        self,
+        tracker: Tracker,
+        config: NodeConfig,
+        time_ns: int,
+        camera_frame: str,
+        transforms: Transforms,
+        given: tuple[ArrayLike, ArrayLike, ArrayLike | None],
+    ) -> Estimate | Failure:
+        """Localize the frame whose middle row was exposed at ``time_ns``, with its readings.
+
+        Args:
+            tracker: localizes.
+            config: the settings.
+            time_ns: by the camera's clock.
+            camera_frame: the camera's axes.
+            transforms: how the IMU is turned against them.
+            given: points, pixels and scores, as :meth:`Tracker.localize` takes them.
+        """
+        if not self._wanted(config):
+            return tracker.localize(time_ns, *given)
+        found = self._samples(tracker, config, time_ns, camera_frame, transforms)
+        if isinstance(found, Unused):
+            result = tracker.localize(time_ns, *given)
+            self._count(config, tracker, found)
+        else:
+            result = tracker.localize(time_ns, *given, imu=found)
+            self._count(config, tracker, _why(tracker.inertial))
+        return result
+
+    def without_tracker(self, config: NodeConfig) -> None:
+        """Count a frame that is localized by itself."""
+        if self._wanted(config):
+            unknown = config.readout_time == 0.0
+            reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
+            self._count(config, None, Unused(reason))
+
+    def _wanted(self, config: NodeConfig) -> bool:
+        return config.imu.use != ImuUse.NONE and self.frame != ""
+
+    def _samples(
+        self,
+        tracker: Tracker,
+        config: NodeConfig,
+        time_ns: int,
+        camera_frame: str,
+        transforms: Transforms,
+    ) -> ImuSamples | Unused:
+        start_ns, end_ns = _exposure(config, time_ns, tracker)
+        found = self._buffer.between(start_ns, end_ns, start_ns - _BEFORE_NS, end_ns + _AROUND_NS)
+        if isinstance(found, Lacking):
+            return Unused(_OF_LACK[found.lack], found.detail)
+        half_ns = round(0.5e9 * config.readout_time)
+        times_ns = found.stamps_ns + round(1e9 * config.imu.time_offset)
+        frames, rows_ns = (camera_frame, self.frame), (time_ns - half_ns, time_ns + half_ns)
+        try:
+            return in_camera_axes(found, times_ns, transforms, frames, rows_ns, _AROUND_NS)
+        except TransformError as error:
+            text = f"from the IMU {self.frame!r} to the camera {camera_frame!r}: {error}"
+            return Unused(ImuReason.NO_TRANSFORM, text)
+
+    def _count(self, config: NodeConfig, tracker: Tracker | None, unused: Unused | None) -> None:
+        self._frames += 1
+        self._used += unused is None
+        self._recently.append(unused is None)
+        self._unused = unused
+        self._status = None if tracker is None else tracker.inertial
+        self._given_offset = config.imu.time_offset
+        if unused is None:
+            self._in_a_row.clear()
+            self._told = None
+            return
+        self._reasons[unused.reason] += 1
+        self._in_a_row.append(unused.reason)
+        if self._in_a_row.count(unused.reason) == _LONG and self._told != unused.reason:
+            self._told = unused.reason
+            self._notice(unused.reason.value, f"the IMU is not used: {unused}")
+
+
+def inertial_settings(config: NodeConfig) -> InertialSettings | None:
+    """What the tracker is told of the IMU; None: there is none to be used."""
+    if config.imu.use == ImuUse.NONE:
+        return None
+    return InertialSettings(
+        gyroscope_noise=config.imu.gyroscope_noise,
+        gyroscope_bias_walk=config.imu.gyroscope_bias_walk,
+        estimate_time_offset=config.imu.estimate_time_offset,
+        gravity_in_map=np.array(config.gravity_in_map, float) if config.imu.gravity else None,
+    )
+
+
+def _exposure(config: NodeConfig, time_ns: int, tracker: Tracker) -> tuple[int, int]:
+    """First and last row by the clock of the IMU, as far as that is known."""
+    status = tracker.inertial
+    left = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset
+    middle_ns = time_ns - round(1e9 * (config.imu.time_offset + left))
+    half_ns = round(0.5e9 * config.readout_time)
+    return middle_ns - half_ns, middle_ns + half_ns
+
+
+def _why(status: InertialStatus | None) -> Unused | None:
+    """Why the tracker went without the samples that it had; None: it did not."""
+    if status is None:
+        return Unused(ImuReason.NOT_TRACKING)
+    if status.used:
+        return None
+    angle = math.degrees(status.extrinsic_angle)
+    detail = f"by {angle:.0f} degrees" if status.alone == Alone.TURNED else ""
+    return Unused(_OF_ALONE[status.alone], detail)

@@ -1,0 +1,147 @@
+"""simulate --imu, and replay with it: what is recorded, which topic is found, what is said."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagError, BagWriter, open_bag
+from rs_localizer.io.estimates import read_motions
+from rs_localizer.io.imu import read_imu
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.recording import write_frame
+from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.lab.simulation.imu import ImuSettings
+from rs_localizer.lab.simulation.imu_recording import make_imu
+from rs_localizer.offline.replay import find_topics
+
+CAMERA = Camera(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
+TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "0.2", "0", "0")
+CLEAN = (
+    "--gyroscope-noise", "0", "--gyroscope-bias", "0", "--gyroscope-bias-walk", "0",
+    "--accelerometer-noise", "0", "--accelerometer-bias", "0",
+)  # fmt: skip
+
+
+def simulate(out: Path, *words: str) -> int:
+    return main(["simulate", str(out), "--duration", "1", "--points", "60", *words])
+
+
+def test_a_recording_holds_readings_and_where_they_were_taken(tmp_path: Path) -> None:
+    assert simulate(tmp_path / "bag", *TURN, "--imu", *CLEAN, "--imu-offset", "0.004") == 0
+    with open_bag(tmp_path / "bag") as bag:
+        assert bag.topics["/imu"] == "sensor_msgs/msg/Imu"
+        messages = list(bag.messages(["/imu", "/correspondences", "/camera_info"]))
+        tree = TransformTree()
+        for _, _, message in bag.messages(["/tf_static"]):
+            tree.add(message, static=True)
+    counts = Counter(topic for topic, _, _ in messages)
+    assert counts["/correspondences"] == counts["/camera_info"] == 30
+    assert counts["/imu"] >= 400
+    mounting = tree.lookup("camera_optical_frame", "imu_link", None)
+    np.testing.assert_allclose(mounting.translation, [0.03, -0.02, -0.01])
+    for topic, recorded_ns, message in messages:
+        delay = 1e-9 * (recorded_ns - stamp_ns(message))
+        if topic != "/imu":  # comes when its last row has been read
+            assert delay == pytest.approx(0.03)
+            continue
+        assert delay == pytest.approx(0.004)  # and the clock of the IMU is slow
+        reading = read_imu(message)
+        turn = mounting.rotation @ np.array(reading.angular_velocity)
+        np.testing.assert_allclose(turn, [0.5, -1.0, 2.0], atol=1e-9)
+        assert 9.0 < np.linalg.norm(reading.linear_acceleration or 0.0) < 10.6
+        assert reading.gyroscope_deviation is None
+    stamps = [recorded_ns for _, recorded_ns, _ in messages]
+    assert stamps == sorted(stamps)
+
+
+def test_an_imu_changes_nothing_else(tmp_path: Path) -> None:
+    clouds = []
+    for name, words in (("without", ()), ("with", ("--imu",))):
+        assert simulate(tmp_path / name, *TURN, *words) == 0
+        with open_bag(tmp_path / name) as bag:
+            clouds.append([bytes(m.data) for _, _, m in bag.messages(["/correspondences"])])
+    assert clouds[0] == clouds[1]
+
+
+def test_a_vibration_is_in_the_truth(tmp_path: Path) -> None:
+    angular = []
+    for name, words in (("still", ()), ("shaken", ("--vibration", "0.3", "60"))):
+        assert simulate(tmp_path / name, *TURN, *words) == 0
+        twists = read_motions(tmp_path / name, "/truth/pose", "/truth/twist").twists
+        assert twists is not None
+        angular.append(twists.angular)
+    shaking = np.linalg.norm(angular[1] - angular[0], axis=1)
+    most = np.radians(0.3) * 2.0 * np.pi * 60.0
+    assert 0.8 * most < shaking.max() <= 1.02 * most
+
+
+def test_options_of_the_imu_need_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert simulate(tmp_path / "bag", "--imu-rate", "100") == 2
+    assert "options of the IMU need --imu" in capsys.readouterr().err
+
+
+def test_replay_uses_it_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert simulate(tmp_path / "bag", *TURN, "--imu") == 0
+    replay = ["replay", str(tmp_path / "bag"), "-p", "readout_time:=0.03"]
+    capsys.readouterr()
+    poses = []
+    for name, words in (("both", []), ("alone", ["--no-imu"]), ("off", ["-p", "imu.use:=none"])):
+        assert main([*replay, "--out", str(tmp_path / name), *words]) == 0
+        said = capsys.readouterr().out
+        assert ("localized with the IMU" in said) == (name == "both")
+        if name == "both":
+            assert re.search(r"localized with the IMU +(9\d\.\d|100\.0)%", said)
+            assert re.search(r"time offset of the IMU \(ms\) +-?\d+\.\d\d", said)
+        poses.append((tmp_path / name / "poses.txt").read_bytes())
+    assert poses[0] != poses[1]
+    assert poses[1] == poses[2]
+    assert main([*replay, "--out", str(tmp_path / "n"), "--imu", "/nowhere"]) == 1
+    assert "topic /nowhere does not exist" in capsys.readouterr().err
+    assert main([*replay, "--out", str(tmp_path / "n"), "--imu", "/imu", "--no-imu"]) == 2
+
+
+def test_without_a_transform_the_reason_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert simulate(tmp_path / "bag", *TURN, "--imu") == 0
+    with open_bag(tmp_path / "bag") as bag, BagWriter(tmp_path / "cut") as writer:
+        topics = [topic for topic in bag.topics if topic != "/tf_static"]
+        for topic, recorded_ns, message in bag.messages(topics):
+            writer.write(topic, message, recorded_ns)
+    out = tmp_path / "out"
+    words = ["replay", str(tmp_path / "cut"), "-p", "readout_time:=0.03", "--out", str(out)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"localized with the IMU +0\.0%", said)
+    assert re.search(r"without: imu_no_transform +30", said)
+    assert "imu_no_transform: TF does not say how the IMU is turned against the camera" in said
+
+
+def test_the_topic_is_found_by_its_type(tmp_path: Path) -> None:
+    """Named so, else the only one: several that could be meant are none."""
+    settings = ImuSettings()
+    for names, expected in (
+        (("/camera/imu",), "/camera/imu"),
+        (("/mavros/data_raw",), "/mavros/data_raw"),
+        (("/mavros/data", "/mavros/data_raw"), None),
+        (("/mavros/data", "/front/imu"), "/front/imu"),
+        (("/rear/imu", "/front/imu"), None),
+    ):
+        path = tmp_path / "_".join(names).replace("/", "")
+        with BagWriter(path) as writer:
+            for name in names:
+                writer.write(name, make_imu(1, np.zeros(3), np.ones(3), settings), 1)
+            write_frame(writer, CAMERA, 1, np.zeros((1, 3)), np.zeros((1, 2)), np.zeros(1, int))
+        with open_bag(path) as bag:
+            assert find_topics(bag).of.get("imu") == expected
+            assert find_topics(bag, {"imu": names[-1]}).of["imu"] == names[-1]
+            assert "imu" not in find_topics(bag).without("imu").of
+            with pytest.raises(BagError, match="does not exist; topics of type sensor_msgs/msg/Im"):
+                find_topics(bag, {"imu": "/other"})

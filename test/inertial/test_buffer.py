@@ -1,0 +1,201 @@
+"""Readings in any order, repeated, lost, from a clock that jumps: an exposure gets its own."""
+
+from __future__ import annotations
+
+import random
+import threading
+
+import numpy as np
+import pytest
+
+from rs_localizer.inertial.buffer import MEMORY_NS, MOST, Lack, Lacking, ReadingBuffer, Readings
+
+MS = 1_000_000
+START = 1_700_000_000 * 10**9
+PERIOD = 2_500_000  # 400 Hz
+
+
+def stamps(count: int, period: int = PERIOD, start: int = START) -> list[int]:
+    return [start + i * period for i in range(count)]
+
+
+def filled(times: list[int]) -> ReadingBuffer:
+    """Each reading says when it was taken, in s since the start."""
+    buffer = ReadingBuffer()
+    for time in times:
+        seconds = (time - START) * 1e-9
+        buffer.add(time, "imu", (seconds, 0.0, -seconds), (0.0, seconds, 9.8))
+    return buffer
+
+
+def lack(found: Readings | Lacking) -> Lack:
+    assert isinstance(found, Lacking)
+    assert not found
+    return found.lack
+
+
+def test_an_exposure_gets_its_readings_and_one_on_either_side() -> None:
+    buffer = filled(stamps(400))
+    start, end = START + 501 * MS, START + 531 * MS
+    found = buffer.between(start, end)
+    assert isinstance(found, Readings)
+    assert found.stamps_ns[0] <= start < found.stamps_ns[1]
+    assert found.stamps_ns[-2] < end <= found.stamps_ns[-1]
+    assert np.diff(found.stamps_ns).tolist() == [PERIOD] * (len(found.stamps_ns) - 1)
+    seconds = (found.stamps_ns - START) * 1e-9
+    np.testing.assert_allclose(found.angular_velocities[:, 0], seconds)
+    assert found.specific_forces is not None
+    np.testing.assert_allclose(found.specific_forces[:, 1], seconds)
+    # Ends that are stamps themselves need no more.
+    exact = buffer.between(START + 500 * MS, START + 530 * MS)
+    assert isinstance(exact, Readings)
+    assert exact.stamps_ns[[0, -1]].tolist() == [START + 500 * MS, START + 530 * MS]
+    assert buffer.rate() == pytest.approx(400.0)
+
+
+def test_what_lies_around_it_comes_as_far_as_there_is_no_gap() -> None:
+    lost = range(START + 300 * MS, START + 330 * MS)
+    buffer = filled([t for t in stamps(400) if t not in lost])
+    start, end = START + 501 * MS, START + 531 * MS
+    for since, first in ((400, 400.0), (100, 330.0)):
+        found = buffer.between(start, end, START + since * MS, START + 541 * MS)
+        assert isinstance(found, Readings)
+        assert (found.stamps_ns[0] - START) / MS == first
+        assert (found.stamps_ns[-1] - START) / MS == 542.5
+    # What is not there yet is not waited for.
+    late = buffer.between(START + 960 * MS, START + 990 * MS, None, START + 2000 * MS)
+    assert isinstance(late, Readings)
+    assert (late.stamps_ns[-1] - START) / MS == 997.5
+
+
+def test_order_and_repetition_do_not_matter() -> None:
+    times = stamps(400)
+    mixed = [*times, *random.Random(0).sample(times, 50)]
+    # Stragglers by up to 0.1 s.
+    mixed = [t for _, t in sorted((t + random.Random(t).uniform(0, 1e8), t) for t in mixed)]
+    buffer, ordered = filled(mixed), filled(times)
+    assert (buffer.repeated, buffer.jumps, len(buffer)) == (50, 0, len(times))
+    pair = [b.between(START + 401 * MS, START + 433 * MS) for b in (buffer, ordered)]
+    assert isinstance(pair[0], Readings)
+    assert isinstance(pair[1], Readings)
+    assert pair[0].stamps_ns.tolist() == pair[1].stamps_ns.tolist()
+    assert pair[0].angular_velocities.tolist() == pair[1].angular_velocities.tolist()
+
+
+def test_what_is_missing_is_told() -> None:
+    assert lack(ReadingBuffer().between(START, START + 30 * MS)) == Lack.NEVER
+    buffer = filled(stamps(400))  # until 997.5 ms
+    not_yet = buffer.between(START + 980 * MS, START + 1010 * MS)
+    assert lack(not_yet) == Lack.NOT_YET
+    assert "12.5 ms older than the last row" in str(not_yet)
+    stopped = buffer.between(START + 3 * 10**9, START + 3030 * MS)
+    assert lack(stopped) == Lack.STOPPED
+    assert "2.0 s older than the first row" in str(stopped)
+    assert lack(buffer.between(START - 1, START + 30 * MS)) == Lack.TOO_LATE
+    with_gap = filled([t for t in stamps(400) if not 500 * MS < t - START < 520 * MS])
+    gap = with_gap.between(START + 490 * MS, START + 525 * MS)
+    assert lack(gap) == Lack.GAP
+    assert "for 20.0 ms within" in str(gap)
+    assert with_gap.between(START + 530 * MS, START + 560 * MS)
+    # One that is lost can be told from its neighbours, two cannot.
+    for lost, expected in ((1, None), (2, Lack.GAP)):
+        some = filled([t for t in stamps(400) if not 0 < t - START - 500 * MS <= lost * PERIOD])
+        found = some.between(START + 490 * MS, START + 525 * MS)
+        assert (found.lack if isinstance(found, Lacking) else None) == expected
+    slow = filled(stamps(50, 20 * MS))
+    assert lack(slow.between(START + 100 * MS, START + 130 * MS)) == Lack.TOO_SLOW
+    assert filled(stamps(100, 10 * MS)).between(START + 100 * MS, START + 130 * MS)
+
+
+def test_a_clock_that_is_set_back_starts_over() -> None:
+    buffer = filled(stamps(400))
+    assert not buffer.add(START - 5 * 10**9, "imu", (0.0, 0.0, 0.0))
+    assert (buffer.jumps, len(buffer)) == (1, 1)
+    for time in stamps(100, start=START - 5 * 10**9 + PERIOD):
+        assert buffer.add(time, "imu", (0.0, 0.0, 0.0))
+    assert buffer.between(START - 4900 * MS, START - 4870 * MS)
+    assert lack(buffer.between(START + 500 * MS, START + 530 * MS)) == Lack.STOPPED
+
+
+@pytest.mark.parametrize("wrong", [START + 10**15, START - 10**15, 0])
+def test_one_wrong_stamp_costs_little(wrong: int) -> None:
+    times = stamps(400)
+    buffer = filled([*times[:200], wrong, *times[200:]])
+    assert buffer.between(times[250], times[262])
+
+
+def test_another_frame_starts_over() -> None:
+    buffer = filled(stamps(400))
+    buffer.add(START + 1000 * MS, "other", (0.0, 0.0, 0.0))
+    assert lack(buffer.between(START + 500 * MS, START + 530 * MS)) == Lack.TOO_LATE
+
+
+def test_one_reading_without_force_leaves_the_turn() -> None:
+    buffer = filled(stamps(100))
+    buffer.add(START + 100 * PERIOD, "imu", (0.0, 0.0, 0.0))
+    found = buffer.between(START + 95 * PERIOD, START + 100 * PERIOD)
+    assert isinstance(found, Readings)
+    assert found.specific_forces is None
+
+
+def test_the_end_of_the_range_is_noticed() -> None:
+    rng = np.random.default_rng(0)
+    turn = 6.0 * np.sin(2.0 * np.pi * 3.0 * np.arange(400) * 2.5e-3)
+    noisy = turn + 1e-3 * rng.normal(size=400)
+    for limit, expected in ((4.36, Lack.SATURATED), (100.0, None)):
+        buffer = ReadingBuffer()
+        for time, rate in zip(stamps(400), np.clip(noisy, -limit, limit).tolist(), strict=True):
+            buffer.add(time, "imu", (0.0, rate, 0.0))
+        # The peak of the sine lies at 1/12 s + k/3 s.
+        found = buffer.between(START + 735 * MS, START + 765 * MS)
+        assert (found.lack if isinstance(found, Lacking) else None) == expected
+        # While it turns through zero, the gyroscope tells the truth.
+        assert buffer.between(START + 650 * MS, START + 680 * MS)
+
+
+def test_rest_and_steady_turns_are_no_end_of_a_range() -> None:
+    for rate in (0.0, 1.5):
+        buffer = ReadingBuffer()
+        for time in stamps(100):
+            buffer.add(time, "imu", (rate, 0.0, 0.0))
+        assert buffer.between(START + 50 * MS, START + 80 * MS)
+
+
+def test_memory_is_bounded() -> None:
+    times = stamps(20_000)
+    buffer = filled(times)
+    found = buffer.between(times[-20], times[-10], times[0])
+    assert isinstance(found, Readings)
+    assert found.stamps_ns[0] == times[-1] - MEMORY_NS
+    # So many that a second holds more than can be remembered, also all behind the newest.
+    rush = ReadingBuffer()
+    for i in range(40_000):
+        rush.add(START + 10_000 * i, "imu", (0.0, 0.0, 0.0))
+        rush.add(START + 10_000 * i - 5_000, "imu", (0.0, 0.0, 0.0))
+    assert MOST <= len(rush) <= 2 * MOST
+    assert rush.between(START + 399_000_000, START + 399_500_000)
+
+
+def test_readings_come_while_others_are_asked_for() -> None:
+    buffer, found = ReadingBuffer(), []
+    done = threading.Event()
+
+    def feed() -> None:
+        for time in stamps(20_000):
+            buffer.add(time, "imu", ((time - START) * 1e-9, 0.0, 0.0))
+        done.set()
+
+    thread = threading.Thread(target=feed)
+    thread.start()
+    asked = START + 200 * MS
+    while not done.is_set():
+        if buffer.lag(asked) <= 0:
+            found.append(buffer.between(asked - 100 * MS, asked))
+            asked += 20 * MS
+    thread.join()
+    complete = [item for item in found if isinstance(item, Readings)]
+    assert len(complete) > 10
+    for item in complete:
+        assert np.all(np.diff(item.stamps_ns) == PERIOD)
+        seconds = (item.stamps_ns - START) * 1e-9
+        np.testing.assert_array_equal(item.angular_velocities[:, 0], seconds)

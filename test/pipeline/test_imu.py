@@ -1,0 +1,312 @@
+"""An IMU that stops, lies, is late or is lost now and then: no frame is lost, none is wrong."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.config import Imu, NodeConfig
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.estimates import read_motions
+from rs_localizer.io.messages import MessageError, stamp_ns
+from rs_localizer.io.outputs import Frame
+from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.offline.imu_first import imu_first
+from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.imu import ImuState
+from rs_localizer.pipeline.reasons import ImuReason
+
+READOUT_TIME = 0.03
+# Frames until an IMU is dropped that turns about other axes than TF says.
+NOTICED = 30
+CONFIG = NodeConfig(readout_time=READOUT_TIME)
+MS = 1_000_000
+# A camera in a hand that shakes by a tenth of a degree: alone, it is localized, if badly.
+FLIGHT = (
+    "--trajectory", "tum_vi_room5", "--start", "20", "--duration", "3", "--points", "80",
+    "--noise", "0.3", "--outliers", "0.1", "--imu", "--vibration", "0.1", "60",
+)  # fmt: skip
+
+Item = tuple[str, int, Any]
+Change = Callable[[Any, float], Iterable[Any]]
+"""A message of the IMU and when it comes (s since the first frame): what comes instead."""
+
+
+class Flight:
+    """A recording in memory."""
+
+    def __init__(self, path: Path) -> None:
+        self.truth = read_motions(path, "/truth/pose", "/truth/twist").poses
+        with open_bag(path) as bag:
+            self.items = list(bag.messages(["/imu", "/camera_info", "/correspondences"]))
+            (self.mounting,) = [m for _, _, m in bag.messages(["/tf_static"])]
+        self.start_ns = next(ns for topic, ns, _ in self.items if topic == "/correspondences")
+
+    def since_start(self, recorded_ns: int) -> float:
+        return (recorded_ns - self.start_ns) * 1e-9
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    assert main(["simulate", str(path), *FLIGHT]) == 0
+    return Flight(path)
+
+
+class Flown:
+    """What became of the frames."""
+
+    def __init__(self, flight: Flight) -> None:
+        self._truth = flight.truth
+        self.results: list[Frame | Refusal] = []
+        self.notices: Counter[str] = Counter()
+        self.state: ImuState | None = None
+
+    @property
+    def frames(self) -> list[Frame]:
+        return [result for result in self.results if isinstance(result, Frame)]
+
+    def errors(self) -> tuple[Any, Any]:
+        """Degrees and metres of each frame."""
+        rows = {stamp: row for row, stamp in enumerate(self._truth.stamps_ns.tolist())}
+        degrees, metres = [], []
+        for frame in self.frames:
+            row = rows[frame.stamp_ns]
+            true = Rotation.from_quat(self._truth.quaternions[row])
+            turn = true.inv() * Rotation.from_matrix(frame.pose.rotation)
+            degrees.append(math.degrees(turn.magnitude()))
+            metres.append(np.linalg.norm(frame.pose.position - self._truth.positions[row]))
+        return np.array(degrees), np.array(metres)
+
+    def assert_none_is_lost_or_wrong(self, count: int, first: int = 0) -> None:
+        """Wrong is what is far off, and farther than its covariance says."""
+        assert len(self.frames) == count
+        degrees, metres = (errors[first:] for errors in self.errors())
+        covariances = np.array([frame.pose.covariance for frame in self.frames[first:]])
+        variances = np.diagonal(covariances, axis1=1, axis2=2)
+        place, turn = (np.sqrt(variances[:, part].max(axis=1)) for part in (slice(3), slice(3, 6)))
+        assert np.all(metres < np.maximum(0.03, 5.0 * place))
+        assert np.all(degrees < np.maximum(0.6, 5.0 * np.degrees(turn)))
+        assert np.median(metres) < 0.005
+        assert np.median(degrees) < 0.2
+
+
+def fly(
+    flight: Flight,
+    change: Change = lambda message, time: (message,),
+    config: NodeConfig = CONFIG,
+    mounting: Any = None,
+) -> Flown:
+    flown = Flown(flight)
+    tree = TransformTree()
+    if mounting is not False:
+        tree.add(mounting or flight.mounting, static=True)
+    frames = FrameLocalizer(config, lambda name, _: flown.notices.update((name,)), tree)
+
+    def changed() -> Iterable[Item]:
+        for topic, recorded_ns, message in flight.items:
+            if topic != "/imu":
+                yield topic, recorded_ns, message
+                continue
+            for item in change(message, flight.since_start(recorded_ns)):
+                yield topic, recorded_ns, item
+
+    def awaits(item: Item) -> bool:
+        return item[0] == "/correspondences" and frames.awaits_imu(stamp_ns(item[2]), 1.0)
+
+    for topic, _, message in imu_first(changed(), "/imu", awaits):
+        if topic == "/camera_info":
+            frames.take_camera_info(message)
+        elif topic == "/imu":
+            frames.take_imu(message)
+        else:
+            flown.results.append(frames.localize(message))
+    flown.state = frames.imu.state
+    return flown
+
+
+def count(flight: Flight) -> int:
+    return sum(topic == "/correspondences" for topic, _, _ in flight.items)
+
+
+def later(message: Any, seconds: float) -> Any:
+    result = copy.deepcopy(message)
+    stamp = stamp_ns(message) + round(seconds * 1e9)
+    result.header.stamp.sec, result.header.stamp.nanosec = divmod(stamp, 10**9)
+    return result
+
+
+def test_it_makes_poses_better(flight: Flight) -> None:
+    both, alone = fly(flight), fly(flight, lambda message, time: ())
+    both.assert_none_is_lost_or_wrong(count(flight))
+    assert both.state is not None
+    assert both.state.share == 1.0
+    assert both.state.unused is None
+    assert both.state.rate == pytest.approx(400.0)
+    assert alone.state is None  # whoever has no IMU hears nothing of it
+    assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
+    # An IMU that is not used changes nothing, to the last bit.
+    for other in (
+        fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=Imu(use="none"))),
+        fly(flight, mounting=False),
+    ):
+        for a, b in zip(other.frames, alone.frames, strict=True):
+            assert np.array_equal(a.pose.position, b.pose.position)
+            assert np.array_equal(a.pose.rotation, b.pose.rotation)
+
+
+def without(start: float, end: float) -> Change:
+    return lambda message, time: () if start < time < end else (message,)
+
+
+def clipped(message: Any, limit: float) -> Any:
+    result = copy.deepcopy(message)
+    for axis in "xyz":
+        value = getattr(message.angular_velocity, axis)
+        setattr(result.angular_velocity, axis, float(np.clip(value, -limit, limit)))
+    return result
+
+
+def jumped(seconds: float) -> Change:
+    return lambda message, time: (later(message, seconds if time > 1.0 else 0.0),)
+
+
+def rarer() -> Change:
+    taken = Counter[str]()
+
+    def change(message: Any, time: float) -> Iterable[Any]:
+        taken["all"] += 1
+        return (message,) if taken["all"] % 8 == 0 else ()
+
+    return change
+
+
+FAULTS: dict[str, tuple[Change, ImuReason]] = {
+    "stops": (without(1.0, 9.0), ImuReason.STOPPED),
+    "begins late": (without(-9.0, 1.0), ImuReason.BEGINS_LATER),
+    "jumps ahead": (jumped(5.0), ImuReason.BEGINS_LATER),
+    "is set back": (jumped(-5.0), ImuReason.STOPPED),
+    "has another clock": (lambda m, time: (later(m, 1000.0),), ImuReason.BEGINS_LATER),
+    "comes at 50 Hz": (rarer(), ImuReason.TOO_SLOW),
+    "is cut": (without(1.0, 1.05), ImuReason.GAP),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_camera_goes_on_alone(flight: Flight, fault: str) -> None:
+    change, reason = FAULTS[fault]
+    flown = fly(flight, change)
+    flown.assert_none_is_lost_or_wrong(count(flight))
+    assert flown.state is not None
+    assert flown.state.reasons[reason] > 0
+    lasts = fault not in ("is cut", "begins late")
+    assert flown.notices[reason] == lasts  # told once, not at every frame
+    assert (flown.state.unused is not None) == lasts
+
+
+def test_a_gyroscope_at_the_end_of_its_range(tmp_path: Path) -> None:
+    """A camera that is swung faster and faster: from some moment on its gyroscope lies."""
+    path = tmp_path / "swung"
+    poses = swinging(tmp_path / "poses.txt")
+    words = ("--trajectory", str(poses), "--points", "80", "--noise", "0.3", "--imu")
+    assert main(["simulate", str(path), *words]) == 0
+    flight = Flight(path)
+    flown = fly(flight, lambda message, time: (clipped(message, 2.2),))
+    flown.assert_none_is_lost_or_wrong(count(flight))
+    assert flown.state is not None
+    assert flown.state.reasons[ImuReason.SATURATED] > 3
+    assert flown.state.used > 3
+
+
+def swinging(path: Path) -> Path:
+    """Poses that swing to and fro about the vertical at 1.5 Hz, up to 4 rad/s after 3 s."""
+    time = np.arange(0.0, 3.0, 0.01)
+    yaw = 0.14 * time * np.sin(2.0 * np.pi * 1.5 * time)
+    half = 0.5 * yaw
+    rows = [f"{100.0 + t:.6f} 0 0 0 0 0 {s:.9f} {c:.9f}"
+            for t, s, c in zip(time, np.sin(half), np.cos(half), strict=True)]  # fmt: skip
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight: Flight) -> None:
+    upside_down = copy.deepcopy(flight.mounting)
+    rotation = upside_down.transforms[0].transform.rotation
+    wrong = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w])
+    wrong = wrong * Rotation.from_euler("x", 180.0, degrees=True)
+    rotation.x, rotation.y, rotation.z, rotation.w = wrong.as_quat().tolist()
+    flown = fly(flight, mounting=upside_down)
+    flown.assert_none_is_lost_or_wrong(count(flight), first=NOTICED)
+    assert flown.state is not None
+    assert flown.state.unused is not None
+    assert flown.state.unused.reason == ImuReason.TURNED
+    angle = re.search(r"by (\d+) degrees", str(flown.state.unused))
+    assert angle is not None
+    assert 175 <= int(angle[1]) <= 180
+
+
+def test_no_covariance_is_no_fault(flight: Flight) -> None:
+    def change(message: Any, time: float) -> Iterable[Any]:
+        result = copy.deepcopy(message)
+        result.angular_velocity_covariance[:] = 0.0
+        result.linear_acceleration_covariance[:] = 0.0
+        return (result,)
+
+    flown, told = fly(flight, change), fly(flight)
+    for a, b in zip(flown.frames, told.frames, strict=True):
+        assert np.array_equal(a.pose.rotation, b.pose.rotation)
+
+
+def test_two_hundred_interruptions(flight: Flight) -> None:
+    rng = np.random.default_rng(0)
+    starts = np.sort(rng.uniform(0.0, 3.0, 200))
+    ends = starts + rng.choice([0.003, 0.01, 0.03, 0.1], 200, p=[0.55, 0.3, 0.1, 0.05])
+
+    def change(message: Any, time: float) -> Iterable[Any]:
+        return () if np.any((starts < time) & (time < ends)) else (message,)
+
+    flown = fly(flight, change)
+    flown.assert_none_is_lost_or_wrong(count(flight))
+    assert flown.state is not None
+    assert 0 < flown.state.used < flown.state.frames
+    assert flown.state.reasons[ImuReason.GAP] > 5
+
+
+def test_repetition_changes_nothing(flight: Flight) -> None:
+    twice = fly(flight, lambda message, time: (message, message))
+    for a, b in zip(twice.frames, fly(flight).frames, strict=True):
+        assert np.array_equal(a.pose.rotation, b.pose.rotation)
+        assert np.array_equal(a.pose.covariance, b.pose.covariance)
+
+
+def test_without_a_readout_time_or_tracking_it_is_not_used_and_that_is_told(
+    flight: Flight,
+) -> None:
+    for config, reason in (
+        (NodeConfig(), ImuReason.NO_READOUT_TIME),
+        (NodeConfig(readout_time=READOUT_TIME, tracking=False), ImuReason.NOT_TRACKING),
+    ):
+        flown = fly(flight, config=config)
+        assert flown.state is not None
+        assert flown.state.unused is not None
+        assert flown.state.unused.reason == reason
+        assert flown.notices[reason] == 1
+
+
+def test_bad_messages_are_told_and_the_others_count(flight: Flight) -> None:
+    frames = FrameLocalizer(CONFIG)
+    message = next(copy.deepcopy(m) for topic, _, m in flight.items if topic == "/imu")
+    message.angular_velocity.x = math.nan
+    with pytest.raises(MessageError, match="angular_velocity is not finite"):
+        frames.take_imu(message)
+    assert frames.imu.frame == ""

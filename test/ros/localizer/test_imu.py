@@ -1,0 +1,256 @@
+"""An IMU beside the camera, heard by a node in its own process: as offline, or as without it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
+
+from rs_localizer.cli.main import main as command_line
+from rs_localizer.io.bags import open_bag, typestore
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.outputs import TYPES
+from rs_localizer.ros.node.conversion import copy_message, message_class
+
+STAND_IN = Path(__file__).parents[1] / "stand_in"
+INSTALLED = importlib.util.find_spec("tf2_ros") is not None
+ENVIRONMENT = {} if INSTALLED else {"PYTHONPATH": str(STAND_IN)}
+SHUTTER = ("-p", "readout_time:=0.03")
+BLOCKED = (
+    "import sys; sys.modules['tf2_ros'] = None; "
+    "from rs_localizer.ros.main import main; sys.exit(main())"
+)
+FRAMES = 30
+Item = tuple[str, int, Any]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "flight"
+    words = ("--trajectory", "tum_vi_room5", "--start", "20", "--duration", "1")
+    seen = ("--points", "60", "--noise", "0.3", "--outliers", "0.1")
+    assert command_line(["simulate", str(path), *words, *seen, "--imu"]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def items(recording: Path) -> list[Item]:
+    with open_bag(recording) as bag:
+        return [
+            (topic, recorded_ns, copy_message(message, message.__msgtype__))
+            for topic, recorded_ns, message in bag.messages(KINDS)
+        ]
+
+
+KINDS = {"/imu": Imu, "/camera_info": CameraInfo, "/correspondences": PointCloud2}
+
+
+class Robot:
+    """Sends what the node needs, and keeps what it answers and what it says of itself."""
+
+    def __init__(self, peer: Any, tf2_ros: Any) -> None:
+        self.peer = peer
+        self.answers: dict[str, list[bytes]] = {name: [] for name in TYPES}
+        self.values: dict[str, str] = {}
+        self._sent = 0
+        for name, kind in TYPES.items():
+            peer.node.create_subscription(
+                message_class(kind), f"/rs_localizer/{name}", self.answers[name].append,
+                QoSProfile(depth=100), raw=True,
+            )  # fmt: skip
+        peer.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_status, 10)
+        self._publishers = {
+            topic: peer.node.create_publisher(kind, topic, QoSProfile(depth=500))
+            for topic, kind in KINDS.items()
+        }
+        self._static = tf2_ros.StaticTransformBroadcaster(peer.node)
+
+    def _take_status(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith(": localizer"):
+                self.values = {item.key: item.value for item in status.values}
+
+    def connect(self) -> None:
+        def connected() -> bool:
+            return all(p.get_subscription_count() for p in self._publishers.values()) and all(
+                self.peer.node.count_publishers(f"/rs_localizer/{name}") for name in TYPES
+            )
+
+        assert self.peer.spin_until(connected), "the node was not found"
+        self.peer.spin_until(lambda: False, 0.3)  # the other side has to find us, too
+
+    def mount(self, recording: Path) -> None:
+        with open_bag(recording) as bag:
+            ((_, _, message),) = bag.messages(["/tf_static"])
+        transform = message.transforms[0]
+        self._static.sendTransform(copy_message(transform, "geometry_msgs/msg/TransformStamped"))
+
+    def greet(self, items: list[Item]) -> None:
+        """The camera, and the first reading, at which the node begins to listen to TF."""
+        for topic in ("/camera_info", "/imu"):
+            self.send(next(item for item in items if item[0] == topic))
+        self.peer.spin_until(lambda: False, 1.0)
+
+    def send(self, item: Item) -> None:
+        self._publishers[item[0]].publish(item[2])
+        self._sent += item[0] == "/correspondences"
+
+    def wait_for_answers(self) -> None:
+        """To all frames so far."""
+        answered = self.answers["inliers"]
+        assert self.peer.spin_until(lambda: len(answered) == self._sent, 20.0), (
+            f"{len(answered)} of {self._sent} frames: {self.values}"
+        )
+
+    def play(self, items: list[Item], delay: Callable[[Item], float] = lambda item: 0.0) -> None:
+        """Send what was recorded in its order, as if some had come so many seconds later.
+
+        Frames come one by one: this machine may be busy, and the newest would win.
+        """
+        order = sorted((item[1] * 1e-9 + delay(item), i) for i, item in enumerate(items))
+        for _, i in order:
+            if items[i][0] == "/correspondences":
+                self.wait_for_answers()
+            self.send(items[i])
+        self.wait_for_answers()
+
+    def bytes_of(self, name: str) -> dict[int, bytes]:
+        """What the node said on a topic, by stamp."""
+        received = [typestore().deserialize_cdr(d, TYPES[name]) for d in self.answers[name]]
+        return {stamp_ns(m): bytes(typestore().serialize_cdr(m, TYPES[name])) for m in received}
+
+
+@pytest.fixture
+def robot(peer: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
+    if not INSTALLED:
+        monkeypatch.syspath_prepend(str(STAND_IN))
+    yield Robot(peer, importlib.import_module("tf2_ros"))
+    if not INSTALLED:
+        del sys.modules["tf2_ros"]
+
+
+def offline(recording: Path, out: Path, *words: str) -> dict[str, dict[int, bytes]]:
+    """What replay says of it, by topic and stamp."""
+    assert command_line(["replay", str(recording), "--out", str(out), *SHUTTER, *words]) == 0
+    with open_bag(out / "result") as bag:
+        return {
+            name: {
+                stamp_ns(m): bytes(typestore().serialize_cdr(m, kind))
+                for _, _, m in bag.messages([f"/rs_localizer/{name}"])
+            }
+            for name, kind in TYPES.items()
+        }
+
+
+def test_node_and_replay_say_the_same(
+    recording: Path, items: list[Item], tmp_path: Path, start_node: Any, robot: Robot
+) -> None:
+    start_node(*SHUTTER, "-p", "imu.wait:=1.0", **ENVIRONMENT)
+    robot.connect()
+    robot.mount(recording)
+    robot.greet(items)
+    robot.play(items)
+    assert robot.peer.spin_until(lambda: "IMU" in robot.values)
+    both = offline(recording, tmp_path / "both")
+    alone = offline(recording, tmp_path / "alone", "--no-imu")
+    for name in TYPES:
+        assert len(both[name]) == FRAMES
+        assert robot.bytes_of(name) == both[name]
+    assert both["twist"] != alone["twist"]
+    assert robot.values["IMU"] == "used"
+    assert robot.values["IMU used (share of the last frames)"] == "100%"
+    assert float(robot.values["IMU rate (Hz)"]) == pytest.approx(400.0)
+    assert re.match(r"(-?\d+\.\d+ ){3}\+- ", robot.values["IMU bias (deg/s, camera axes)"])
+    assert re.match(r"-?\d+\.\d+ \+- ", robot.values["IMU time offset (ms)"])
+
+
+def test_an_imu_that_is_late_is_not_waited_for(
+    recording: Path, items: list[Item], tmp_path: Path, start_node: Any, robot: Robot
+) -> None:
+    node = start_node(*SHUTTER, **ENVIRONMENT)
+    robot.connect()
+    robot.mount(recording)
+    robot.greet(items)
+    robot.play(items, lambda item: 0.1 if item[0] == "/imu" else 0.0)
+    alone = offline(recording, tmp_path / "alone", "--no-imu")
+    for name in TYPES:
+        assert robot.bytes_of(name) == alone[name]
+    node.wait_for_log("imu_late: the IMU is not used: the messages of the exposure come later")
+    assert robot.peer.spin_until(lambda: "IMU not used: imu_late" in robot.values)
+    assert "older than the last row" in robot.values["IMU"]
+    assert "imu.wait" in robot.values["Odd: imu"]
+
+
+def test_random_interruptions_lose_nothing(
+    recording: Path, items: list[Item], start_node: Any, robot: Robot
+) -> None:
+    """Readings are lost, late and stop in between: every frame has its pose."""
+    start_node(*SHUTTER, **ENVIRONMENT)
+    robot.connect()
+    robot.mount(recording)
+    robot.greet(items)
+    rng = np.random.default_rng(0)
+    begin, end = items[0][1], items[-1][1]
+    starts = np.sort(rng.uniform(begin, end, 200))
+    lengths = rng.choice([2e6, 1e7, 3e7], 200, p=[0.8, 0.15, 0.05])
+    delays = rng.choice([0.0, 0.005, 0.05], 200, p=[0.8, 0.15, 0.05])
+
+    def lost(item: Item) -> bool:
+        return item[0] == "/imu" and bool(np.any((starts < item[1]) & (item[1] < starts + lengths)))
+
+    def delay(item: Item) -> float:
+        return float(delays[np.searchsorted(starts, item[1]) % 200]) if item[0] == "/imu" else 0.0
+
+    robot.play([item for item in items if not lost(item)], delay)
+    assert robot.peer.spin_until(lambda: robot.values.get("Poses published") == str(FRAMES))
+    assert robot.values["Frames replaced"] == "0"
+    assert robot.values["Frames refused"] == "0"
+    truth = true_positions(recording)
+    for data in robot.answers["pose_with_covariance"]:
+        message = typestore().deserialize_cdr(data, TYPES["pose_with_covariance"])
+        place = message.pose.pose.position
+        error = np.array([place.x, place.y, place.z]) - truth[stamp_ns(message)]
+        deviation = np.sqrt(message.pose.covariance.reshape(6, 6).diagonal()[:3].max())
+        assert np.linalg.norm(error) < max(0.03, 5.0 * deviation)
+
+
+def true_positions(recording: Path) -> dict[int, Any]:
+    with open_bag(recording) as bag:
+        poses = [(stamp_ns(m), m.pose.position) for _, _, m in bag.messages(["/truth/pose"])]
+    return {stamp: np.array([place.x, place.y, place.z]) for stamp, place in poses}
+
+
+def test_without_tf2_ros_the_camera_goes_alone(
+    recording: Path, items: list[Item], start_node: Any, robot: Robot
+) -> None:
+    node = start_node(*SHUTTER, run=BLOCKED)
+    robot.connect()
+    robot.greet(items)
+    robot.play(items)
+    node.wait_for_log("the IMU needs the Python package tf2_ros")
+    assert robot.peer.spin_until(lambda: "IMU not used: imu_no_transform" in robot.values)
+
+
+def test_messages_that_no_imu_sends_are_counted(
+    items: list[Item], start_node: Any, robot: Robot
+) -> None:
+    node = start_node(*SHUTTER, **ENVIRONMENT)
+    robot.connect()
+    robot.greet(items)
+    wrong = Imu()
+    wrong.header.frame_id = "imu_link"
+    wrong.angular_velocity.x = 250.0
+    robot.send(("/imu", 0, wrong))
+    node.wait_for_log("bad_imu: angular_velocity is (250.0, 0.0, 0.0) rad/s, more than any IMU")
+    robot.play(items)
+    assert robot.peer.spin_until(lambda: robot.values.get("Refused: bad_imu") == "1")
