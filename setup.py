@@ -28,7 +28,7 @@ setup(
     name=package_name,
     version="0.1.0",
     description="Pose and velocity of a rolling-shutter camera from a single image",
-    maintainer="Seed b0484be4 maintainers",
+    maintainer="rs_localizer maintainers",
     maintainer_email="maintainers@users.noreply.h-seed-b0484be4.example",
     license="Apache-2.0",
     packages=find_packages(include=[package_name, f"{package_name}.*"]),

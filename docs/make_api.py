@@ -2,8 +2,8 @@
 
     python docs/make_api.py
 
-``docs/api.md`` comes from the docstrings of the public names, ``docs/reasons.md`` from the table
-that ``replay`` prints from.
+``docs/api.md`` comes from the docstrings of the public names, the first part of ``docs/reasons.md``
+from the table that ``replay`` prints from; what follows there is written by hand, and kept.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from rs_localizer.pipeline.reasons import REASONS
 PAGE = Path(__file__).with_name("api.md")
 REASONS_PAGE = Path(__file__).with_name("reasons.md")
 _REASONS_INTRODUCTION = """\
-# Why a frame has no pose
+# Reasons, notices and states: what it says, and what to do
+
+## Why a frame has no pose
 
 Written by `python docs/make_api.py` from `rs_localizer/pipeline/reasons.py`. The reasons are the
 same in the library (`Failure.reason`), in what `replay` prints, in the log and in `/diagnostics`.
@@ -30,6 +32,7 @@ same in the library (`Failure.reason`), in what `replay` prints, in the log and 
 | reason | means | look at |
 |---|---|---|
 """
+_BY_HAND = "\n<!-- From here on written by hand"
 _INTRODUCTION = """\
 # Library reference
 
@@ -143,9 +146,11 @@ def _text(item: Any) -> str:
 
 
 def reasons_page() -> str:
-    """The page of the reasons."""
+    """The page of the reasons, with the part that is written by hand as it stands."""
     rows = (f"| `{name}` | {means} | {look_at} |" for name, (means, look_at) in REASONS.items())
-    return _REASONS_INTRODUCTION + "\n".join(rows) + "\n"
+    written = REASONS_PAGE.read_text(encoding="utf-8")
+    by_hand = written[written.index(_BY_HAND) :]
+    return _REASONS_INTRODUCTION + "\n".join(rows) + "\n" + by_hand
 
 
 if __name__ == "__main__":

@@ -211,7 +211,10 @@ class LocalizerConfig:
         maximum=1000.0,
     )
     max_iterations: int = setting(
-        1000, "Most minimal samples to draw for one frame", minimum=1, maximum=1_000_000
+        1000,
+        "Most minimal samples of a frame, for its global-shutter start and again for its motion",
+        minimum=1,
+        maximum=1_000_000,
     )
     confidence: float = setting(
         0.99,

@@ -69,6 +69,8 @@ class Localizer:
     def __init__(
         self, camera: Camera, config: LocalizerConfig | None = None, **settings: object
     ) -> None:
+        if not isinstance(camera, Camera):
+            raise ValueError(f"camera must be an rs_localizer.Camera, got {type(camera).__name__}")
         if config is not None and settings:
             raise ValueError(f"give either config or settings, got both: {', '.join(settings)}")
         self.config = config or localizer_config(settings)
@@ -80,7 +82,7 @@ class Localizer:
     def warm_up(self) -> None:
         """Compile every kernel that :meth:`localize` may need, or load it from the cache."""
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
-        count = max(25, self.config.min_inliers)
+        count = max(60, self.config.min_inliers)
         pixels = np.random.default_rng(0).uniform(0.3, 0.7, (count, 2)) * self.camera.size
         rays = np.nan_to_num(self.camera.rays(pixels))
         depth = 2.0 + np.arange(count) % 3
@@ -90,6 +92,9 @@ class Localizer:
                       gravity_deviation=1.0, gravity_in_map=(0.0, 0.0, 1.0))  # fmt: skip
         self.localize(points, pixels, np.arange(count, dtype=np.float64), prior)
         self.localize(points, pixels)
+        # And with one that shakes, rows to and fro.
+        swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
+        self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
 
     def localize(
         self,
@@ -119,6 +124,8 @@ class Localizer:
         Raises:
             ValueError: wrong shapes, or values that are not finite.
         """
+        if prior is not None and not isinstance(prior, Prior):
+            raise ValueError(f"prior must be an rs_localizer.Prior, got {type(prior).__name__}")
         points, pixels, scores = checked(points, pixels, scores)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")

@@ -92,3 +92,29 @@ def test_imports_go_down_only() -> None:
             for bad in sorted(used - MAY_IMPORT[part])
         ]
     assert wrong == []
+
+
+# What each folder of ros may import of the others; every folder has a row.
+ROS_MAY_IMPORT: dict[str, set[str]] = {
+    "node": set(),
+    "localizer": {"node"},
+    "detector": {"node"},
+    "graph": {"node"},
+    "bench": {"node"},
+}
+
+
+def test_nodes_do_not_know_each_other() -> None:
+    """What stands beside the folders starts nodes, and may import any of them."""
+    ros = PACKAGE / "ros"
+    folders = {path.name for path in ros.iterdir() if (path / "__init__.py").is_file()}
+    assert folders == set(ROS_MAY_IMPORT)
+    wrong = []
+    for folder in sorted(folders):
+        for path in sorted((ros / folder).rglob("*.py")):
+            where = path.relative_to(PACKAGE.parent).with_suffix("").parts
+            names = imported(path.read_text(), ".".join(where[:-1]))
+            used = {name.split(".")[2] for name in names if name.startswith("rs_localizer.ros.")}
+            bad = (used & folders) - ROS_MAY_IMPORT[folder] - {folder}
+            wrong += [f"{path.relative_to(PACKAGE.parent)} imports ros.{name}" for name in bad]
+    assert wrong == []

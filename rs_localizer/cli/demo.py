@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> None:
     except ImportError as error:
         raise ValueError(
             f"the demo needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(README.md)"
+            "(docs/install.md)"
         ) from error
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,9 @@ def run(args: argparse.Namespace) -> None:
         ):
             total = len(recording.clouds)
             with tqdm(total=total, unit="frame", desc=title, disable=None) as bar:
-                answers = session.play(recording, readout_time, methods, bar.update)
+                answers = session.play(
+                    recording, readout_time, methods, bar.update, lossless=(_ROLLING,)
+                )
             results = {names[name]: compare(answers[name], recording.truth) for name in methods}
             acts.append(Act(recording, readout_time, results))
             print(f"\n{table(title, recording, results)}", flush=True)

@@ -28,7 +28,7 @@ from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
-from rs_localizer.offline.detect import Recorded, record
+from rs_localizer.offline.detect import Options, Recorded, record
 from rs_localizer.offline.image_sources import (
     IMAGE_TYPES,
     INFO_TYPE,
@@ -65,23 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     markers = parser.add_argument_group("what to look for")
     markers.add_argument("--map", type=Path, metavar="FILE", help="marker map")
-    markers.add_argument(
-        "--board",
-        metavar="6x4",
-        help="instead: a board, inner corners (or circles) along a row x rows",
-    )
-    markers.add_argument(
-        "--pattern",
-        choices=_PATTERNS,
-        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
-    )
     above = number(0.0, above=True)
-    markers.add_argument(
-        "--square",
-        type=above,
-        metavar="M",
-        help="side of its squares in metres, or distance of its rows of circles",
-    )
+    add_board_arguments(markers)
     markers.add_argument(
         "--min-side",
         type=number(0.0),
@@ -177,6 +162,26 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
     )
 
 
+def add_board_arguments(parser: argparse._ActionsContainer) -> None:
+    """A board of its own instead of a map, for :func:`find_map`."""
+    parser.add_argument(
+        "--board",
+        metavar="6x4",
+        help="instead: a board, inner corners (or circles) along a row x rows",
+    )
+    parser.add_argument(
+        "--pattern",
+        choices=_PATTERNS,
+        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
+    )
+    parser.add_argument(
+        "--square",
+        type=number(0.0, above=True),
+        metavar="M",
+        help="side of its squares in metres, or distance of its rows of circles",
+    )
+
+
 def find_map(args: argparse.Namespace) -> MarkerMap:
     if (args.map is None) == (args.board is None):
         raise UsageError("give either --map or --board")
@@ -239,9 +244,11 @@ def _record(
             shots,
             detector,
             args.out,
-            storage=args.storage,
-            with_images=args.with_images,
-            scan_direction=args.scan_direction or ScanDirection.TOP_TO_BOTTOM,
+            Options(
+                args.storage,
+                args.with_images,
+                args.scan_direction or ScanDirection.TOP_TO_BOTTOM,
+            ),
             done=progress.update,
             tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )

@@ -123,12 +123,13 @@ def _map(args: argparse.Namespace) -> MarkerMap:
     pose = Pose(np.zeros(3), _STANDING if args.standing else np.eye(3))
     if args.chessboard is None and args.charuco is None:
         _refuse(args, "a board", "square", "marker")
-        columns, rows = _counts(args.grid or _GRID, "--grid")
+        grid = _counts(args.grid or _GRID, "--grid")
         size = args.size or _SIZE
         gap = _GAP * size / _SIZE if args.gap is None else args.gap
         markers = wall(
             args.family or _FAMILY,
-            *(columns, rows, size, gap),
+            grid,
+            *(size, gap),
             first_id=args.first_id or 0,
             pose=pose,
         )

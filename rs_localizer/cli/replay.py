@@ -24,9 +24,11 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
+from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.topics import KEYPOINTS, MAP_POINTS
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
@@ -46,10 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "bag", type=Path, metavar="BAG", help="rosbag2 (MCAP, sqlite3) or ROS 1 bag"
     )
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
-    topics.add_argument("--correspondences", metavar="TOPIC")
-    topics.add_argument("--camera-info", metavar="TOPIC")
-    topics.add_argument("--keypoints", metavar="TOPIC", help="instead of correspondences")
-    topics.add_argument("--map-points", metavar="TOPIC", help="the map of the keypoints")
+    add_topics(topics)
     offline = parser.add_argument_group(
         "offline (default): at full speed, no ROS needed",
         "With the settings base_frame and publish_tf, transforms come from the recording's "
@@ -106,10 +105,12 @@ def run(args: argparse.Namespace) -> None:
     _check_usage(args)
     if not is_bag(args.bag) and (pictures := holds_images(args.bag)):
         raise ValueError(f"{args.bag} {pictures}, not matches: first {_detect_command(args.bag)}")
+    named = given_topics(args)
     if args.ros:
         with open_bag(args.bag) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
-            play(bag, None if only_images else _find_topics(bag, args), args.rate or 1.0)
+            topics = None if only_images else find_topics(bag, named)
+            play(bag, topics, args.rate or 1.0)
         return
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
     config = _config(args.params, args.assignments + given)
@@ -119,8 +120,8 @@ def run(args: argparse.Namespace) -> None:
             raise ValueError(
                 f"{args.bag} holds images, not matches: first {_detect_command(args.bag)}"
             )
-        topics = _find_topics(bag, args)
-        if topics.keypoints and not topics.map_points and not config.map_file:
+        topics = find_topics(bag, named)
+        if KEYPOINTS in topics.of and MAP_POINTS not in topics.of and not config.map_file:
             raise ValueError(
                 f"{args.bag} has keypoints and no map on map_points; give one with --map"
             )
@@ -149,10 +150,6 @@ def _detect_command(path: Path) -> str:
         f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {seen} (or --board "
         f"6x4 --square 0.03 instead of --map), then: rs_localizer replay {seen}"
     )
-
-
-def _find_topics(bag: BagReader, args: argparse.Namespace) -> Topics:
-    return find_topics(bag, args.correspondences, args.camera_info, args.keypoints, args.map_points)
 
 
 def _check_usage(args: argparse.Namespace) -> None:

@@ -15,6 +15,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.outputs import Frame, messages
+from rs_localizer.io.topics import TF
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms.rigid import TransformError, make_transform
 from rs_localizer.io.whole import told, whole
@@ -81,7 +82,7 @@ def _write_transform(
         transform = make_transform(
             writer.make, item.stamp_ns, item.parent, item.child, item.parent_from_child
         )
-        writer.write("/tf", writer.make(TF_TYPE, transforms=[transform]), recorded_ns)
+        writer.write(TF, writer.make(TF_TYPE, transforms=[transform]), recorded_ns)
     return True
 
 

@@ -30,7 +30,7 @@ def play(bag: BagReader, topics: Topics | None, rate: float) -> None:
     except ImportError as error:
         raise ValueError(
             f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(README.md)"
+            "(docs/install.md)"
         ) from error
     images = image_topics(bag)
     inputs = images + (_of_type(bag, INFO_TYPE) if topics is None else list(topics.names))
@@ -38,12 +38,12 @@ def play(bag: BagReader, topics: Topics | None, rate: float) -> None:
         raise BagError(f"{bag.path} has nothing to play: no matches, keypoints or images")
     names = tuple(dict.fromkeys((*_transforms(bag), *_of_type(bag, _IMU_TYPE), *inputs)))
     total = bag.count(names)
-    map_points = None if topics is None else topics.map_points
+    latched = [] if topics is None else [t for t, item in topics.inputs.items() if item.lasting]
     played = play(
         tqdm(bag.messages(names), total=total, unit="message", desc="play", disable=None),
         {name: bag.topics[name] for name in names},
         rate,
-        latched=() if map_points is None else (map_points,),
+        latched=latched,
     )
     if topics is not None:
         print(f"{bag.count([topics.frames])} frames published in {played.seconds:.1f} s")

@@ -1,1 +1,1 @@
-"""Geometry, camera and estimation; imports NumPy, Numba and OpenCV, never ROS."""
+"""Geometry: rotations, camera, shutter and state; imports NumPy, Numba and OpenCV, never ROS."""

@@ -72,14 +72,6 @@ class Motion:
         return so3.exp(-self.angle_at(tau)) @ velocity
 
 
-def from_model_a(rotation: Array, translation: Array, w: Array, drift: Array) -> Motion:
-    """Motion of the solvers' parameters ``exp(tau [w]x) R X + C + tau t`` (model A).
-
-    The two models agree to first order in ``tau``; see theory in the module's docstring.
-    """
-    return Motion(rotation, translation, -w, np.cross(w, translation) - drift)
-
-
 # Secant steps double the digits; even rows that overtake the image settle well before this.
 _MOST_STEPS = 50
 _ROW_TIME_TOLERANCE = 1e-12

@@ -21,6 +21,7 @@ from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import Columns, columns_of, with_prior
 from rs_localizer.estimation.evidence import Sizes, sizes_of
 from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
 
 # Probability of no field above which none is looked for among neighbours.
@@ -30,6 +31,8 @@ _FAR_APART = 0.15
 # Correlations below so many standard deviations are chance.
 _CHANCE = 1.5
 _MOST_SHARED = 0.9
+# Of the diagonal: what nothing determines has an inverse.
+RIDGE = 1.0 + 1e-14
 
 
 @kernel
@@ -54,17 +57,9 @@ def with_model_error(
     matrix = columns.products[:kept, :kept].copy()
     for k in range(PARAMETERS, kept):
         matrix[k, k] += noise * noise / (shake_size * shake_size)
-    scale = np.empty(kept)
-    for i in range(kept):
-        scale[i] = 1.0 / np.sqrt(matrix[i, i])
-    for i in range(kept):
-        for j in range(kept):
-            matrix[i, j] *= scale[i] * scale[j]
-        matrix[i, i] += 1e-14
-    inverse = np.linalg.inv(matrix)
-    for i in range(kept):
-        for j in range(kept):
-            inverse[i, j] *= scale[i] * scale[j]
+    for k in range(kept):
+        matrix[k, k] *= RIDGE
+    inverse = inverted(matrix)
     step = np.empty(kept)
     covariance = np.empty((kept, kept))
     for i in range(kept):

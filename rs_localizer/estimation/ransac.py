@@ -75,12 +75,13 @@ def search(
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
     *optimised* motion, is below ``1 - confidence``: minimal models see too few of the inliers to
     count them (a six-point model sees a tenth). Only models that beat all minimal ones before are
-    optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003).
+    optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). The samples of ``start`` count: a search
+    goes on from where another stopped.
     """
     usable = [pool for pool in pools if len(pool.points) >= hypotheses.sample_size]
     best = start
     inliers = _inliers(observations, best, hypotheses.final_scale)
-    drawn, blocks = [0] * len(usable), 0
+    drawn, blocks = [start.samples // max(len(usable), 1)] * len(usable), 0
     no_fit, best_gain = len(observations) * hypotheses.score_scale**2, 0.0
     while usable and (left := max_samples - sum(drawn)) > 0:
         samples = np.empty((min(hypotheses.block, left), hypotheses.sample_size), dtype=np.int64)
@@ -107,7 +108,7 @@ def search(
             inliers = _inliers(observations, best, hypotheses.final_scale)
         if _missed(inliers, usable, drawn, hypotheses.sample_size) < 1.0 - confidence:
             break
-    return Candidate(best.state, best.cost, start.samples + sum(drawn))
+    return Candidate(best.state, best.cost, sum(drawn))
 
 
 def _draw(

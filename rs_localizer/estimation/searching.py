@@ -28,7 +28,11 @@ _POOL_SCALE = 0.12
 _SCORE_SCALE = 4.0
 _GLOBAL_SHUTTER_BLOCK = 48
 _BLOCK = 64
-_GLOBAL_SHUTTER_MOST_SAMPLES = 384
+# Either search first draws at most so many: they do for all but the hardest frames, and what they
+# find tells whether more are worth it.
+_FIRST_SAMPLES = 384
+# A global-shutter start near more than this part of a motion's inliers would lead to it again.
+_SAME_GROUP = 0.5
 # Enough to find three inliers among points of which two fifths are.
 _SECOND_LOOK_SAMPLES = 96
 
@@ -59,10 +63,47 @@ class MotionSearch:
     def find(self, frame: Frame) -> tuple[Candidate, Candidate]:
         """The global-shutter start and the motion found from it; the start may not be found."""
         everything = np.arange(len(frame.observations))
-        start = self._global_shutter(frame, everything, self._config.max_iterations)
-        if not start.found:
-            return start, start
-        return self._largest_group(frame, start, self._motion(frame, start))
+        most = self._config.max_iterations
+        first = min(_FIRST_SAMPLES, most) if self._solver.rolling_shutter else most
+        start = self._global_shutter(frame, everything, first)
+        best = self._motion(frame, start, first)
+        if first < most:
+            start, best = self._go_on(frame, start, best)
+        return self._largest_group(frame, start, best)
+
+    def _go_on(
+        self, frame: Frame, start: Candidate, best: Candidate
+    ) -> tuple[Candidate, Candidate]:
+        """The start and the motion after more samples, where the first ones may not be enough."""
+        most, inliers = self._config.max_iterations, self._inliers(frame, best)
+        if start.samples >= _FIRST_SAMPLES and self._missed(inliers, start.samples):
+            later = self._global_shutter(frame, np.arange(len(inliers)), most, start)
+            if not np.any(inliers) or np.mean(self._near(frame, later)[inliers]) < _SAME_GROUP:
+                rival = self._motion(frame, later, most)
+                if rival.cost < best.cost:
+                    return later, rival
+            elif later.cost < start.cost:
+                start = later
+        if best.samples >= _FIRST_SAMPLES:
+            best = self._motion(frame, start, most, best)
+        return start, best
+
+    def _inliers(self, frame: Frame, best: Candidate) -> BoolArray:
+        if not best.found:
+            return np.zeros(len(frame.observations), dtype=np.bool_)
+        errors = frame.observations.squared_errors(best.state)
+        inliers: BoolArray = errors < self._config.inlier_threshold**2
+        return inliers
+
+    def _missed(self, inliers: BoolArray, samples: int) -> bool:
+        """Whether every sample of the global-shutter start may have held an outlier.
+
+        The motion tells, not the start: where the camera is fast, that explains but a part of the
+        inliers.
+        """
+        share = float(np.mean(inliers))
+        chance = (1.0 - share ** find_solver("p3p").sample_size) ** samples
+        return chance > 1.0 - self._config.confidence
 
     def _largest_group(
         self, frame: Frame, start: Candidate, best: Candidate
@@ -85,7 +126,7 @@ class MotionSearch:
             np.count_nonzero(self._near(frame, second)[others]) <= np.count_nonzero(inliers)
         ):
             return start, best
-        rival = self._motion(frame, second)
+        rival = self._motion(frame, second, self._config.max_iterations)
         return (second, rival) if rival.cost < best.cost else (start, best)
 
     def _near(self, frame: Frame, start: Candidate) -> BoolArray:
@@ -94,13 +135,14 @@ class MotionSearch:
         near: BoolArray = errors < (_POOL_SCALE * self._focal_length) ** 2
         return near
 
-    def _global_shutter(self, frame: Frame, among: IntArray, most: int) -> Candidate:
+    def _global_shutter(
+        self, frame: Frame, among: IntArray, most: int, before: Candidate = NOTHING
+    ) -> Candidate:
         """A pose that fits all rows roughly, by P3P on some points and a wide threshold."""
         threshold = self._config.inlier_threshold
         wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
         if self._solver.rolling_shutter:
             score_scale, final_scale = wide, wide
-            most = min(_GLOBAL_SHUTTER_MOST_SAMPLES, most)
         else:
             score_scale, final_scale = _SCORE_SCALE * threshold, threshold
         hypotheses = self._hypotheses(
@@ -111,20 +153,24 @@ class MotionSearch:
             hypotheses,
             [np.eye(3)],
             _pools(frame, among),
-            NOTHING,
+            before,
             self._config.confidence,
             most,
             frame.random,
         )
 
-    def _motion(self, frame: Frame, start: Candidate) -> Candidate:
+    def _motion(
+        self, frame: Frame, start: Candidate, most: int, before: Candidate | None = None
+    ) -> Candidate:
         """The motion that most points agree on, from the solver's hypotheses."""
-        if not self._solver.rolling_shutter:
+        if not self._solver.rolling_shutter or not start.found:
             return start
         threshold = self._config.inlier_threshold
         near = np.flatnonzero(self._near(frame, start))
         # The global-shutter pose is a hypothesis, too: at rest it is the best one.
-        first = self.optimize(frame, start.state, _POOL_SCALE * self._focal_length, frame.terms)
+        if before is None:
+            scale = _POOL_SCALE * self._focal_length
+            before = self.optimize(frame, start.state, scale, frame.terms)
         hypotheses = self._hypotheses(
             self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, frame.terms
         )
@@ -133,9 +179,9 @@ class MotionSearch:
             hypotheses,
             [start.state[:9].reshape(3, 3)],
             [Pool(near), *_pools(frame, np.arange(len(frame.observations)))],
-            first,
+            before,
             self._config.confidence,
-            self._config.max_iterations,
+            most,
             frame.random,
         )
 

@@ -18,11 +18,11 @@ from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import basis_sizes, shake_at
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import columns_of
-from rs_localizer.estimation.model_error import neighbours_agree
+from rs_localizer.estimation.model_error import RIDGE, neighbours_agree
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, add_prior
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.residuals import linearized
 
 # Degrees to try, until neighbouring rows no longer agree: twelve follow a cycle and a half in one
@@ -167,7 +167,7 @@ def _sizes_and_step(
     count = len(with_errors)
     held = coefficients.ravel()
     step, covariance = np.zeros(count), np.zeros((count, count))
-    matrix, scale, right = np.empty((count, count)), np.empty(count), np.empty(count)
+    matrix, right = np.empty((count, count)), np.empty(count)
     found = np.empty(len(sizes))
     for round_ in range(_SIZE_ROUNDS):
         weight = 1.0 / (noise * noise)
@@ -186,16 +186,9 @@ def _sizes_and_step(
             matrix[k, k] += precision
             right[k] -= precision * held[k - PARAMETERS]
         for i in range(count):
-            scale[i] = 1.0 / np.sqrt(matrix[i, i])
-        scaled = matrix.copy()
+            matrix[i, i] *= RIDGE
+        covariance = inverted(matrix)
         for i in range(count):
-            for j in range(count):
-                scaled[i, j] *= scale[i] * scale[j]
-            scaled[i, i] += 1e-14
-        inverse = np.linalg.inv(scaled)
-        for i in range(count):
-            for j in range(count):
-                covariance[i, j] = scale[i] * scale[j] * inverse[i, j]
             along = 0.0
             for j in range(count):
                 along += covariance[i, j] * right[j]

@@ -29,6 +29,8 @@ from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from rs_localizer.io.topics import TF_STATIC
+
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _SUFFIXES = (".mcap", ".db3", ".bag")
 # Fields that ROS 2 spells in lower case.
@@ -40,7 +42,7 @@ _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     _NO_LIMIT, _NO_LIMIT, QosLiveliness.AUTOMATIC, _NO_LIMIT, False,
 )  # fmt: skip
-_LATCHED_TOPICS = ("/tf_static",)
+_LATCHED_TOPICS = (TF_STATIC,)
 
 
 class BagError(ValueError):

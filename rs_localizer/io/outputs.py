@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.types import Estimate
+from rs_localizer.io import topics
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import Make, make_header
 
 TYPES = {
-    "pose": "geometry_msgs/msg/PoseStamped",
-    "twist": "geometry_msgs/msg/TwistStamped",
-    "pose_with_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "twist_with_covariance": "geometry_msgs/msg/TwistWithCovarianceStamped",
-    "odometry": "nav_msgs/msg/Odometry",
-    "inliers": "sensor_msgs/msg/PointCloud2",
+    topics.POSE: "geometry_msgs/msg/PoseStamped",
+    topics.TWIST: "geometry_msgs/msg/TwistStamped",
+    topics.POSE_WITH_COVARIANCE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    topics.TWIST_WITH_COVARIANCE: "geometry_msgs/msg/TwistWithCovarianceStamped",
+    topics.ODOMETRY: "nav_msgs/msg/Odometry",
+    topics.INLIERS: "sensor_msgs/msg/PointCloud2",
 }
 """Output topics, below the node's name, and their types."""
 
@@ -128,29 +129,29 @@ class _Parts:
 
 
 _BUILDERS: dict[str, Callable[[_Parts], Any]] = {
-    "pose": lambda of: of.make(TYPES["pose"], header=of.in_map, pose=of.pose),
-    "pose_with_covariance": lambda of: of.make(
-        TYPES["pose_with_covariance"], header=of.in_map, pose=of.pose_with_covariance
+    topics.POSE: lambda of: of.make(TYPES[topics.POSE], header=of.in_map, pose=of.pose),
+    topics.POSE_WITH_COVARIANCE: lambda of: of.make(
+        TYPES[topics.POSE_WITH_COVARIANCE], header=of.in_map, pose=of.pose_with_covariance
     ),
-    "twist": lambda of: of.make(TYPES["twist"], header=of.in_body, twist=of.twist),
-    "twist_with_covariance": lambda of: of.make(
-        TYPES["twist_with_covariance"], header=of.in_body, twist=of.twist_with_covariance
+    topics.TWIST: lambda of: of.make(TYPES[topics.TWIST], header=of.in_body, twist=of.twist),
+    topics.TWIST_WITH_COVARIANCE: lambda of: of.make(
+        TYPES[topics.TWIST_WITH_COVARIANCE], header=of.in_body, twist=of.twist_with_covariance
     ),
-    "odometry": lambda of: of.make(
-        TYPES["odometry"],
+    topics.ODOMETRY: lambda of: of.make(
+        TYPES[topics.ODOMETRY],
         header=of.in_map,
         child_frame_id=of.frame.body_frame,
         pose=of.pose_with_covariance,
         twist=of.twist_with_covariance,
     ),
-    "inliers": lambda of: make_cloud(
+    topics.INLIERS: lambda of: make_cloud(
         of.make, of.frame.input_stamp_ns, of.frame.map_frame, of.frame.inliers
     ),
 }
 _WITHOUT_TWIST = {
     name: build
     for name, build in _BUILDERS.items()
-    if name not in ("twist", "twist_with_covariance", "odometry")
+    if name not in (topics.TWIST, topics.TWIST_WITH_COVARIANCE, topics.ODOMETRY)
 }
 
 

@@ -9,16 +9,17 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import make_header
 
 CAMERA_FRAME = "camera_optical_frame"
 MAP_FRAME = "map"
-CAMERA_INFO_TOPIC = "/camera_info"
-CORRESPONDENCES_TOPIC = "/correspondences"
-KEYPOINTS_TOPIC = "/keypoints"
-IMAGE_TOPIC = "/image/compressed"
+CAMERA_INFO_TOPIC = f"/{topics.CAMERA_INFO}"
+CORRESPONDENCES_TOPIC = f"/{topics.CORRESPONDENCES}"
+KEYPOINTS_TOPIC = f"/{topics.KEYPOINTS}"
+IMAGE_TOPIC = f"/{topics.COMPRESSED_IMAGE}"
 RAW_IMAGE_TOPIC = "/image_raw/compressed"
 # A params file and maps in the directory of a recording.
 PARAMETERS = "parameters.yaml"

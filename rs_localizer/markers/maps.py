@@ -73,8 +73,7 @@ class MarkerMap:
 
 def wall(
     family_name: str,
-    columns: int,
-    rows: int,
+    grid: tuple[int, int],
     size: float,
     gap: float,
     *,
@@ -85,13 +84,14 @@ def wall(
 
     Args:
         family_name: see :func:`rs_localizer.markers.families.family`.
-        columns, rows: how many markers.
+        grid: columns and rows of markers.
         size: side of a marker, m.
         gap: between the sides of neighbours, m.
         first_id: id of the top left marker.
         pose: of the middle of the wall: x to the right, y up, z toward the viewer.
     """
     pose = pose or Pose()
+    columns, rows = grid
     spacing = size + gap
     made = []
     for index in range(columns * rows):

@@ -230,8 +230,6 @@ class Charuco:
 
 
 Board = Chessboard | CircleGrid | Charuco
-Whole = Chessboard | CircleGrid
-"""Boards without marks of their own: seen whole or not at all."""
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:

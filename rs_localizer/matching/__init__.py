@@ -24,7 +24,9 @@ from rs_localizer.matching.descriptors import Index, Nearest, make_index
 from rs_localizer.matching.prediction import find_view, predict, search_cost
 
 # A prediction tells look-alikes apart: worth so much more than a search of all landmarks, in ns.
-_WORTH = 3e6
+_WORTH = 1e6
+# So many landmarks of a map tell how many of all are in view: to look at all takes milliseconds.
+_SAMPLED = 1000
 
 
 class MatchError(ValueError):
@@ -53,6 +55,8 @@ class Matcher:
         if landmarks.ids is not None:
             self._order = np.argsort(landmarks.ids, kind="stable")
             self._sorted: Ids = landmarks.ids[self._order]
+        self._every = max(1, len(landmarks) // _SAMPLED)
+        self._some = np.ascontiguousarray(landmarks.points[:: self._every])
         self._index: Index | None = None
         if landmarks.descriptors is not None:
             binary = landmarks.descriptors.dtype == np.uint8
@@ -162,10 +166,12 @@ class Matcher:
         Where so many are in view that this would take longer, among all.
         """
         assert self._index is not None
-        view = find_view(camera, prior, self.map.points, settings.gate)
-        cost = search_cost(camera, view, len(queries), self._index.candidate_cost)
-        if cost > _WORTH + len(queries) * len(self.map) * self._index.pair_cost:
+        some = find_view(camera, prior, self._some, settings.gate)
+        cost = search_cost(camera, some, len(queries), self._index.candidate_cost)
+        whole = len(queries) * len(self.map) * self._index.pair_cost
+        if self._every * cost > _WORTH + whole:
             return self._anywhere(queries, settings)
+        view = find_view(camera, prior, self.map.points, settings.gate)
         visible = predict(camera, prior, self.map.points, view)
         found, owners = self._index.nearest_within(queries, pixels, visible)
         if not settings.mutual:

@@ -24,8 +24,8 @@ from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.recognition import recognized
 from rs_localizer.markers.still import rms, still_errors, still_pose
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.frames import Refusal
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
+from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
 _LEAST_CORNERS = 6
@@ -60,14 +60,21 @@ class Recorded:
     faults: tuple[str, ...]  # what speaks against map or calibration
 
 
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How images are recorded."""
+
+    storage: str = "mcap"  # or sqlite3
+    with_images: bool = False  # write these, too, as far as they are compressed
+    scan_direction: str = ScanDirection.TOP_TO_BOTTOM  # for the check of the markers' places
+
+
 def record(
     shots: Iterable[Shot | Carried],
     detector: FrameDetector,
     out: Path,
+    options: Options,
     *,
-    storage: str = "mcap",
-    with_images: bool = False,
-    scan_direction: str = ScanDirection.TOP_TO_BOTTOM,
     done: Callable[[], object] = lambda: None,
     tell: Callable[[str], object] = lambda text: None,
 ) -> Recorded:
@@ -77,9 +84,7 @@ def record(
         shots: the images, and what else of their recording is to be kept.
         detector: looks for markers.
         out: bag directory to create.
-        storage: ``mcap`` or ``sqlite3``.
-        with_images: write these images, too, as far as they are compressed.
-        scan_direction: of the shutter, for the check of the markers' places.
+        options: what is written, and how it was seen.
         done: called after each image.
         tell: called when many images in the beginning show nothing, with what they show instead.
 
@@ -87,8 +92,8 @@ def record(
         DetectError: when no image shows anything, or images and calibration differ in size.
     """
     tally = _Tally(detector.map)
-    cameras = _Cameras(scan_direction)
-    with whole(out), BagWriter(out, storage) as bag:
+    cameras = _Cameras(options.scan_direction)
+    with whole(out), BagWriter(out, options.storage) as bag:
         for shot in shots:
             if isinstance(shot, Carried):
                 tally.carried[shot.topic] += 1
@@ -100,7 +105,7 @@ def record(
                 detected = detector.detect(shot.image)
                 tally.add(cameras.of(shot, detected), detected)
                 if len(detected.detections.ids):
-                    _write(bag, shot, detected, with_images)
+                    _write(bag, shot, detected, options.with_images)
                 if tally.images == _PATIENCE and tally.are_few:
                     count = len(tally.counts) or "none"
                     tell(f"{count} of the first {_PATIENCE} images {tally.nothing()}")

@@ -13,6 +13,7 @@ from rs_localizer.io.clouds import Correspondences, read_correspondences
 from rs_localizer.io.keypoints import read_keypoints, read_map
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, KEYPOINTS, MAP_POINTS
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.offline.replay import Topics
 
@@ -27,7 +28,6 @@ class Recorded:
 
     calibration: Calibration
     clouds: tuple[Correspondences, ...]
-    unreadable: Counter[str]  # messages that could not be used, by what was wrong
 
     @property
     def map_frame(self) -> str:
@@ -48,20 +48,22 @@ def read_recording(
     clouds: list[Correspondences] = []
     calibration: Calibration | None = None
     faults: Counter[str] = Counter()
+    inputs = topics.inputs
     for topic, _, message in bag.messages(topics.names):
+        name = inputs[topic].topic
         try:
-            if topic == topics.camera_info:
+            if name == CAMERA_INFO:
                 read = read_camera_info(message)
                 if calibration is not None and read != calibration:
                     raise RecordingError(
                         f"{bag.path}: camera_info changes on the way; cut the recording there"
                     )
                 calibration = read
-            elif topic == topics.map_points:
+            elif name == MAP_POINTS:
                 matcher = Matcher(read_map(message))
-            elif topic == topics.correspondences:
+            elif name == CORRESPONDENCES:
                 clouds.append(read_correspondences(message))
-            elif matcher is not None:
+            elif name == KEYPOINTS and matcher is not None:
                 keypoints = read_keypoints(message)
                 matches = matcher.match(keypoints, settings)
                 clouds.append(matching.correspondences(matches, keypoints, matcher.map))
@@ -72,4 +74,4 @@ def read_recording(
     if not clouds:
         why = f"; {faults.most_common(1)[0][0]}" if faults else ""
         raise RecordingError(f"{bag.path} has no usable correspondences{why}")
-    return Recorded(calibration, tuple(clouds), faults)
+    return Recorded(calibration, tuple(clouds))

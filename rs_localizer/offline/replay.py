@@ -8,20 +8,16 @@ from typing import Any
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
-from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
+from rs_localizer.io.topics import CAMERA_INFO, TF, TF_STATIC
 from rs_localizer.io.transforms.rigid import TransformError
 from rs_localizer.io.transforms.tree import TransformTree
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.inputs import INPUTS, Input, Role, with_role
+from rs_localizer.pipeline.refusal import Refusal
 
-_INPUTS = {
-    "correspondences": "sensor_msgs/msg/PointCloud2",
-    "keypoints": "sensor_msgs/msg/PointCloud2",
-    "map_points": "sensor_msgs/msg/PointCloud2",
-    "camera_info": "sensor_msgs/msg/CameraInfo",
-}
 # Reasons of messages that are no frames.
-NO_FRAMES = ("bad_camera_info", "bad_map")
+NO_FRAMES = tuple(item.refused for item in INPUTS.values() if item.role != Role.FRAMES)
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 _OLD_TF_TYPE = "tf/msg/tfMessage"  # of ROS 1 before tf2
@@ -33,94 +29,103 @@ CARRIED_TYPES = (TF_TYPE, _OLD_TF_TYPE, "sensor_msgs/msg/Imu")
 class Topics:
     """Where a recording has the inputs of the node: frames are correspondences or keypoints."""
 
-    camera_info: str
-    correspondences: str | None
-    keypoints: str | None = None
-    map_points: str | None = None
+    of: Mapping[str, str]  # by the input
 
     @property
     def frames(self) -> str:
         """The topic whose messages are localized."""
-        return self.correspondences or self.keypoints or ""
+        return next(topic for name, topic in self.of.items() if INPUTS[name].role == Role.FRAMES)
 
     @property
     def names(self) -> tuple[str, ...]:
         """All of them."""
-        all_of_them = (self.camera_info, self.map_points, self.correspondences, self.keypoints)
-        return tuple(name for name in all_of_them if name is not None)
+        return tuple(self.of.values())
+
+    @property
+    def inputs(self) -> dict[str, Input]:
+        """The inputs by their topics in the recording."""
+        return {topic: INPUTS[name] for name, topic in self.of.items()}
 
 
-def find_topics(
-    bag: BagReader,
-    correspondences: str | None = None,
-    camera_info: str | None = None,
-    keypoints: str | None = None,
-    map_points: str | None = None,
-) -> Topics:
-    """The topics of the inputs, given or found.
+def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -> Topics:
+    """The topics of the inputs, given (by input; None: not given) or found.
 
-    Found are those that end in the node's own names, else the only one of the type.
+    Found are those that end in the node's own names, else the only one of the type; of what is not
+    necessary, only the former.
 
     Raises:
         BagError: when a given topic is not there, or none or several could be meant.
     """
-    camera = _find(bag, "camera_info", camera_info)
-    if correspondences is None and keypoints is None:
-        found = [name for name in ("correspondences", "keypoints") if _named(bag, name)]
-        if len(found) == 2:
-            raise BagError(
-                f"{bag.path} has correspondences and keypoints; choose with --correspondences or "
-                "--keypoints"
-            )
-        if found == ["keypoints"]:
-            keypoints = _find(bag, "keypoints", None)
-    if keypoints is None:
-        return Topics(camera, _find(bag, "correspondences", correspondences))
-    if map_points is not None or _named(bag, "map_points"):
-        map_points = _find(bag, "map_points", map_points)
-    return Topics(camera, None, _find(bag, "keypoints", keypoints), map_points)
+    wanted = {name: topic for name, topic in (given or {}).items() if topic is not None}
+    frames = _choose_frames(bag, wanted)
+    found = {}
+    for name, item in INPUTS.items():
+        if item.role == Role.FRAMES:
+            needed = item is frames
+        elif item.only_with in ("", frames.topic):
+            needed = item.necessary or name in wanted or bool(_named(bag, item))
+        else:
+            needed = False
+        if needed:
+            found[name] = _find(bag, item, wanted.get(name))
+    return Topics(found)
+
+
+def _choose_frames(bag: BagReader, wanted: Mapping[str, str]) -> Input:
+    """The input that is localized: what is given, else what is there by its name."""
+    kinds = with_role(Role.FRAMES)
+    given = [item for item in kinds if item.topic in wanted]
+    if given:
+        return given[-1]
+    found = [item for item in kinds if _named(bag, item)]
+    if len(found) > 1:
+        raise BagError(
+            f"{bag.path} has {' and '.join(item.topic for item in found)}; choose with "
+            f"{' or '.join(item.option for item in found)}"
+        )
+    return found[0] if found else kinds[0]
 
 
 def has_frames(bag: BagReader) -> bool:
     """Whether there is anything to localize: a cloud of any kind."""
-    return _INPUTS["correspondences"] in bag.topics.values()
+    return any(item.type in bag.topics.values() for item in with_role(Role.FRAMES))
 
 
-def _named(bag: BagReader, name: str) -> list[str]:
+def _named(bag: BagReader, item: Input) -> list[str]:
     """Topics of the type of an input that end in its name."""
-    kind = _INPUTS[name]
     return sorted(
-        topic for topic in bag.topics if bag.topics[topic] == kind and topic.split("/")[-1] == name
+        topic
+        for topic, kind in bag.topics.items()
+        if kind == item.type and topic.split("/")[-1] == item.topic
     )
 
 
-def _find(bag: BagReader, name: str, given: str | None) -> str:
-    type_name = _INPUTS[name]
-    of_type = sorted(topic for topic, kind in bag.topics.items() if kind == type_name)
+def _find(bag: BagReader, item: Input, given: str | None) -> str:
+    of_type = sorted(topic for topic, kind in bag.topics.items() if kind == item.type)
     if given is not None:
         if given in of_type:
             return given
         found = f"is of type {bag.topics[given]}" if given in bag.topics else "does not exist"
         raise BagError(
-            f"{bag.path}: topic {given} {found}; topics of type {type_name}: {_list(of_type)}"
+            f"{bag.path}: topic {given} {found}; topics of type {item.type}: {_list(of_type)}"
         )
-    for candidates in (_named(bag, name), of_type):
+    for candidates in (_named(bag, item), of_type):
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
             raise BagError(
-                f"{bag.path}: several topics may be the {name}: {_list(candidates)}; "
-                f"choose one with --{name.replace('_', '-')}"
+                f"{bag.path}: several topics may be the {item.topic}: {_list(candidates)}; "
+                f"choose one with {item.option}"
             )
     raise BagError(
-        f"{bag.path} has no topic of type {type_name} for the {name}; it has "
+        f"{bag.path} has no topic of type {item.type} for the {item.topic}; it has "
         f"{_describe(bag.topics)}"
     )
 
 
 def tf_topics(bag: BagReader, *types: str) -> list[str]:
     """Those of /tf_static and /tf that the recording has, as one of these types."""
-    return [topic for topic in ("/tf_static", "/tf") if bag.topics.get(topic) in types]
+    return [topic for topic in (TF_STATIC, TF) if bag.topics.get(topic) in types]
 
 
 def as_tf2(message: Any) -> Any:
@@ -145,14 +150,14 @@ def find_transforms(bag: BagReader, topics: Topics, config: NodeConfig) -> Trans
     if config.publish_tf == PublishTf.MAP_TO_ODOM:
         wanted["odom_frame"] = config.odom_frame
     tree = TransformTree()
-    camera = next((m.header.frame_id for _, _, m in bag.messages((topics.camera_info,))), None)
+    camera = next((m.header.frame_id for _, _, m in bag.messages((topics.of[CAMERA_INFO],))), None)
     if not wanted or camera is None:
         return tree
     found = tf_topics(bag, TF_TYPE, _OLD_TF_TYPE)
     for topic in found:
         for _, _, message in bag.messages((topic,)):
-            tree.add(message, static=topic == "/tf_static")
-        if topic == "/tf_static" and all(_connected(tree, f, camera) for f in wanted.values()):
+            tree.add(message, static=topic == TF_STATIC)
+        if topic == TF_STATIC and all(_connected(tree, f, camera) for f in wanted.values()):
             break  # /tf is long
     for name, frame in wanted.items():
         try:
@@ -182,20 +187,11 @@ def replay(
     A CameraInfo or a map that cannot be used gives a Refusal of its own, for a reason of
     :data:`NO_FRAMES`.
     """
+    inputs = topics.inputs
     for topic, recorded_ns, message in bag.messages(topics.names):
-        if topic == topics.correspondences:
-            yield recorded_ns, localizer.localize(message)
-        elif topic == topics.keypoints:
-            yield recorded_ns, localizer.localize_keypoints(message)
-        else:
-            kind = "camera_info" if topic == topics.camera_info else "map"
-            try:
-                if kind == "map":
-                    localizer.take_map(message)
-                else:
-                    localizer.take_camera_info(message)
-            except MessageError as error:
-                yield recorded_ns, Refusal(f"bad_{kind}", str(error))
+        result = inputs[topic].take(localizer, message)
+        if result is not None:
+            yield recorded_ns, result
 
 
 def _list(topics: list[str]) -> str:

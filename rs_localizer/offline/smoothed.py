@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from rs_localizer.config import PoseTime
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.io.outputs import Frame
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.trajectory.observe import Observed
 from rs_localizer.trajectory.smoothing import smooth
 

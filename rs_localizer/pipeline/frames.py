@@ -7,9 +7,9 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Frame
+from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError, Transforms
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.localizer import Localizer
@@ -39,6 +40,7 @@ from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.oddities import oddities
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -61,34 +63,6 @@ _STILL = Estimate(
 )
 
 _NO_TRANSFORM = "no_transform"
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """A frame without a pose; false in a condition.
-
-    Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud``, ``bad_cloud``
-    (a message that cannot be read) and ``no_transform`` (from the camera to ``base_frame``); of
-    keypoints ``no_map``, ``bad_keypoints`` (that cannot be read, or not be compared with the map)
-    and ``no_matches``.
-    """
-
-    reason: str
-    detail: str  # one sentence that says what was found
-
-    def __bool__(self) -> Literal[False]:
-        return False
-
-
-@dataclass(frozen=True, slots=True)
-class Waiting(Refusal):
-    """A localized frame whose mounting is known for earlier times only.
-
-    It is refused, unless somebody asks for it again.
-    """
-
-    again: Callable[[], Frame | Refusal]
-    patience: float  # s, for which this makes sense
 
 
 class FrameLocalizer:
@@ -155,9 +129,9 @@ class FrameLocalizer:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What has to come before a frame can be localized, in words of users."""
-        camera = ("camera_info",) if self._calibration is None else ()
-        return (*camera, "a map") if self._lacks_map else camera
+        """The inputs that have to come before a frame can be localized."""
+        camera = (CAMERA_INFO,) if self._calibration is None else ()
+        return (*camera, MAP_POINTS) if self._lacks_map else camera
 
     @property
     def map(self) -> Map | None:

@@ -21,7 +21,7 @@ from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
 from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.pipeline.refusal import Refusal
 
 # Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
 # map of a kilometre. Larger ones (georeferenced) need more.

@@ -32,7 +32,7 @@ def explain(error: ImportError) -> str:
             f"the Python package {name} is not installed: pip install {name} (beside Ubuntu's ROS "
             f'with --break-system-packages, and "numpy<2" to keep its NumPy)'
         )
-    return f"{_one_line(error)}; source a ROS 2 workspace, or install it with pip (README.md)"
+    return f"{_one_line(error)}; source a ROS 2 workspace, or install it with pip (docs/install.md)"
 
 
 def _one_line(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 
@@ -17,9 +18,11 @@ def main(args: list[str] | None = None) -> int:
     """Run the localizer until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
 
     def load() -> Run:
+        from rs_localizer.ros.localizer.node import LocalizerNode
         from rs_localizer.ros.node.run import run
+        from rs_localizer.settings import NODE_NAME
 
-        return run
+        return functools.partial(run, LocalizerNode, NODE_NAME)
 
     return _guarded("localizer", load, args)
 
@@ -32,7 +35,7 @@ def marker_detector(args: list[str] | None = None) -> int:
         from rs_localizer.ros.node.run import run
         from rs_localizer.settings import DETECTOR_NAME
 
-        return lambda stop, args: run(stop, args, MarkerDetectorNode, DETECTOR_NAME)
+        return functools.partial(run, MarkerDetectorNode, DETECTOR_NAME)
 
     return _guarded("marker_detector", load, args)
 

@@ -8,7 +8,8 @@ the nine entries of R_RS. Points are in the frame of the initial rotation; one s
 At zero motion ``R_RS = I, t = C`` solves the homogeneous equations (all points scaled with the
 row), so the published system is singular there. Fixing ``trace(R_RS) = 0``, which holds for the
 true ``[w]x`` to first order, removes that direction; it is the default. Either way
-``w`` is the skew part of ``R_RS (I + [v]x)^-1``.
+``w`` is the skew part of ``R_RS (I + [v]x)^-1``: what else is in R_RS, and noise puts much there,
+no rigid motion can follow. Scored by the model above, R9P fits far more points than by that motion.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def _angular_velocity(matrix: list[Vector], v: Vector) -> Vector:
     ]
 
 
-def _solve(values: list[Lanes], *, fix_trace: bool) -> Vector:
-    sample = Sample(values, SAMPLE_SIZE)
+def _unknowns(sample: Sample, *, fix_trace: bool) -> tuple[Vector, Vector, Vector, list[Vector]]:
+    """v, C, t and the rows of R_RS in the frame of the initial rotation."""
     points, rays, tau = sample.rotated_points(), sample.rays, sample.tau
     depth = linear.depth_column(rays)
     swept = [[r * x[k] for x, r in zip(points, tau, strict=True)] for k in range(3)]
@@ -92,14 +93,26 @@ def _solve(values: list[Lanes], *, fix_trace: bool) -> Vector:
         cx, tx, *row_one = first
         cy, ty, *row_two = second
         matrix = [row_one, row_two, common[5:8]]
-    v = common[:3]
+    return common[:3], [cx, cy, common[3]], [tx, ty, common[4]], matrix
+
+
+def _solve(values: list[Lanes], *, fix_trace: bool) -> Vector:
+    sample = Sample(values, SAMPLE_SIZE)
+    v, c, t, matrix = _unknowns(sample, fix_trace=fix_trace)
     w = _angular_velocity(matrix, v)
     rotation = linear.fold(sample.rotation, v)
-    return [*(x for row in rotation for x in row), cx, cy, common[3], *w, tx, ty, common[4]]
+    return [*(x for row in rotation for x in row), *c, *w, *t]
+
+
+def _solve_free(values: list[Lanes], *, fix_trace: bool) -> Vector:
+    v, c, t, matrix = _unknowns(Sample(values, SAMPLE_SIZE), fix_trace=fix_trace)
+    return [*v, *c, *t, *(x for row in matrix for x in row)]
 
 
 _lanes = traced(lambda values: _solve(values, fix_trace=True), _INPUTS)
 _lanes_as_published = traced(lambda values: _solve(values, fix_trace=False), _INPUTS)
+_free_lanes = traced(lambda values: _solve_free(values, fix_trace=True), _INPUTS)
+_free_lanes_as_published = traced(lambda values: _solve_free(values, fix_trace=False), _INPUTS)
 
 
 @kernel
@@ -138,3 +151,22 @@ def solve_batch_as_published(
         gather(points, rays, tau, samples, rotations, start, work)
         _lanes_as_published(work, model)
         scatter(model, 0, start, models[0])
+
+
+@kernel
+def solve_free(
+    points: Array, rays: Array, tau: Array, samples: Any, rotations: Array, as_published: bool,
+    models: Array,
+) -> None:  # fmt: skip
+    """The unknowns themselves: models (18,h) are v, C, t and R_RS (row-major), all of them in the
+    frame of the initial rotation. Arguments otherwise as :func:`solve_batch`.
+    """
+    work = np.empty(_INPUTS * LANES)
+    model = np.empty(MODEL_SIZE * LANES)
+    for start in range(0, len(samples), LANES):
+        gather(points, rays, tau, samples, rotations, start, work)
+        if as_published:
+            _free_lanes_as_published(work, model)
+        else:
+            _free_lanes(work, model)
+        scatter(model, 0, start, models)

@@ -36,7 +36,7 @@ distortion_model: plumb_bob
 distortion_coefficients: {data: [0, 0, 0, 0, 0]}
 """
 SQUARE = 0.03
-MARKERS = MarkerMap(wall("5x5_50", 2, 1, 0.07, 0.03), map_frame="hall")  # cells of 1 cm
+MARKERS = MarkerMap(wall("5x5_50", (2, 1), 0.07, 0.03), map_frame="hall")  # cells of 1 cm
 
 
 def render(cells: Any, corners: Any, x: float = 0.0) -> Any:
@@ -214,7 +214,7 @@ def test_other_numbers_are_no_times(
 def test_nothing_is_left_where_nothing_was_seen(
     files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = MarkerMap(wall("5x5_50", 1, 1, 0.1, 0.1, first_id=7))
+    other = MarkerMap(wall("5x5_50", (1, 1), 0.1, 0.1, first_id=7))
     write_marker_map(tmp_path / "map.yaml", other)
     image_bag(tmp_path / "bag", [markers()])
     assert detect(files, str(tmp_path / "bag"), *files.map) == 1

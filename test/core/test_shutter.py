@@ -4,7 +4,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.shutter import Motion, from_model_a, project_rolling
+from rs_localizer.core.shutter import Motion, project_rolling
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
@@ -77,7 +77,7 @@ def test_the_solvers_model_and_ours_agree_to_first_order():
     rng = np.random.default_rng(1)
     rotation = Rotation.random(random_state=2).as_matrix()
     c, w, t, point = np.array([0.2, 0.1, 3.0]), *rng.normal(size=(3, 3))
-    motion = from_model_a(rotation, c, w, t)
+    motion = Motion(rotation, c, -w, np.cross(w, c) - t)
     for tau in (1e-3, 1e-4):
         ours = motion.at(tau)[0] @ point + motion.at(tau)[1]
         theirs = Rotation.from_rotvec(tau * w).as_matrix() @ rotation @ point + c + tau * t

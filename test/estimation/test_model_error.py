@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 from scipy.linalg import null_space
+from scipy.spatial import cKDTree
 
 from rs_localizer.core.shake import shake_at, shake_basis, shake_in_the_middle
 from rs_localizer.estimation.columns import columns_of, with_prior
 from rs_localizer.estimation.evidence import evidence_of_sizes, possible, project_out, sizes_of
-from rs_localizer.estimation.model_error import neighbours_agree, with_model_error
+from rs_localizer.estimation.model_error import neighbours_agree, shared_errors, with_model_error
 from rs_localizer.estimation.prior import motion_terms
 
 from .projection import polynomials
@@ -293,3 +294,64 @@ def test_neighbours_agree_where_errors_are_shared_and_not_where_they_are_noise()
     # Nor do those that stand together in the image.
     corner = np.where(np.arange(60)[:, None] == 0, 1.0, 0.001 * rays)
     assert abs(neighbours_agree(shared, tau, corner, everything)) < 2.0
+
+
+@pytest.mark.parametrize("kind", ["shake", "field"])
+def test_what_a_frame_says_of_sizes_are_its_likelihoods(kind):
+    """Logarithms, less that of the first: of what explains more by itself, and the other beside."""
+    lines = list(frame(3))
+    matrix, _ = design(*lines)
+    group, size = (SHAKING, 1e-3) if kind == "shake" else (FIELDS, 1.0)
+    coefficients = np.random.default_rng(8).normal(size=len(group))
+    lines[0][lines[5]] += (size * matrix[:, group] @ coefficients).reshape(-1, 2)
+    _, errors = design(*lines)
+    columns = with_prior(columns_of(*lines, DEGREES, True), TERMS, STATE, DEVIATION)
+    sizes, freedom = np.array([1e-5, 1e-4, 1e-3]) * 10.0 ** (3 * (kind == "field")), 70.0
+    tried = {"shake": SHAKE_SIZES, "field": FIELD_SIZES} | {kind: sizes}
+    even = {name: np.full(len(each), 1 / len(each)) for name, each in tried.items()}
+    found = sizes_of(
+        columns, freedom, DEVIATION, tried["shake"], even["shake"], tried["field"], even["field"]
+    )
+    of_sizes = {"shake": found.of_shake_sizes, "field": found.of_field_sizes}
+    expected = np.array(
+        [dense_evidence(matrix, errors, freedom, DEVIATION, group, s)[0] for s in sizes]
+    )
+    # Each begins with the noise of the size before: the third step is nearly there.
+    np.testing.assert_allclose(of_sizes[kind], expected - expected[0], rtol=0.02, atol=0.1)
+    assert of_sizes[kind][-1] > 5.0
+    for name, each in of_sizes.items():
+        assert each.shape == tried[name].shape
+        assert each[0] == 0.0
+
+
+def test_errors_are_shared_as_far_as_the_nearest_neighbours_say():
+    rng = np.random.default_rng(2)
+    rays, everything = rng.uniform(-0.5, 0.5, (80, 2)), np.ones(80, dtype=bool)
+    inliers = rng.uniform(size=80) < 0.8
+    for correlation in (0.0, 0.5, 0.95):
+        # Corners of markers: two near each other, with part of their errors in common.
+        rays[1::2] = rays[::2] + 1e-3
+        own = rng.normal(size=(80, 2))
+        common = np.repeat(rng.normal(size=(40, 2)), 2, axis=0)
+        errors = np.sqrt(correlation) * common + np.sqrt(1 - correlation) * own
+        for counting in (everything, inliers):
+            chosen, at = errors[counting], rays[counting]
+            nearest = cKDTree(at).query(at, k=2)[1][:, 1]
+            raw = np.sum(chosen * chosen[nearest]) / np.sum(chosen**2)
+            expected = np.clip(raw - 1.5 / np.sqrt(2 * len(chosen)), 0.0, 0.9)
+            found = shared_errors(errors, rays, counting)
+            assert found == pytest.approx(expected)
+            assert shared_errors(7.0 * errors, rays - 3.0, counting) == pytest.approx(found)
+
+
+def test_noise_is_rarely_said_to_be_shared():
+    rng = np.random.default_rng(3)
+    rays, everything = rng.uniform(-0.5, 0.5, (100, 2)), np.ones(100, dtype=bool)
+    found = np.array(
+        [shared_errors(rng.normal(size=(100, 2)), rays, everything) for _ in range(300)]
+    )
+    # Nearest neighbours are often each other's: the correlation scatters by more than one sigma.
+    assert np.mean(found > 0.0) < 0.2
+    assert found.max() < 0.3
+    assert shared_errors(np.zeros((100, 2)), rays, everything) == 0.0
+    assert shared_errors(rng.normal(size=(100, 2)), rays, ~everything) == 0.0

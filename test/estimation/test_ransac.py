@@ -129,3 +129,18 @@ def test_scores_put_good_samples_first(problem):
     solver = Solver(model, outliers)
     run(observations, solver, [ranked], max_samples=1000)
     assert not outliers[solver.samples[0]].any()
+
+
+def test_it_goes_on_from_where_another_search_stopped(problem):
+    """The samples of the first count: towards the most, and towards being sure."""
+    observations, model, outliers = problem(0.5)
+    pools = [everything(observations)] * 2
+    first = run(observations, Solver(model, outliers, always_wrong=True), pools, max_samples=200)
+    solver = Solver(model, outliers)
+    later = run(observations, solver, pools, max_samples=250, start=first)
+    assert later.samples == 250
+    assert sum(map(len, solver.samples)) == 50
+    # Of 293 samples that it takes to be sure 280 were drawn before, and a block has 50.
+    sure = run(observations, Solver(model, outliers), pools)
+    before = Candidate(sure.state, sure.cost, 280)
+    assert run(observations, solver, pools, start=before).samples == 330

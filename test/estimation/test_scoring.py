@@ -1,6 +1,6 @@
 import numpy as np
 
-from rs_localizer.core.shutter import from_model_a
+from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.residuals import truncated_cost
 from rs_localizer.estimation.scoring import best_models, optimize, state_of_model
@@ -10,7 +10,8 @@ FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
 
 def test_models_become_states_by_the_motion_model(scene):
     model = np.random.default_rng(0).normal(size=18)
-    motion = from_model_a(model[:9].reshape(3, 3), model[9:12], model[12:15], model[15:18])
+    rotation, c, w, drift = model[:9].reshape(3, 3), model[9:12], model[12:15], model[15:18]
+    motion = Motion(rotation, c, -w, np.cross(w, c) - drift)
     np.testing.assert_allclose(state_of_model(model), scene.state_of(motion), atol=1e-15)
 
 

@@ -22,9 +22,9 @@ SIDEWAYS = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # z of the print along
 
 def corner() -> MarkerMap:
     """Two walls at a right angle."""
-    back = wall("4x4_50", 3, 2, 0.3, 0.1, pose=Pose(np.array([0.6, 2.0, 0]), UPRIGHT))
+    back = wall("4x4_50", (3, 2), 0.3, 0.1, pose=Pose(np.array([0.6, 2.0, 0]), UPRIGHT))
     left = wall(
-        "4x4_50", 3, 2, 0.3, 0.1, first_id=20, pose=Pose(np.array([-0.2, 1.2, 0]), SIDEWAYS)
+        "4x4_50", (3, 2), 0.3, 0.1, first_id=20, pose=Pose(np.array([-0.2, 1.2, 0]), SIDEWAYS)
     )
     return MarkerMap((*back, *left))
 
@@ -62,9 +62,9 @@ def test_true_maps_have_no_fault() -> None:
 
 
 def test_a_fisheye_lens_is_no_fault_of_the_map() -> None:
-    back = wall("4x4_250", 11, 7, 0.3, 0.1, pose=Pose(np.array([0.5, 1.2, 0.1]), UPRIGHT))
+    back = wall("4x4_250", (11, 7), 0.3, 0.1, pose=Pose(np.array([0.5, 1.2, 0.1]), UPRIGHT))
     left = wall(
-        "4x4_250", 3, 7, 0.3, 0.1, first_id=100, pose=Pose(np.array([-1.5, 0.5, 0.1]), SIDEWAYS)
+        "4x4_250", (3, 7), 0.3, 0.1, first_id=100, pose=Pose(np.array([-1.5, 0.5, 0.1]), SIDEWAYS)
     )
     told = MarkerMap((*back, *left))
     x, z, y = (told.points - np.array([0.5, -0.3, 0.1])).T
@@ -98,7 +98,7 @@ def test_a_marker_at_another_place_shows_in_an_image() -> None:
 
 def test_a_few_markers_of_many_at_another_place_show_in_an_image() -> None:
     true = MarkerMap(
-        wall("4x4_250", 9, 6, 0.12, 0.04, pose=Pose(np.array([0.5, 2.0, 0.0]), UPRIGHT))
+        wall("4x4_250", (9, 6), 0.12, 0.04, pose=Pose(np.array([0.5, 2.0, 0.0]), UPRIGHT))
     )
     places = iter(range(54))
     told = changed(true, lambda corners: corners + np.array([0, 0, 0.12 * (next(places) == 20)]))

@@ -106,7 +106,7 @@ def test_what_covers_a_corner_does_not_move_it(render: Any, look: Any, project: 
 
 def test_ids_are_rows_of_the_maps_points(render: Any, look: Any, project: Any) -> None:
     turned = Pose(np.array([0.0, 0.0, 0.0]), np.diag([-1.0, -1.0, 1.0]))
-    walls = wall("4x4_50", 2, 2, 0.06, 0.02, first_id=10, pose=turned)
+    walls = wall("4x4_50", (2, 2), 0.06, 0.02, first_id=10, pose=turned)
     board = Chessboard(4, 3, 0.02, Pose(np.array([0.0, 0.13, 0.0])))
     marker_map = MarkerMap(walls, (board,), "hall")
     prints = [(pattern(m.family, m.id), m.corners) for m in walls]
@@ -125,7 +125,7 @@ def test_ids_are_rows_of_the_maps_points(render: Any, look: Any, project: Any) -
 
 
 def test_markers_that_are_not_in_the_map_are_named(render: Any, look: Any) -> None:
-    known, other = wall("5x5_50", 2, 1, 0.08, 0.04)
+    known, other = wall("5x5_50", (2, 1), 0.08, 0.04)
     prints = [(pattern(m.family, m.id), m.corners) for m in (known, other)]
     found = MarkerDetector(MarkerMap((known,))).detect(render(prints, look()))
     assert found.ids.tolist() == [0, 1, 2, 3]
@@ -134,7 +134,7 @@ def test_markers_that_are_not_in_the_map_are_named(render: Any, look: Any) -> No
 
 
 def test_a_marker_that_is_seen_twice_is_not_used(render: Any, look: Any) -> None:
-    first, second, third = wall("5x5_50", 3, 1, 0.06, 0.03)
+    first, second, third = wall("5x5_50", (3, 1), 0.06, 0.03)
     prints = [
         (pattern(first.family, number), m.corners)
         for number, m in ((0, first), (1, second), (0, third))
@@ -154,7 +154,7 @@ def test_small_markers_are_left_out(render: Any, look: Any) -> None:
 def test_noise_shows_nothing() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
     marker_map = MarkerMap(
-        wall("apriltag_36h11", 10, 10, 0.1, 0.1),
+        wall("apriltag_36h11", (10, 10), 0.1, 0.1),
         (Charuco(5, 7, 0.04, 0.03, family("5x5_100")), Chessboard(6, 4, 0.03)),
     )
     assert len(MarkerDetector(marker_map).detect(noise).ids) == 0
@@ -165,7 +165,7 @@ def test_noise_shows_nothing() -> None:
 )
 def test_other_arrays_are_refused(image: Any) -> None:
     with pytest.raises(ValueError, match=r"an image must be \(h,w\) uint8, got"):
-        MarkerDetector(MarkerMap(wall("4x4_50", 1, 1, 0.1, 0.1))).detect(image)
+        MarkerDetector(MarkerMap(wall("4x4_50", (1, 1), 0.1, 0.1))).detect(image)
 
 
 def test_families_of_another_opencv_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

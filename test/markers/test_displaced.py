@@ -16,7 +16,7 @@ from rs_localizer.offline.detect import _RollingFit
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)
-MARKERS = MarkerMap(wall("4x4_50", 3, 2, 0.07, 0.03))
+MARKERS = MarkerMap(wall("4x4_50", (3, 2), 0.07, 0.03))
 
 
 def said(

@@ -70,7 +70,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     measured = Marker.at("aruco_original", 1000, 0.1, pose).corners + 1e-3 * np.eye(4, 3)
     written = MarkerMap(
         markers=(
-            *wall("4x4_50", 4, 3, 0.16, 0.04, first_id=5, pose=pose),
+            *wall("4x4_50", (4, 3), 0.16, 0.04, first_id=5, pose=pose),
             Marker(family("aruco_original"), 1000, measured),
         ),
         boards=(
@@ -93,7 +93,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 
 def test_wall_is_a_grid_around_its_middle() -> None:
     pose = Pose(np.array([0.0, 5.0, 1.0]), TURN.as_matrix())
-    markers = wall("apriltag_36h11", 3, 2, 0.1, 0.05, pose=pose)
+    markers = wall("apriltag_36h11", (3, 2), 0.1, 0.05, pose=pose)
     assert [marker.id for marker in markers] == list(range(6))
     centres = TURN.inv().apply([m.points.mean(axis=0) - pose.position for m in markers])
     expected = [[x, y, 0] for y in (0.075, -0.075) for x in (-0.15, 0, 0.15)]
@@ -206,7 +206,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 
 
 def test_a_written_map_explains_itself(tmp_path: Path) -> None:
-    write_marker_map(tmp_path / "wall.yaml", MarkerMap(wall("4x4_50", 2, 1, 0.1, 0.05)))
+    write_marker_map(tmp_path / "wall.yaml", MarkerMap(wall("4x4_50", (2, 1), 0.1, 0.05)))
     text = (tmp_path / "wall.yaml").read_text()
     for words in ("metres", "quaternion: x y z w", "x to the right, y up, z out of the paper"):
         assert words in text

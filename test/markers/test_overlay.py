@@ -15,7 +15,7 @@ from rs_localizer.markers.overlay import CameraPath, draw_detections, draw_world
 K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
 READOUT = 0.03
 CAMERA = Camera(640, 480, K, readout_time=READOUT)
-MAP = MarkerMap(wall("4x4_50", 2, 1, 0.2, 0.2))
+MAP = MarkerMap(wall("4x4_50", (2, 1), 0.2, 0.2))
 # Before the wall, turning fast and walking.
 POSITION, ANGULAR, LINEAR = np.array([0.05, 0.1, 1.0]), [2.0, -3.0, 4.0], [0.5, 0.3, -0.8]
 FACING = np.diag([1.0, -1.0, -1.0])

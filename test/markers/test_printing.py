@@ -24,7 +24,7 @@ PIXEL = 0.0254 / 300  # m, of the PNG files
 @pytest.mark.parametrize(
     "marker_map",
     [
-        MarkerMap(wall("apriltag_36h11", 2, 3, 0.055, 0.02, first_id=100)),
+        MarkerMap(wall("apriltag_36h11", (2, 3), 0.055, 0.02, first_id=100)),
         MarkerMap(boards=(Chessboard(6, 5, 0.029),)),
         MarkerMap(boards=(Charuco(5, 6, 0.035, 0.025, family("5x5_100"), 7),)),
         MarkerMap(boards=(Charuco(5, 6, 0.035, 0.025, family("5x5_100"), 7, True),)),
@@ -47,7 +47,7 @@ def test_a_page_is_as_its_map(marker_map: MarkerMap, tmp_path: Path) -> None:
 
 
 def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path: Path) -> None:
-    marker_map = MarkerMap(wall("4x4_50", 3, 1, 0.12, 0.1))
+    marker_map = MarkerMap(wall("4x4_50", (3, 1), 0.12, 0.1))
     pages = plan(marker_map)
     assert len(pages) == 3
     files = write_pages(pages, tmp_path / "wall.png")
@@ -58,8 +58,8 @@ def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path: Path)
     assert side == pytest.approx(0.12, abs=3e-5)
     # Small ones share a page, though the map has them on different walls.
     turned = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    other = wall("4x4_50", 2, 1, 0.05, 0.1, first_id=9, pose=Pose(np.zeros(3), turned))
-    (page,) = plan(MarkerMap((*wall("4x4_50", 2, 1, 0.05, 0.1), *other)))
+    other = wall("4x4_50", (2, 1), 0.05, 0.1, first_id=9, pose=Pose(np.zeros(3), turned))
+    (page,) = plan(MarkerMap((*wall("4x4_50", (2, 1), 0.05, 0.1), *other)))
     assert len(page.figures) == 4
 
 
@@ -77,7 +77,7 @@ def test_notes_do_not_cover_the_bar(name: str, tmp_path: Path) -> None:
 
 
 def test_pdf_has_the_size_of_the_paper(tmp_path: Path) -> None:
-    pages = plan(MarkerMap(wall("4x4_50", 3, 1, 0.12, 0.1)), "letter")
+    pages = plan(MarkerMap(wall("4x4_50", (3, 1), 0.12, 0.1)), "letter")
     (file,) = write_pages(pages, tmp_path / "wall.pdf")
     boxes = re.findall(rb"/MediaBox \[ ?0 0 ([\d.]+) ([\d.]+) ?\]", file.read_bytes())
     assert len(boxes) == 3
@@ -88,11 +88,11 @@ def test_pdf_has_the_size_of_the_paper(tmp_path: Path) -> None:
 
 def test_what_is_too_large_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PrintError, match="4x4_50 0 takes 400 x 400 mm, but a3 has room for 277 x"):
-        plan(MarkerMap(wall("4x4_50", 1, 1, 0.3, 0.1)), "a3")
+        plan(MarkerMap(wall("4x4_50", (1, 1), 0.3, 0.1)), "a3")
     with pytest.raises(PrintError, match="chessboard 9x6 takes 500 x 350 mm, but a4 has room"):
         plan(MarkerMap(boards=(Chessboard(9, 6, 0.05),)))
     with pytest.raises(PrintError, match=r"must end in .pdf or .png"):
-        write_pages(plan(MarkerMap(wall("4x4_50", 1, 1, 0.1, 0.1))), tmp_path / "wall.svg")
+        write_pages(plan(MarkerMap(wall("4x4_50", (1, 1), 0.1, 0.1))), tmp_path / "wall.svg")
 
 
 def standing() -> Any:
@@ -100,7 +100,7 @@ def standing() -> Any:
 
 
 def test_a_page_tells_how_the_map_lies_on_it() -> None:
-    (page,) = plan(MarkerMap(wall("4x4_50", 2, 3, 0.06, 0.02, pose=standing())))
+    (page,) = plan(MarkerMap(wall("4x4_50", (2, 3), 0.06, 0.02, pose=standing())))
     assert page.axes is not None
     assert (page.axes.right, page.axes.up, page.axes.out) == ("+x", "+z", "-y")
     # In the middle of the grid, which is that of all figures.
@@ -115,7 +115,7 @@ def test_a_page_tells_how_the_map_lies_on_it() -> None:
 
 
 def test_what_is_cut_out_tells_where_it_goes() -> None:
-    pages = plan(MarkerMap(wall("4x4_50", 2, 1, 0.1, 0.5)))
+    pages = plan(MarkerMap(wall("4x4_50", (2, 1), 0.1, 0.5)))
     labels = [figure.label for page in pages for _, _, figure in page.figures]
     assert [label.split("  ")[-1] for label in labels] == [
         "middle at (-0.3, 0, 0) m", "middle at (0.3, 0, 0) m",

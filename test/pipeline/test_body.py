@@ -28,7 +28,8 @@ from rs_localizer.io.transforms.rigid import Transform, TransformError, read_tra
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
 
 Make = Callable[..., SimpleNamespace]
 READOUT_TIME = 0.03

@@ -24,7 +24,8 @@ from rs_localizer.io.outputs import Frame
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import ConstantVelocity
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
 
 Make = Callable[..., SimpleNamespace]
 

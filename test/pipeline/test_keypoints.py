@@ -23,7 +23,8 @@ from rs_localizer.lab.simulation.landmarks import keypoint_rows, map_rows, rando
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.matching import Matcher
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
 
 READOUT_TIME = 0.03
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=4000)
@@ -133,7 +134,7 @@ def test_a_map_that_is_missing_and_comes_late(
     assert (reason, detail) == (
         "no_map", "no usable map has come yet, on map_points or as map_file"
     )  # fmt: skip
-    assert node.missing == ("a map",)
+    assert node.missing == ("map_points",)
     assert node.map is None
     node.take_map(map_cloud(LANDMARKS))
     assert node.missing == ()
@@ -146,7 +147,7 @@ def test_a_map_that_is_missing_and_comes_late(
 def test_correspondences_need_no_map(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     node = localizer(make_camera_info)
     assert refused(node.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_map"
-    assert node.missing == ("a map",)
+    assert node.missing == ("map_points",)
     rows = np.empty(len(frames[1].points), [(name, "<f8") for name in "xyzuv"])
     for name, column in zip("xyzuv", [*frames[1].points.T, *frames[1].pixels.T], strict=True):
         rows[name] = column

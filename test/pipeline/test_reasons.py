@@ -7,6 +7,7 @@ from pathlib import Path
 
 import rs_localizer
 from rs_localizer.core.types import Reason
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.pipeline.reasons import REASONS, explained
 
 PACKAGE = Path(rs_localizer.__file__).parent
@@ -18,7 +19,7 @@ def test_the_table_is_that_of_the_code() -> None:
     used = {str(reason) for reason in Reason}
     for path in PACKAGE.rglob("*.py"):
         used |= set(re.findall(r"Refusal\(\s*\"(\w+)\"", path.read_text()))
-    used |= {"bad_camera_info", "bad_map"}  # of replay.py, put together
+    used |= {item.refused for item in INPUTS.values()}
     used |= set(
         re.findall(r"_NO_TRANSFORM = \"(\w+)\"", (PACKAGE / "pipeline" / "frames.py").read_text())
     )

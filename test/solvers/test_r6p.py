@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.solvers import r6p
 
-BOUND = 0.6
+BOUND = 1.0
 MONOMIALS = sorted(
     (m for m in itertools.product(range(5), repeat=3) if sum(m) <= 4), key=lambda m: (sum(m), m)
 )

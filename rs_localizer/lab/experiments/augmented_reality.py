@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
@@ -19,7 +19,7 @@ from rs_localizer.lab.experiments.augmented_reality_claims import QUANTILES, Fra
 from rs_localizer.lab.experiments.cube_clip import cube_clip
 from rs_localizer.lab.experiments.marker_frames import CAMERA, MarkerFrame, MarkerWalls
 from rs_localizer.lab.experiments.methods import available
-from rs_localizer.lab.experiments.plain_ransac import best_of_samples, observe
+from rs_localizer.lab.experiments.plain_ransac import PlainRansac
 from rs_localizer.lab.experiments.results import Context, Result, Table
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import SOLVERS
@@ -68,7 +68,9 @@ def run(context: Context) -> Result:
         taken=len(frames),
         speeds=np.array([frame.speed for frame in shown]),
         plain=plain,
+        plain_owners=_owners(deep),
         products=products,
+        owners=_owners(shown),
         positions={solver: e.positions for solver, e in estimates.items()},
         seconds={solver: e.seconds for solver, e in estimates.items()},
         cube=clip.errors,
@@ -82,8 +84,8 @@ def run(context: Context) -> Result:
         "is that of all their corners, each predicted at its own row's pose; a frame without a "
         f"pose has infinite errors. Left: the best of {_SAMPLES} minimal models, as in the paper, "
         f"on the {len(deep)} frames that show more than one wall (six points of a plane are no "
-        f"sample for R6P). Right: the Localizer with at most {_SAMPLES} samples, all frames, each "
-        "for itself.",
+        f"sample for R6P); R9P by its own model. Right: the Localizer with at most "
+        f"{_SAMPLES} samples, all frames, each for itself.",
         claims(found),
         {
             "augmented_reality": _quantile_table(plain, products),
@@ -98,25 +100,29 @@ def run(context: Context) -> Result:
     )
 
 
-def _errors(motion: Motion, frame: MarkerFrame) -> Array:
+def _owners(frames: Sequence[MarkerFrame]) -> IntArray:
+    """The frame of each corner."""
+    return np.repeat(np.arange(len(frames)), [len(frame.points) for frame in frames])
+
+
+def _errors(
+    poses_at: Callable[[Array], tuple[Array, Array]], points: Array, pixels: Array
+) -> Array:
     """Distances (n,) of all detected corners from where a motion puts them, px."""
-    predicted = project_rolling(CAMERA, motion.at_rows, frame.points)[0]
-    errors: Array = np.linalg.norm(predicted - frame.pixels, axis=1)
+    predicted = project_rolling(CAMERA, poses_at, points)[0]
+    errors: Array = np.linalg.norm(predicted - pixels, axis=1)
     return np.where(np.isnan(errors), np.inf, errors)
 
 
 def _plain_errors(frame: MarkerFrame, method: m.Method, seed: int) -> Array:
     """With the best of so many minimal models, started from that of P3P."""
-    observations = observe(CAMERA, frame.points, frame.pixels)
-    state, _ = best_of_samples(observations, m.P3P, np.eye(3), _SAMPLES, _THRESHOLD, seed)
+    search = PlainRansac.of(CAMERA, frame.points, frame.pixels, _SAMPLES, _THRESHOLD, seed)
+    best = search.best(m.P3P)
     if method is not m.P3P:
-        rotation = np.nan_to_num(state[:9].reshape(3, 3))
-        state, _ = best_of_samples(observations, method, rotation, _SAMPLES, _THRESHOLD, seed)
-    if not np.all(np.isfinite(state)):
+        best = search.best(method, best.rotation)
+    if best.poses_at is None:
         return np.full(len(frame.points), np.inf)
-    rotation = state[:9].reshape(3, 3)
-    translation = state[9:12] - rotation @ frame.points.mean(axis=0)
-    return _errors(Motion(rotation, translation, state[12:15], state[15:18]), frame)
+    return _errors(best.poses_at, frame.points - frame.points.mean(axis=0), frame.pixels)
 
 
 def _localize(frames: Sequence[MarkerFrame], solver: str) -> _Estimates:
@@ -131,7 +137,7 @@ def _localize(frames: Sequence[MarkerFrame], solver: str) -> _Estimates:
             times.append(time.perf_counter() - start)
         seconds.append(min(times))
         if found:
-            errors.append(_errors(found, frame))
+            errors.append(_errors(found.at_rows, frame.points, frame.pixels))
             positions.append(float(np.linalg.norm(found.position - frame.position)))
         else:
             errors.append(np.full(len(frame.points), np.inf))

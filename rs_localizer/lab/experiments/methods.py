@@ -59,7 +59,6 @@ REFINED = Method("refined", f"ours, refined on {POINTS} points", "r6p_vcwt", as_
 
 PAPERS = (P3P, R6P, VC_WT, VCT_W, VCT_WT, VCWT, R9P)
 TWO_STEP = (VC_WT, VCT_W, VCT_WT)
-SIX_POINT = (R6P, *TWO_STEP, VCWT)
 OURS = (VCWT_OURS, R9P_OURS, JOINT, REFINED)
 ALL = PAPERS + OURS
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.state import STATE_SIZE
+from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.ransac import MODEL_SIZE
 from rs_localizer.estimation.sampling import draw, generator
 from rs_localizer.estimation.scoring import best_models
+from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.methods import Method
+from rs_localizer.lab.experiments.own_model import best_free_motion, solve_all
 from rs_localizer.solvers.table import find_solver
 
 
@@ -30,40 +34,83 @@ def observe(camera: Camera, points: Array, pixels: Array) -> Observations:
     )
 
 
-def best_of_samples(
-    observations: Observations,
-    method: Method,
-    rotation: Array,
-    samples: int,
-    threshold: float,
-    seed: int,
-) -> tuple[Array, int]:
-    """State (24,) of the best minimal model and its number of inliers.
+@dataclass(frozen=True, slots=True, eq=False)
+class Best:
+    """The best minimal model of a frame."""
 
-    Args:
-        rotation: initial rotation (3,3).
-        samples: all of them are drawn.
-        threshold: px, of an inlier and of the truncated error by which models are ranked.
-    """
-    solver = find_solver(method.solver)
-    count = len(observations)
-    if count < solver.sample_size:
-        return np.full(STATE_SIZE, np.nan), 0
-    drawn = np.empty((samples, solver.sample_size), dtype=np.int64)
-    draw(
-        np.arange(count), np.full(samples, count), observations.tau,
-        float(np.ptp(observations.tau)), generator(seed), drawn,
-    )  # fmt: skip
-    models = np.empty((solver.solutions, MODEL_SIZE, samples))
-    solve = solver.solve_as_published if method.as_published else solver.solve
-    solve(
-        observations.points, observations.rays, observations.tau, drawn, rotation[None],
-        method.iterations, models,
-    )  # fmt: skip
-    states, costs = best_models(
-        models, observations.packed, observations.row_time_gradient, threshold, 1, math.inf
-    )
-    if not math.isfinite(costs[0]):
-        return np.full(STATE_SIZE, np.nan), 0
-    inliers = observations.squared_errors(states[0]) < threshold**2
-    return states[0], int(np.count_nonzero(inliers))
+    # Row times (n,) -> matrices (n,3,3) and translations (n,3) that take the centred points to the
+    # camera; None: no model.
+    poses_at: Callable[[Array], tuple[Array, Array]] | None
+    rotation: Array  # (3,3) at the middle row, to start other solvers from
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlainRansac:
+    """One frame, and what the search may spend on it."""
+
+    observations: Observations  # of centred points
+    by_ray: Array  # (n,2,2)
+    samples: int  # all of them are drawn
+    threshold: float  # px, of an inlier and of the truncated error by which models are ranked
+    seed: int
+
+    @classmethod
+    def of(
+        cls, camera: Camera, points: Array, pixels: Array, samples: int, threshold: float, seed: int
+    ) -> PlainRansac:
+        """Points (n,3) and their raw pixels (n,2)."""
+        observations = observe(camera, points, pixels)
+        by_ray = camera.pixel_jacobian(observations.rays)
+        return cls(observations, by_ray, samples, threshold, seed)
+
+    def best(self, method: Method, rotation: Array | None = None) -> Best:
+        """The best model of all samples; that of R9P is its own, which is no motion.
+
+        Args:
+            rotation: initial rotation (3,3); the identity by default.
+        """
+        rotation = np.eye(3) if rotation is None else rotation
+        if len(self.observations) < find_solver(method.solver).sample_size:
+            return Best(None, rotation, 0)
+        found = self._free if method.solver == m.R9P.solver else self._rigid
+        return found(method, self._drawn(method), rotation)
+
+    def _rigid(self, method: Method, drawn: IntArray, rotation: Array) -> Best:
+        solver, observations = find_solver(method.solver), self.observations
+        models = np.empty((solver.solutions, MODEL_SIZE, len(drawn)))
+        solve = solver.solve_as_published if method.as_published else solver.solve
+        solve(
+            observations.points, observations.rays, observations.tau, drawn, rotation[None],
+            method.iterations, models,
+        )  # fmt: skip
+        states, costs = best_models(
+            models, observations.packed, observations.row_time_gradient, self.threshold, 1,
+            math.inf,
+        )  # fmt: skip
+        if not math.isfinite(costs[0]):
+            return Best(None, rotation, 0)
+        state = states[0]
+        motion = Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18])
+        return Best(motion.at_rows, motion.rotation,
+                    self._inliers(observations.squared_errors(state)))  # fmt: skip
+
+    def _free(self, method: Method, drawn: IntArray, rotation: Array) -> Best:
+        models = solve_all(self.observations, drawn, rotation, method.as_published)
+        motion = best_free_motion(models, self.observations, self.by_ray, self.threshold)
+        if motion is None:
+            return Best(None, rotation, 0)
+        errors = motion.squared_errors(self.observations, self.by_ray)
+        return Best(motion.at_rows, rotation, self._inliers(errors))
+
+    def _inliers(self, squared_errors: Array) -> int:
+        return int(np.count_nonzero(squared_errors < self.threshold**2))
+
+    def _drawn(self, method: Method) -> IntArray:
+        count = len(self.observations)
+        drawn = np.empty((self.samples, find_solver(method.solver).sample_size), dtype=np.int64)
+        draw(
+            np.arange(count), np.full(self.samples, count), self.observations.tau,
+            self.observations.row_range, generator(self.seed), drawn,
+        )  # fmt: skip
+        return drawn

@@ -26,7 +26,15 @@ from rs_localizer.lab.experiments.results import (
     judge_intervals,
 )
 from rs_localizer.lab.experiments.uncertainty import CONFIDENCE, Interval, share, together
-from rs_localizer.lab.experiments.views import GROSS, Outcome, View, outcome, uniform_pixels
+from rs_localizer.lab.experiments.views import (
+    GROSS,
+    Outcome,
+    View,
+    direction,
+    outcome,
+    seen_at,
+    uniform_pixels,
+)
 from rs_localizer.localizer import Localizer
 
 _SIZE = 1000
@@ -180,10 +188,10 @@ def _view(case: Case, view: Camera, rng: np.random.Generator) -> View:
     """A frame: pixels are drawn first, and their points lie on the rays of their rows."""
     n = case.points
     pixels = uniform_pixels(view, n, rng)
-    place = case.offset * _direction(rng)
+    place = case.offset * direction(rng)
     motion = _motion(so3.exp(math.pi * rng.uniform(-1.0, 1.0, 3)), place + rng.normal(size=3), case,
                      rng)  # fmt: skip
-    points = _seen_at(motion, view, pixels, rng.uniform(*_DEPTH, n))
+    points = seen_at(motion, view, pixels, rng.uniform(*_DEPTH, n))
     group = np.zeros(n, dtype=np.int64)  # 0: the scene
     order, first = rng.permutation(n), 0
     for kind, part in enumerate((case.uniform, case.second, case.shifted), 1):
@@ -195,33 +203,19 @@ def _view(case: Case, view: Camera, rng: np.random.Generator) -> View:
     other = group == 2
     turn, way = _OBJECT
     beside = _motion(
-        so3.exp(math.radians(turn) * _direction(rng)) @ motion.rotation,
-        -motion.rotation.T @ motion.translation + way * _direction(rng),
+        so3.exp(math.radians(turn) * direction(rng)) @ motion.rotation,
+        -motion.rotation.T @ motion.translation + way * direction(rng),
         case,
         rng,
     )
-    points[other] = _seen_at(beside, view, pixels[other], rng.uniform(*_DEPTH, n)[other])
+    points[other] = seen_at(beside, view, pixels[other], rng.uniform(*_DEPTH, n)[other])
     points[group == 3] += _PERIOD * motion.rotation[0]  # along the rows of the image
     return View(view, points, measured, pixels, group == 0, motion, _NOISE)
 
 
 def _motion(rotation: Array, position: Array, case: Case, rng: np.random.Generator) -> Motion:
     turn, travel = math.radians(10.0) * case.motion, 0.1 * case.motion
-    return Motion(rotation, -rotation @ position, turn * _direction(rng), travel * _direction(rng))
-
-
-def _seen_at(motion: Motion, view: Camera, pixels: Array, depth: Array) -> Array:
-    """Points (n,3) in the map that are seen at pixels (n,2), each at the time of its row."""
-    rotations, translations = motion.at_rows(view.row_time(pixels))
-    local = depth[:, None] * np.column_stack([view.rays(pixels), np.ones(len(pixels))])
-    points: Array = np.einsum("nji,nj->ni", rotations, local - translations)
-    return points
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    vector = rng.normal(size=3)
-    unit: Array = vector / np.linalg.norm(vector)
-    return unit
+    return Motion(rotation, -rotation @ position, turn * direction(rng), travel * direction(rng))
 
 
 def _scores(case: Case, inliers: BoolArray, rng: np.random.Generator) -> Array | None:

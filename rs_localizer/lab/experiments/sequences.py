@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.shutter import Motion
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.lab.experiments.views import direction, seen_at, uniform_pixels
 from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import RecordedMotion
@@ -23,6 +26,8 @@ _POINTS = 150
 _OUTLIERS = 0.3
 _READOUT_TIME = 0.03
 _WAY_SAMPLES = 400
+_HARD_TURN, _HARD_WAY = 30.0, 0.3  # deg and m per readout
+_DEPTH = (1.0, 4.0)  # m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +69,22 @@ def action_camera(trajectory: Path, frames: int, seed: int) -> Sequence:
         "action camera, 1920x1080, 8 px (simulated, three times as fast)",
         camera,
         tuple(_fly(camera, trajectory, frames, seed, noise=2.0, speed=3.0)),
+        8.0,
+    )
+
+
+def hard(frames: int, seed: int) -> Sequence:
+    """The action camera under the fastest motion of the paper's synthetic experiments, 8 px.
+
+    No hand keeps that up: every frame is of a motion by itself, in any direction, past points at
+    all depths from 1 to 4 m.
+    """
+    camera = _camera(1920, 1080, focal=900.0)
+    return Sequence(
+        "hard",
+        f"{_HARD_TURN:g} degrees and {_HARD_WAY:g} m per readout, 1920x1080, 8 px (simulated)",
+        camera,
+        tuple(_single(camera, np.random.default_rng([seed, k]), noise=2.0) for k in range(frames)),
         8.0,
     )
 
@@ -124,6 +145,21 @@ def _fly(
     )
     for frame in simulated:
         yield Frame(frame.points, frame.pixels)
+
+
+def _single(camera: Camera, rng: np.random.Generator, noise: float) -> Frame:
+    motion = Motion(
+        so3.exp(rng.uniform(0.0, np.pi) * direction(rng)),
+        rng.normal(size=3),
+        np.radians(_HARD_TURN) * direction(rng),
+        _HARD_WAY * direction(rng),
+    )
+    pixels = uniform_pixels(camera, _POINTS, rng)
+    points = seen_at(motion, camera, pixels, rng.uniform(*_DEPTH, _POINTS))
+    pixels += noise * rng.normal(size=pixels.shape)
+    wrong = round(_OUTLIERS * _POINTS)
+    pixels[:wrong] = uniform_pixels(camera, wrong, rng)
+    return Frame(points, pixels)
 
 
 def _evenly(count: int, wanted: int) -> list[int]:

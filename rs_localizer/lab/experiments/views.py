@@ -128,3 +128,18 @@ def synthetic_views(
 def uniform_pixels(view: Camera, count: int, rng: np.random.Generator) -> Array:
     """Pixels (count,2) anywhere in the image."""
     return rng.uniform(-0.5, np.array(view.size) - 0.5, (count, 2))
+
+
+def seen_at(motion: Motion, view: Camera, pixels: Array, depth: Array) -> Array:
+    """Points (n,3) in the map that are seen at pixels (n,2), each at the time of its row."""
+    rotations, translations = motion.at_rows(view.row_time(pixels))
+    local = depth[:, None] * np.column_stack([view.rays(pixels), np.ones(len(pixels))])
+    points: Array = np.einsum("nji,nj->ni", rotations, local - translations)
+    return points
+
+
+def direction(rng: np.random.Generator) -> Array:
+    """Any unit vector (3,)."""
+    vector = rng.normal(size=3)
+    unit: Array = vector / np.linalg.norm(vector)
+    return unit

@@ -100,13 +100,13 @@ class Motions:
 
 def rest(count: int, rng: np.random.Generator) -> Motions:
     """Cameras that do not move."""
-    return _motions(count, rng, np.zeros((count, 1, 6)), np.ones((count, 1)))
+    return _motions(count, rng, _no_waves(count))
 
 
 def hand(count: int, rng: np.random.Generator, slower: float = 1.0) -> Motions:
     """Cameras in a hand; ``slower`` divides its velocities and accelerations."""
     waves = _waves(count, rng, _HAND_HERTZ, _HAND_RATE / slower, _HAND_SPEED / slower)
-    return _motions(count, rng, *waves)
+    return _motions(count, rng, waves)
 
 
 def vibration(count: int, rng: np.random.Generator, degrees: float, hertz: float) -> Motions:
@@ -117,8 +117,10 @@ def vibration(count: int, rng: np.random.Generator, degrees: float, hertz: float
     return _motions(
         count,
         rng,
-        np.concatenate([amplitude, shaking], axis=1),
-        np.column_stack([frequency, np.full(count, 2.0 * np.pi * hertz)]),
+        (
+            np.concatenate([amplitude, shaking], axis=1),
+            np.column_stack([frequency, np.full(count, 2.0 * np.pi * hertz)]),
+        ),
         in_step=True,
     )
 
@@ -140,9 +142,7 @@ def shaken_hand(
 def steady(count: int, rng: np.random.Generator, rate: float, speed: float) -> Motions:
     """Cameras that turn (rad/s) and move (m/s) steadily, in any direction."""
     velocities = [rate * directions(count, rng), speed * directions(count, rng)]
-    return _motions(
-        count, rng, np.zeros((count, 1, 6)), np.ones((count, 1)), np.column_stack(velocities)
-    )
+    return _motions(count, rng, _no_waves(count), np.column_stack(velocities))
 
 
 def sudden_stop(count: int, rng: np.random.Generator, earliest: float, latest: float) -> Motions:
@@ -151,11 +151,9 @@ def sudden_stop(count: int, rng: np.random.Generator, earliest: float, latest: f
     return _motions(
         count,
         rng,
-        np.zeros((count, 1, 6)),
-        np.ones((count, 1)),
+        _no_waves(count),
         np.column_stack(velocities),
-        rng.uniform(earliest, latest, count),
-        rng.uniform(*_STOP_SECONDS, count),
+        (rng.uniform(earliest, latest, count), rng.uniform(*_STOP_SECONDS, count)),
     )
 
 
@@ -164,6 +162,10 @@ def directions(count: int, rng: np.random.Generator) -> Array:
     vectors = rng.normal(size=(count, 3))
     unit: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return unit
+
+
+def _no_waves(count: int) -> tuple[Array, Array]:
+    return np.zeros((count, 1, 6)), np.ones((count, 1))
 
 
 def _waves(
@@ -184,14 +186,23 @@ def _waves(
 def _motions(
     count: int,
     rng: np.random.Generator,
-    amplitude: Array,
-    frequency: Array,
+    waves: tuple[Array, Array],
     steady: Array | None = None,
-    stop: Array | None = None,
-    stopping: Array | None = None,
+    stop: tuple[Array, Array] | None = None,
     in_step: bool = False,
 ) -> Motions:
-    """From any first pose. ``in_step``: the last sine shakes all axes at once, about one line."""
+    """From any first pose.
+
+    Args:
+        count: how many.
+        rng: source of chance.
+        waves: amplitudes (count,k,6) and frequencies (count,k), rad/s, of the sines.
+        steady: (count,6) velocities; None: zero.
+        stop: when they stop (count,) and for how long they brake, s; None: they do not.
+        in_step: the last sine shakes all axes at once, about one line.
+    """
+    amplitude, frequency = waves
+    when, braking = (np.full(count, np.inf), np.ones(count)) if stop is None else stop
     phase = rng.uniform(0.0, 2.0 * np.pi, amplitude.shape)
     if in_step:
         phase[:, -1] = phase[:, -1, :1]
@@ -202,6 +213,6 @@ def _motions(
         frequency,
         phase,
         np.zeros((count, 6)) if steady is None else steady,
-        np.full(count, np.inf) if stop is None else stop,
-        np.ones(count) if stopping is None else stopping,
+        when,
+        braking,
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -153,9 +154,8 @@ def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
         for name, style in _methods(poses):
             if name in series:
                 one = series[name]
-                _draw_series(
-                    axes, name, style, one.stamps_ns, np.maximum(values(one), _LEAST), start, unit
-                )
+                shown = np.maximum(values(one), _LEAST)
+                _draw_series(axes, _Series(name, style, one.stamps_ns, shown), start, unit)
         digits = [np.log10(np.maximum(values(one), _LEAST)) for one in series.values()]
         low, high = _range(digits, _ROOM_OF_DIGITS)
         axes.set_ylim(10.0**low, 10.0**high)
@@ -167,20 +167,23 @@ def errors(poses: Mapping[str, Errors], twists: Mapping[str, Errors]) -> Figure:
     return figure
 
 
+class _Series(NamedTuple):
+    """Values of a method over time."""
+
+    name: str
+    style: _Style
+    stamps_ns: Stamps
+    values: Array
+
+
 def _draw_series(
-    axes: Axes,
-    name: str,
-    style: _Style,
-    stamps_ns: Stamps,
-    values: Array,
-    start: int,
-    unit: str,
-    counted: Array | None = None,
+    axes: Axes, series: _Series, start: int, unit: str, counted: Array | None = None
 ) -> None:
     """Single values as pale marks, their running median as a line.
 
     The legend has the median of all values, or of those that are ``counted``.
     """
+    name, style, stamps_ns, values = series
     t = _seconds(stamps_ns, start)
     axes.plot(
         t, values, linestyle="none", marker=style.marker, markersize=3.0, markeredgewidth=0.6,
@@ -223,7 +226,8 @@ def inliers(
     for (name, style), values in zip(_methods(counts), counts.values(), strict=True):
         # As in the table: what a refused frame would have had, nobody knows.
         localized = values[values > 0.0]
-        _draw_series(upper, name, style, stamps_ns, values, int(stamps_ns[0]), "", localized)
+        series = _Series(name, style, stamps_ns, values)
+        _draw_series(upper, series, int(stamps_ns[0]), "", localized)
     upper.set_ylim(bottom=0.0)
     upper.set_ylabel("inliers (0: frame refused)")
     _legend(upper, 3)

@@ -84,7 +84,8 @@ def three_walls(way: TrueState) -> Scene:
         frame = box.axes @ np.column_stack([right, up, np.cross(right, up)])
         pose = Pose(box.axes @ middle, frame)
         size = scale * side
-        made = wall(_FAMILY, columns, rows, size, _GAP * size, first_id=len(markers), pose=pose)
+        gap = _GAP * size
+        made = wall(_FAMILY, (columns, rows), size, gap, first_id=len(markers), pose=pose)
         planes.append(_marker_plane(pose, columns, rows, size, len(markers), light))
         markers += made
     return Scene(tuple(planes), MarkerMap(tuple(markers)))

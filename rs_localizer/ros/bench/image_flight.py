@@ -35,6 +35,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 from tqdm import tqdm
 
+from rs_localizer.io import topics
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import (
@@ -45,9 +46,9 @@ from rs_localizer.io.recording import (
     RAW_IMAGE_TOPIC,
 )
 from rs_localizer.ros.node.conversion import copy_message
-from rs_localizer.settings import NODE_NAME
+from rs_localizer.settings import DETECTOR_NAME, NODE_NAME
 
-_POSE, _TWIST = f"/{NODE_NAME}/pose", f"/{NODE_NAME}/twist"
+_POSE, _TWIST = f"/{NODE_NAME}/{topics.POSE}", f"/{NODE_NAME}/{topics.TWIST}"
 _KINDS = {_POSE: PoseStamped, _TWIST: TwistStamped}
 _QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 # The nodes' inputs are best effort, and a busy machine loses messages: here, none may be lost.
@@ -127,11 +128,11 @@ def _flight(images: Path, parameters: list[str]) -> Iterator[_Flight]:
     """Both nodes, started and ready, until the end."""
     given = [word for parameter in parameters for word in ("-p", parameter)]
     processes = {
-        "marker_detector": _start(
+        DETECTOR_NAME: _start(
             "marker_detector",
             *("-p", f"marker_map:={images / MARKER_MAP}"),
-            *("-r", f"image:={RAW_IMAGE_TOPIC.removesuffix('/compressed')}"),
-            *("-r", f"image/compressed:={RAW_IMAGE_TOPIC}"),
+            *("-r", f"{topics.IMAGE}:={RAW_IMAGE_TOPIC.removesuffix('/compressed')}"),
+            *("-r", f"{topics.COMPRESSED_IMAGE}:={RAW_IMAGE_TOPIC}"),
             *("-p", _RELIABLE.format(RAW_IMAGE_TOPIC)),
         ),
         "localizer": _start(
@@ -206,8 +207,7 @@ class _Flight:
             _START_TIMEOUT,
             "the nodes do not listen",
         )
-        end = time.monotonic() + _ACQUAINTANCE
-        self._wait(lambda: time.monotonic() > end, _START_TIMEOUT, "")
+        self._wait_until(time.monotonic() + _ACQUAINTANCE)
 
     def send(self, images: Path, offline: Mapping[str, Mapping[int, Any]]) -> int:
         """All images of a bag; the answers that replay has are waited for."""
@@ -250,12 +250,15 @@ class _Flight:
                 self._infos.publish(message)
                 continue
             due = start + len(sent) / rate
-            self._wait(lambda due=due: time.monotonic() >= due, _ANSWER_TIMEOUT, "")
+            self._wait_until(due)
             sent[stamp_ns(message)] = time.monotonic()
             self._images.publish(message)
-        end = time.monotonic() + _LAST_ANSWERS
-        self._wait(lambda: time.monotonic() > end, _ANSWER_TIMEOUT, "")
+        self._wait_until(time.monotonic() + _LAST_ANSWERS)
         return sent
+
+    def _wait_until(self, due: float) -> None:
+        """Hear what comes until then (time.monotonic())."""
+        self._wait(lambda: time.monotonic() >= due, _START_TIMEOUT, "")
 
     def _answered(self, image: int, pose: int | None, topics: list[str]) -> bool:
         return image in self._detected and all(pose in self.heard[topic] for topic in topics)

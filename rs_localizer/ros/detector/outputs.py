@@ -11,6 +11,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
+from rs_localizer.io import topics
 from rs_localizer.io.messages import make_header
 from rs_localizer.markers.overlay import Picture
 from rs_localizer.pipeline.images import Detected, correspondences
@@ -31,9 +32,9 @@ class DetectorOutputs:
 
     def __init__(self, node: LifecycleNode) -> None:
         self._node = node
-        self._clouds = self._create(PointCloud2, "correspondences")
-        self._pictures = self._create(Image, "~/debug_image")
-        self._jpegs = self._create(CompressedImage, "~/debug_image/compressed")
+        self._clouds = self._create(PointCloud2, topics.CORRESPONDENCES)
+        self._pictures = self._create(Image, f"~/{topics.DEBUG_IMAGE}")
+        self._jpegs = self._create(CompressedImage, f"~/{topics.COMPRESSED_DEBUG_IMAGE}")
         # Held while publishing: after close() nothing is published any more.
         self._lock = threading.Lock()
         self._closed = False

@@ -6,14 +6,18 @@ import time
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
+from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.lab.measures.comparison import Answer
 
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# Of the diagnostics: frames that will never be answered.
+_UNANSWERED = ("Frames refused", "Frames replaced", "Frames dropped")
 # Frames that the latency is judged by.
 _RECENT = 20
 
@@ -27,6 +31,8 @@ class Listener:
 
     def __init__(self, delay_ns: int) -> None:
         self._delay_ns = delay_ns
+        self._status = ""
+        self.unanswered: int | None = None  # frames, by the node's diagnostics; None: none came yet
         self.clear()
 
     def clear(self) -> None:
@@ -38,11 +44,13 @@ class Listener:
 
     def subscribe(self, node: Any, prefix: str) -> None:
         for message_type, name, callback in (
-            (PoseStamped, "pose", self._take_pose),
-            (TwistStamped, "twist", self._take_twist),
-            (PointCloud2, "inliers", self._take_inliers),
+            (PoseStamped, topics.POSE, self._take_pose),
+            (TwistStamped, topics.TWIST, self._take_twist),
+            (PointCloud2, topics.INLIERS, self._take_inliers),
         ):
             node.create_subscription(message_type, f"{prefix}/{name}", callback, _QOS)
+        self._status = f"{prefix.lstrip('/')}: localizer"
+        node.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self._take_status, _QOS)
 
     def expect(self, stamp: int) -> None:
         self._sent[stamp] = time.perf_counter()
@@ -79,6 +87,12 @@ class Listener:
 
     def _take_twist(self, message: TwistStamped) -> None:
         self._twists[stamp_ns(message) - self._delay_ns] = message
+
+    def _take_status(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == self._status:
+                values = {item.key: item.value for item in status.values}
+                self.unanswered = sum(int(values.get(name, 0)) for name in _UNANSWERED)
 
     def _take_inliers(self, message: PointCloud2) -> None:
         self._inliers[stamp_ns(message)] = message

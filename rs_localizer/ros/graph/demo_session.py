@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from statistics import median
@@ -19,6 +19,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from rs_localizer.config import PoseTime
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES
 from rs_localizer.lab.measures.comparison import Answer, Recording
 from rs_localizer.process.stopping import StopSignals
 from rs_localizer.ros.graph.demo_listener import Listener
@@ -35,6 +36,8 @@ _FIRST_ANSWER_TIMEOUT = 20.0
 # far; an answer that is later still counts when it comes.
 _PATIENCE = 10.0
 _ANSWER_TIMEOUT = (0.1, 1.0)
+# How long a node that may lose no frame has (s) to say, once a second, that it has refused one.
+_ACCOUNT_TIMEOUT = 30.0
 _REST_TIME = 0.3
 _STOP_TIMEOUT = 10.0
 
@@ -71,14 +74,20 @@ class Session:
         readout_time: float,
         methods: Mapping[str, Mapping[str, Any]],
         progress: Callable[[], None],
+        lossless: Collection[str] = (),
     ) -> dict[str, dict[int, Answer]]:
         """Every frame to every node, as fast as the slowest of them answers.
+
+        A node keeps only the newest of the frames that wait. On a busy machine, one that has not
+        answered in time may still have the last frame before it, and the next one replaces it.
 
         Args:
             recording: what to publish.
             readout_time: s; the nodes answer for the middle row.
             methods: parameters of the node of each method, by a name that is a ROS namespace.
             progress: called after each frame.
+            lossless: methods whose nodes get the next frame only after they have answered the last
+                one, or said in their diagnostics that they will not.
 
         Returns:
             for each method its answers by the stamp of the frame.
@@ -99,7 +108,7 @@ class Session:
                     listeners[name].subscribe(node, f"{self.namespace}/{name}/{NODE_NAME}")
                     given = {**shutter, **parameters}
                     starter.submit(self._start, name, given, processes).result()
-            player = _Player(node, executor, listeners)
+            player = _Player(node, executor, listeners, lossless)
             player.wait_for_nodes(recording, lambda: self._check(processes))
             for index in range(len(recording.clouds)):
                 if not player.play(recording, index):
@@ -121,7 +130,7 @@ class Session:
     ) -> None:
         remappings = [f"__ns:={self.namespace}/{name}"]
         remappings += [
-            f"{topic}:={self.namespace}/{topic}" for topic in ("correspondences", "camera_info")
+            f"{topic}:={self.namespace}/{topic}" for topic in (CORRESPONDENCES, CAMERA_INFO)
         ]
         words = [word for remapping in remappings for word in ("-r", remapping)]
         for key, value in parameters.items():
@@ -150,12 +159,17 @@ class _Player:
     """Publishes frames and waits for their answers."""
 
     def __init__(
-        self, node: Any, executor: SingleThreadedExecutor, listeners: Mapping[str, Listener]
+        self,
+        node: Any,
+        executor: SingleThreadedExecutor,
+        listeners: Mapping[str, Listener],
+        lossless: Collection[str],
     ) -> None:
         self._executor = executor
         self._listeners = listeners
-        self._camera_info = node.create_publisher(CameraInfo, "camera_info", _QOS)
-        self._correspondences = node.create_publisher(PointCloud2, "correspondences", _QOS)
+        self._lossless = [listeners[name] for name in lossless]
+        self._camera_info = node.create_publisher(CameraInfo, CAMERA_INFO, _QOS)
+        self._correspondences = node.create_publisher(PointCloud2, CORRESPONDENCES, _QOS)
 
     def wait_for_nodes(self, recording: Recording, check: Callable[[], None]) -> None:
         """Until all nodes listen, and their answers to a first frame arrive."""
@@ -169,16 +183,38 @@ class _Player:
         # A node may hear before it is heard. What it says is not counted.
         deadline = time.monotonic() + _FIRST_ANSWER_TIMEOUT
         index = 0
-        while not self.play(recording, index % len(recording.clouds)):
+        while not self._ask(recording, index % len(recording.clouds)):
             check()
             if time.monotonic() > deadline:
                 raise SessionError(f"no answer within {_FIRST_ANSWER_TIMEOUT:.0f} s")
             index += 1
+        for listener in self._lossless:
+            listener.unanswered = None
+        self._spin_until(
+            lambda: all(item.unanswered is not None for item in self._lossless), _ACCOUNT_TIMEOUT
+        )
         for listener in self._listeners.values():
             listener.clear()
 
     def play(self, recording: Recording, index: int) -> bool:
-        """Publish one frame; whether all nodes have answered it in time."""
+        """Publish one frame; whether all nodes have answered it in time.
+
+        If not, those that may lose none have accounted for it.
+        """
+        before = [item.unanswered for item in self._lossless]
+        if self._ask(recording, index):
+            return True
+        stamp = recording.stamps_ns[index]
+        self._spin_until(
+            lambda: all(
+                item.has(stamp) or item.unanswered != count
+                for item, count in zip(self._lossless, before, strict=True)
+            ),
+            _ACCOUNT_TIMEOUT,
+        )
+        return False
+
+    def _ask(self, recording: Recording, index: int) -> bool:
         stamp = recording.stamps_ns[index]
         info = copy_message(recording.camera_infos[index], "sensor_msgs/msg/CameraInfo")
         cloud = copy_message(recording.clouds[index], "sensor_msgs/msg/PointCloud2")
@@ -186,8 +222,13 @@ class _Player:
         for listener in self._listeners.values():
             listener.expect(stamp)
         self._correspondences.publish(cloud)
-        deadline = time.monotonic() + self._timeout()
-        while not all(listener.has(stamp) for listener in self._listeners.values()):
+        everybody = self._listeners.values()
+        return self._spin_until(lambda: all(item.has(stamp) for item in everybody), self._timeout())
+
+    def _spin_until(self, condition: Callable[[], bool], seconds: float) -> bool:
+        """Hear what comes until this holds; whether it did in time."""
+        deadline = time.monotonic() + seconds
+        while not condition():
             if time.monotonic() > deadline:
                 return False
             self._executor.spin_once(timeout_sec=0.05)
@@ -200,9 +241,7 @@ class _Player:
 
     def hear_the_rest(self) -> None:
         """What is still under way, of the last frame or of one that took too long."""
-        deadline = time.monotonic() + _REST_TIME
-        while time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.05)
+        self._spin_until(lambda: False, _REST_TIME)
 
 
 def _stop(processes: Iterable[subprocess.Popen[bytes]]) -> None:

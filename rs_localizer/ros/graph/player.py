@@ -17,6 +17,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
+from rs_localizer.io import topics
+from rs_localizer.io.outputs import TYPES
 from rs_localizer.process.stopping import StopSignals
 from rs_localizer.ros.node.conversion import copy_message, message_class
 from rs_localizer.settings import NODE_NAME
@@ -32,9 +34,12 @@ _LATCHED = QoSProfile(
 )
 # As tf2_ros has them; whether anybody listens depends on the node's settings.
 _TF_QOS = {
-    "/tf": QoSProfile(depth=100),
-    "/tf_static": QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+    topics.TF: QoSProfile(depth=100),
+    topics.TF_STATIC: QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
 }
+
+
+_POSE = f"/{NODE_NAME}/{topics.POSE}"
 
 
 class PlayerError(ValueError):
@@ -122,7 +127,7 @@ class _Poses:
     def look_round(self) -> None:
         """Hear nodes that are new in the graph, too: they are discovered one after the other."""
         for topic, types in self._node.get_topic_names_and_types():
-            if topic.endswith(f"/{NODE_NAME}/pose") and types == ["geometry_msgs/msg/PoseStamped"]:
+            if topic.endswith(_POSE) and types == [TYPES[topics.POSE]]:
                 self._hear(topic)
 
     def _hear(self, topic: str) -> None:

@@ -15,10 +15,10 @@ from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.outputs import Frame
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError, make_transform
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
+from rs_localizer.ros.localizer.transforms import Tf, import_tf2_ros
 from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
-from rs_localizer.ros.node.transforms import Tf, import_tf2_ros
 
 # Frames that wait for odometry, which mostly comes later than they do.
 _MOST_PENDING = 100

@@ -6,25 +6,24 @@ becomes an update, which the worker's thread carries out between two frames.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.io.camera_info import Calibration, read_camera_info
-from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Frame
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.ros.node.inputs import LATCHED, Topic
+from rs_localizer.pipeline.inputs import INPUTS, Input, Role
+from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.ros.node.conversion import message_class
+from rs_localizer.ros.node.inputs import LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.refusals import Refusals
-from rs_localizer.ros.node.worker import Localize, Worker
-
-FRAME_TOPICS = ("correspondences", "keypoints")
-"""Inputs that are localized; the others say with what."""
+from rs_localizer.ros.node.worker import Worker
 
 # In a serialized message, which begins with four bytes of CDR and the stamp of its header.
 _AFTER_STAMP = 12
@@ -44,7 +43,7 @@ class Feed:
 
     def __init__(
         self,
-        worker: Worker,
+        worker: Worker[FrameLocalizer, Frame],
         frames: FrameLocalizer,
         refusals: Refusals,
         say: Callable[[str], Any],
@@ -53,23 +52,14 @@ class Feed:
         self._frames = frames
         self._refusals = refusals
         self._say = say
-        # The last that was handed on.
-        self._camera_info = b""
-        self._calibration: Calibration | None = None
+        # The last that was handed on of what is repeated, and what it says; by topic.
+        self._repeated: dict[str, tuple[bytes, Any]] = {}
         self.changing = False  # whether the worker compiles kernels for new settings
 
     def topics(self) -> dict[str, Topic]:
         """The inputs; what changes the state comes before the frames."""
-        return {
-            "camera_info": Topic(CameraInfo, self._take_camera_info, LATCHED, raw=True),
-            "map_points": Topic(PointCloud2, self._take_map, LATCHED, lasting=True),
-            "correspondences": self._localized_by(
-                "correspondences", lambda frames, message: frames.localize(message)
-            ),
-            "keypoints": self._localized_by(
-                "keypoints", lambda frames, message: frames.localize_keypoints(message)
-            ),
-        }
+        make = {Role.FRAMES: self._frames_topic, Role.STATE: self._state_topic}
+        return {name: make[item.role](item) for name, item in INPUTS.items()}
 
     def take_config(self, config: NodeConfig) -> None:
         """Use these settings from the next frame on."""
@@ -81,44 +71,60 @@ class Feed:
 
     # -- in the thread of the inputs ---------------------------------------------------------
 
-    def _localized_by(self, topic: str, localize: Localize) -> Topic:
-        """A topic whose messages are frames, which the worker localizes in this way."""
-        return Topic(PointCloud2, lambda message: self._worker.localize(topic, message, localize))
+    def _frames_topic(self, item: Input) -> Topic:
+        """A topic whose messages the worker localizes."""
 
-    def _take_camera_info(self, serialized: bytes) -> None:
+        def localize(frames: FrameLocalizer, message: Any) -> Frame | Refusal:
+            result = item.take(frames, message)
+            assert result is not None  # a frame has one
+            return result
+
+        return Topic(
+            message_class(item.type),
+            lambda message: self._worker.process(item.topic, message, localize),
+        )
+
+    def _state_topic(self, item: Input) -> Topic:
+        """A topic whose messages are read here; the worker uses them."""
+        return Topic(
+            message_class(item.type),
+            functools.partial(self._take if item.held is None else self._take_repeated, item),
+            LATCHED if item.latched else SENSOR_DATA,
+            lasting=item.lasting,
+            raw=item.held is not None,
+        )
+
+    def _take(self, item: Input, message: Any) -> Any:
+        """What the message says, which the worker will use; None if it cannot be read."""
+        try:
+            content = item.read(message)
+        except MessageError as error:
+            self._refusals.add(item.refused, str(error))
+            return None
+        self._worker.update(item.topic, lambda frames: self._use(frames, item, content))
+        return content
+
+    def _take_repeated(self, item: Input, serialized: bytes) -> None:
         # Drivers repeat it with every image, and only its stamp is new.
-        content = serialized[_AFTER_STAMP:]
-        if content == self._camera_info and self._calibration == self._frames.calibration:
+        assert item.held is not None
+        rest = serialized[_AFTER_STAMP:]
+        last, said = self._repeated.get(item.topic, (b"", None))
+        if rest == last and said == item.held(self._frames):
             return
-        try:
-            calibration = read_camera_info(deserialize_message(serialized, CameraInfo))
-        except MessageError as error:
-            self._refusals.add("bad_camera_info", str(error))
-            return
-        self._camera_info, self._calibration = content, calibration
-        self._worker.update("camera_info", lambda frames: self._calibrate(frames, calibration))
-
-    def _take_map(self, message: PointCloud2) -> None:
-        # Meanwhile frames are localized by the previous one.
-        try:
-            landmarks = read_map(message)
-        except MessageError as error:
-            self._refusals.add("bad_map", str(error))
-            return
-        self._worker.update("map", lambda frames: self._use_map(frames, landmarks))
+        content = self._take(item, deserialize_message(serialized, message_class(item.type)))
+        if content is not None:
+            self._repeated[item.topic] = rest, content
 
     # -- in the worker's thread, between two frames ------------------------------------------
 
-    def _calibrate(self, frames: FrameLocalizer, calibration: Calibration) -> None:
+    def _use(self, frames: FrameLocalizer, item: Input, content: Any) -> None:
+        before = frames.map
         try:
-            frames.calibrate(calibration)
+            item.use(frames, content)
         except MessageError as error:
-            self._refusals.add("bad_camera_info", str(error))
-
-    def _use_map(self, frames: FrameLocalizer, landmarks: Map) -> None:
-        if frames.map is None or not landmarks.equals(frames.map):
-            frames.use_map(landmarks)
-            self._say(described(landmarks))
+            self._refusals.add(item.refused, str(error))
+        if frames.map is not None and frames.map is not before:
+            self._say(described(frames.map))
 
     def _change(self, frames: FrameLocalizer, config: NodeConfig) -> None:
         self.changing = True

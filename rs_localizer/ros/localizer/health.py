@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
 
+from rs_localizer.pipeline.inputs import INPUTS, Role
+from rs_localizer.ros.localizer.answers import Answer
+from rs_localizer.ros.node.health import (
+    COMPILING,
+    LOST,
+    SOME,
+    WAITING,
+    Health,
+    Judgement,
+    Level,
+    lost_on_the_way,
+    milliseconds,
+    out_of_service,
+    refused,
+    told,
+)
 from rs_localizer.ros.node.inputs import Silence
-from rs_localizer.ros.node.statistics import WINDOW, Percentiles, Summary
+from rs_localizer.ros.node.statistics import WINDOW, Summary
 from rs_localizer.trajectory.online import MeasuredReadout
 
 # Frames in a row without a pose after which the camera is lost.
 _LOST = 5
-# Share of the frames that may be refused or replaced before it is worth a warning.
-_SOME = 0.05
-# What a node that is not active needs, by the label of its state.
-_STEPS = {"unconfigured": "configure and activate it", "finalized": "start it again"}
-# Refusals of what a frame cannot be localized without.
-_UNUSABLE = {"camera_info": "bad_camera_info", "a map": "bad_map"}
 # A frame that is worked on for longer (s) holds up the others.
 _LONG_WORK = 1.0
-
-
-class Level(IntEnum):
-    """As in diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-    STALE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,43 +37,34 @@ class Condition:
 
     life_cycle: str  # label of the state
     changing: bool  # new settings compile kernels
-    missing: Sequence[str]  # what no frame can be localized without: camera_info, a map
-    frame_topics: Sequence[str]  # of the inputs, those with frames
+    missing: Sequence[str]  # inputs without which no frame can be localized
     silence: Mapping[str, Silence]  # by input topic
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
     readout: MeasuredReadout | None = None  # as the camera's motion shows it
 
 
-@dataclass(frozen=True, slots=True)
-class Health:
-    """A diagnosis."""
-
-    level: Level
-    state: str
-    message: str
-    values: dict[str, str]
-
-
-def of_interest(
-    silence: Mapping[str, Silence], frame_topics: Sequence[str], missing: Sequence[str]
-) -> dict[str, Silence]:
-    """Without the topics that nobody publishes and nothing waits for.
+def of_interest(silence: Mapping[str, Silence], missing: Sequence[str]) -> dict[str, Silence]:
+    """Without the inputs that nobody publishes and nothing waits for.
 
     Frames come as correspondences or as keypoints; only keypoints need a map.
     """
-    coming = any(silence[name].heard for name in frame_topics if name in silence)
+    coming = any(item.heard for item in _of_frames(silence))
 
     def counts(name: str, item: Silence) -> bool:
         if item.heard or item.mismatch:
             return True
-        if name in frame_topics:
+        if INPUTS[name].role == Role.FRAMES:
             return not coming
-        return name != "map_points" or "a map" in missing
+        return INPUTS[name].necessary or name in missing
 
     return {name: item for name, item in silence.items() if counts(name, item)}
 
 
-def diagnose(condition: Condition, summary: Summary) -> Health:
+def _of_frames(silence: Mapping[str, Silence]) -> list[Silence]:
+    return [item for name, item in silence.items() if INPUTS[name].role == Role.FRAMES]
+
+
+def diagnose(condition: Condition, summary: Summary[Answer]) -> Health:
     """Judge the node.
 
     The states are ``inactive``, ``compiling``, ``waiting for`` what is missing or for frames,
@@ -84,36 +75,33 @@ def diagnose(condition: Condition, summary: Summary) -> Health:
     return Health(level, state, message, {"State": state} | _values(condition, summary))
 
 
-def _judge(condition: Condition, summary: Summary) -> tuple[Level, str, str]:
-    if condition.life_cycle == "configuring":
-        return Level.WARN, "compiling", "the node is being configured: kernels are compiled"
-    if condition.life_cycle != "active":
-        steps = _STEPS.get(condition.life_cycle, "activate it")
-        # Somebody wants it so: no fault, which an aggregator would make of STALE.
-        return Level.OK, "inactive", f"the node is {condition.life_cycle}: {steps}"
+def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
+    if (idle := out_of_service(condition.life_cycle)) is not None:
+        return idle
     if condition.changing:
-        return Level.WARN, "compiling", "the kernels for the new settings are being compiled"
+        return Level.WARN, COMPILING, "the kernels for the new settings are being compiled"
     if summary.busy is not None and summary.busy > _LONG_WORK:
         return Level.WARN, "busy", f"a frame has been worked on for {summary.busy:.1f} s"
     silent = _silent_frames(condition)
     if condition.missing:
         level = Level.WARN if silent else Level.ERROR
-        what = " and ".join(condition.missing)
+        what = " and ".join(INPUTS[name].said for name in condition.missing)
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
-        for reason in (_UNUSABLE[name] for name in condition.missing if name in _UNUSABLE):
+        for reason in (INPUTS[name].refused for name in condition.missing):
             if count := summary.refusals.get(reason):
                 causes.append(f"{count} came and cannot be used: {reason} in the log says why")
         if any(item.mismatch for item in condition.silence.values()):
             level = Level.ERROR
-        return level, f"waiting for {what}", "; ".join([f"waiting for {what}", *causes])
+        state = f"{WAITING} {what}"
+        return level, state, "; ".join([state, *causes])
     if silent is not None:
         return silent
     return _judge_frames(summary, condition.oddities)
 
 
-def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
+def _silent_frames(condition: Condition) -> Judgement | None:
     """What to say where no frames come; None where they do."""
-    silences = [item for name in condition.frame_topics if (item := condition.silence.get(name))]
+    silences = _of_frames(condition.silence)
     if not silences or any(item.heard and not item.cause for item in silences):
         return None
     causes = [f"{item.topic}: {item.cause}" for item in silences if item.cause]
@@ -123,52 +111,38 @@ def _silent_frames(condition: Condition) -> tuple[Level, str, str] | None:
     else:
         level = Level.STALE if latest.heard else Level.WARN
     since = f" for {latest.seconds:.0f} s" if latest.heard else ""
-    return level, "waiting for frames", "; ".join([f"no frame has come{since}", *causes])
+    return level, f"{WAITING} frames", "; ".join([f"no frame has come{since}", *causes])
 
 
-def _judge_frames(summary: Summary, oddities: Mapping[str, str]) -> tuple[Level, str, str]:
+def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Judgement:
     last = summary.last
     if last is None or summary.refused_since_answer >= _LOST:
         if summary.refused_since_answer == 0:
-            return Level.WARN, "waiting for frames", "no frame has been localized yet"
+            return Level.WARN, f"{WAITING} frames", "no frame has been localized yet"
         message = f"the last {summary.refused_since_answer} frames gave no pose"
         if reasons := summary.recently_refused:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
-        return Level.ERROR, "lost", "; ".join(filter(None, [message, told(oddities)]))
+        return Level.ERROR, LOST, "; ".join(filter(None, [message, told(oddities)]))
     state = "tracking" if last.tracked else "localized"
-    refused, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
-    if refused > _SOME * summary.recently_received:
-        return Level.WARN, state, f"{refused} frames were refused in the last {WINDOW:.0f} s"
-    if replaced > _SOME * summary.recently_received:
+    bad, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
+    if bad > SOME * summary.recently_received:
+        return Level.WARN, state, f"{bad} frames were refused in the last {WINDOW:.0f} s"
+    if replaced > SOME * summary.recently_received:
         message = f"{replaced} frames came while another was localized in the last {WINDOW:.0f} s"
         return Level.WARN, state, message
-    if summary.recently_missing > _SOME * summary.recently_received:
+    if summary.recently_missing > SOME * summary.recently_received:
         return Level.WARN, state, lost_on_the_way(summary)
     if oddities:
         return Level.WARN, state, told(oddities)
     return Level.OK, state, f"{state} with {last.inliers} of {last.points} points"
 
 
-def told(oddities: Mapping[str, str]) -> str:
-    """What is odd, in one line."""
-    return "; ".join(f"{name}: {text}" for name, text in oddities.items())
-
-
-def lost_on_the_way(summary: Summary) -> str:
-    """What to say where stamps have gaps."""
-    sent = summary.recently_received + summary.recently_missing
-    return (
-        f"messages are lost: by their stamps, {summary.recently_missing} of {sent} have not come "
-        f"in the last {WINDOW:.0f} s (is the publisher best effort, or the machine too slow?)"
-    )
-
-
-def _values(condition: Condition, summary: Summary) -> dict[str, str]:
+def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
     values = {
         "Frames in (Hz)": f"{summary.rate_in:.1f}",
         "Poses out (Hz)": f"{summary.rate_out:.1f}",
-        **_milliseconds("Latency", summary.latency),
-        **_milliseconds("Delay of the stamp", summary.delay),
+        **milliseconds("Latency", summary.latency),
+        **milliseconds("Delay of the stamp", summary.delay),
     }
     if summary.last is not None:
         values |= {
@@ -192,18 +166,9 @@ def _values(condition: Condition, summary: Summary) -> dict[str, str]:
         values["Frames missing by their stamps, recently"] = str(summary.recently_missing)
     if summary.dropped:
         values["Frames dropped"] = str(summary.dropped)
-    values |= {f"Refused: {reason}": str(n) for reason, n in sorted(summary.refusals.items())}
+    values |= refused(summary)
     values |= {f"Topic {item.topic}": _heard(item) for item in condition.silence.values()}
     return values | {f"Odd: {name}": text for name, text in condition.oddities.items()}
-
-
-def _milliseconds(name: str, value: Percentiles | None) -> dict[str, str]:
-    if value is None:
-        return {}
-    return {
-        f"{name} p50 (ms)": f"{1e3 * value[0]:.2f}",
-        f"{name} p95 (ms)": f"{1e3 * value[1]:.2f}",
-    }
 
 
 def _heard(item: Silence) -> str:

@@ -8,7 +8,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from rs_localizer.ros.localizer.health import Health, Level
+from rs_localizer.io.topics import DIAGNOSTICS
+from rs_localizer.ros.node.health import INACTIVE, LOST, WAITING, Health, Level
 
 _PERIOD = 1.0  # s
 # The same state for so many periods is worth a line in the log.
@@ -32,8 +33,8 @@ class Diagnostics:
         node: Node,
         examine: Callable[[], tuple[Health, str]],
         notice: Callable[[str, str], None],
-        task: str = "localizer",
-        lack: str = "no_pose",
+        task: str,
+        lack: str,
     ) -> None:
         self._node = node
         self._examine = examine
@@ -43,7 +44,7 @@ class Diagnostics:
         self._periods = 0
         # As diagnostic_updater in C++: with the namespace and without the first slash.
         self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {task}"
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 1)
+        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
         self._timer = node.create_timer(
             _PERIOD, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
@@ -68,8 +69,8 @@ class Diagnostics:
         state = health.level, health.state
         self._periods = self._periods + 1 if state == self._state else 1
         self._state = state
-        if health.level != Level.OK and health.state != "inactive" and self._worth_a_line():
-            lacking = health.state.startswith("waiting for") or health.state == "lost"
+        if health.level != Level.OK and health.state != INACTIVE and self._worth_a_line():
+            lacking = health.state.startswith(WAITING) or health.state == LOST
             self._notice(self._lack if lacking else health.state, health.message)
 
     def _worth_a_line(self) -> bool:

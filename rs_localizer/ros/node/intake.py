@@ -54,12 +54,12 @@ class Intake:
         self._subscriptions = subscriptions
         self._failed = failed
         self._closed = False
-        with context.handle:
+        handle = context.handle
+        assert handle is not None  # the context of a node has been initialized
+        with handle:
             # Ready-made waiting as in rclpy.wait_for_message: the public ways need an executor.
-            self._wake = rclpy_implementation.GuardCondition(context.handle)
-            self._waiting = rclpy_implementation.WaitSet(
-                len(subscriptions), 1, 0, 0, 0, 0, context.handle
-            )
+            self._wake = rclpy_implementation.GuardCondition(handle)
+            self._waiting = rclpy_implementation.WaitSet(len(subscriptions), 1, 0, 0, 0, 0, handle)
         self._thread = threading.Thread(target=self._run, name="rs_localizer intake", daemon=True)
         self._thread.start()
 

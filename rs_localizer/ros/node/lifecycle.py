@@ -13,6 +13,8 @@ from rclpy.task import Future
 
 from rs_localizer.ros.node.worker import in_thread
 
+_ON_CHANGE_STATE = "_LifecycleNodeMixin__on_change_state"
+
 
 class RobustLifecycleNode(LifecycleNode):
     """A managed node that answers impossible transitions instead of raising.
@@ -74,7 +76,7 @@ class RobustLifecycleNode(LifecycleNode):
                 response.success = self.configure(failure)
                 return response
         try:
-            return super()._LifecycleNodeMixin__on_change_state(request, response)
+            return getattr(super(), _ON_CHANGE_STATE)(request, response)
         except RuntimeError:  # RCLError; what callbacks raise does not come here
             _, present = self._state_machine.current_state
             self.get_logger().warning(f"transition {wanted} is refused: the node is {present}")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -15,13 +14,12 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rs_localizer.config import NodeConfig
-from rs_localizer.settings import Kind, Setting, build, settings, unknown
+from rs_localizer.settings import Config, Kind, Setting, build, settings, unknown
 
 _UNCONFIGURED = "unconfigured"
 
 
-def declare(node: Node, kind: Kind = NodeConfig) -> Any:
+def declare(node: Node, kind: type[Config]) -> Config:
     """Declare every setting as a parameter and return those that the node was started with.
 
     Args:
@@ -44,10 +42,10 @@ def declare(node: Node, kind: Kind = NodeConfig) -> Any:
             ) from error
         except InvalidParameterValueException as error:
             raise ValueError(str(error)) from error
-    return read(node, kind=kind)
+    return read(node, kind)
 
 
-def unknown_names(node: Node, kind: Kind = NodeConfig) -> list[str]:
+def unknown_names(node: Node, kind: Kind) -> list[str]:
     """What to say of each parameter that the node was started with and does not have.
 
     No reason to refuse the start: a params file for ``/**`` speaks to several nodes.
@@ -56,14 +54,14 @@ def unknown_names(node: Node, kind: Kind = NodeConfig) -> list[str]:
     return [text for name in names if (text := unknown(name, kind))]
 
 
-def read(node: Node, changes: list[Parameter] | None = None, kind: Kind = NodeConfig) -> Any:
+def read(node: Node, kind: type[Config], changes: Sequence[Parameter] = ()) -> Config:
     """The settings of the node's parameters, with these changes.
 
     Raises:
         ValueError: for values that the settings refuse.
     """
     values = {name: node.get_parameter(name).value for name in settings(kind)}
-    for parameter in changes or ():
+    for parameter in changes:
         if parameter.name in values:  # there are also use_sim_time and the QoS overrides
             values[parameter.name] = parameter.value
     return build(values, kind)
@@ -71,32 +69,32 @@ def read(node: Node, changes: list[Parameter] | None = None, kind: Kind = NodeCo
 
 def on_change(
     node: Node,
-    check: Callable[[Any], None],
-    apply: Callable[[Any], None],
-    kind: Kind = NodeConfig,
+    kind: type[Config],
+    check: Callable[[Config], None],
+    apply: Callable[[Config], None],
     state: Callable[[], str] = lambda: _UNCONFIGURED,
 ) -> None:
     """Check, then apply, changes of parameters; several set at once are one change.
 
     Args:
         node: with declared parameters.
+        kind: the class of the node's settings.
         check: raises ``ValueError`` for settings that are refused: then all stay as they were.
         apply: takes settings that were accepted.
-        kind: the class of the node's settings.
         state: label of the node's, for settings that are fixed once it is configured.
     """
 
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
         try:
             _check_fixed(node, parameters, kind, state())
-            check(read(node, parameters, kind))
+            check(read(node, kind, parameters))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def after_set(parameters: list[Parameter]) -> None:
         if any(parameter.name in settings(kind) for parameter in parameters):
-            apply(read(node, kind=kind))
+            apply(read(node, kind))
 
     node.add_on_set_parameters_callback(on_set)
     node.add_post_set_parameters_callback(after_set)

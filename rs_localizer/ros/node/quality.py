@@ -15,11 +15,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 Policies = tuple[ReliabilityPolicy, DurabilityPolicy]
 
-# Hears everybody.
-_LEAST: Policies = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
-_MOST: Policies = (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
-_OPEN: Policies = (ReliabilityPolicy.BEST_AVAILABLE, DurabilityPolicy.BEST_AVAILABLE)
-
 
 def policies(profile: QoSProfile) -> Policies:
     return profile.reliability, profile.durability
@@ -32,10 +27,11 @@ def offered(node: Node, topic: str) -> list[Policies]:
 
 def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
     """What is wished, and where that is ``BEST_AVAILABLE``, the most that all of them offer."""
-    found = [
-        wish if wish != open_ else most if offers and all(o[k] == most for o in offers) else least
-        for k, (wish, open_, most, least) in enumerate(
-            zip(wished, _OPEN, _MOST, _LEAST, strict=True)
-        )
-    ]
-    return found[0], found[1]
+    reliability, durability = wished
+    if reliability == ReliabilityPolicy.BEST_AVAILABLE:
+        unanimous = offers and all(offer[0] == ReliabilityPolicy.RELIABLE for offer in offers)
+        reliability = ReliabilityPolicy.RELIABLE if unanimous else ReliabilityPolicy.BEST_EFFORT
+    if durability == DurabilityPolicy.BEST_AVAILABLE:
+        unanimous = offers and all(offer[1] == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if unanimous else DurabilityPolicy.VOLATILE
+    return reliability, durability

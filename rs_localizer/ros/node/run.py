@@ -1,4 +1,4 @@
-"""Runs the node in a process of its own."""
+"""Runs a node in a process of its own."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
 from rs_localizer.process.stopping import StopRequest
-from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.errors import describe
+from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.worker import wait_for_workers
-from rs_localizer.settings import NODE_NAME
 
 # A waiting executor does not see signals: it looks up this often, in s.
 _SIGNAL_LATENCY = 0.1
@@ -29,18 +28,18 @@ _SWITCH_INTERVAL = 0.001
 
 
 def run(
+    make: Callable[[], ManagedNode[Any, Any, Any, Any]],
+    name: str,
     stop: StopRequest,
     args: list[str] | None = None,
-    make: Callable[..., Any] = LocalizerNode,
-    name: str = NODE_NAME,
 ) -> int:
     """Run a node until ``stop`` is requested; the exit code.
 
     Args:
-        stop: asks for the end.
-        args: of the command line.
         make: the node's class.
         name: of the node.
+        stop: asks for the end.
+        args: of the command line.
     """
     try:
         # rclpy's own handlers end the context from a thread while the node still uses it.

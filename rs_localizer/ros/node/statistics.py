@@ -7,15 +7,17 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.outputs import Frame
-from rs_localizer.pipeline.frames import Refusal
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.node.gaps import missing
 from rs_localizer.ros.node.refusals import Refusals
+
+Result = TypeVar("Result")
+Told = TypeVar("Told")
 
 WINDOW = 5.0
 """What "now" means, in s."""
@@ -29,20 +31,7 @@ Percentiles = tuple[float, float]  # s, the median and the 95th
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """What is told of the last frame that was localized."""
-
-    points: int
-    inliers: int
-    global_shutter_inliers: int  # what a pose without motion would have explained
-    residual: float  # px, root mean square of the inliers
-    model_error: float  # px, root mean square of what map, lens and motion leave beside the noise
-    iterations: int
-    tracked: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
+class Summary(Generic[Told]):
     """How things are now."""
 
     received: dict[str, int]  # frames since the start, by topic
@@ -61,14 +50,15 @@ class Summary:
     busy: float | None  # s for which the worker has had the same frame
     latency: Percentiles | None  # from receiving to publishing
     delay: Percentiles | None  # from the header's stamp to publishing, where that makes sense
-    last: Any  # the last answer; None: there was none
+    last: Told | None  # of the last frame that was answered; None: there was none
 
 
-class Statistics:
+class Statistics(Generic[Result, Told]):
     """Counts frames; all methods may be called from any thread.
 
     Args:
         refusals: logs and counts what is refused.
+        tell: stamp of the frame (ns) and what is told of a result.
         ros_time: now in ns, by the clock of the stamps.
         clock: s, monotonic.
     """
@@ -76,16 +66,18 @@ class Statistics:
     def __init__(
         self,
         refusals: Refusals,
+        tell: Callable[[Result], tuple[int, Told]],
         ros_time: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._refusals = refusals
+        self._tell = tell
         self._ros_time = ros_time
         self._clock = clock
         self._lock = threading.Lock()
         self._received: Counter[str] = Counter()
         self._answered = self._replaced = self._refused = self._dropped = self._in_a_row = 0
-        self._last: Any = None
+        self._last: Told | None = None
         self._started: float | None = None
         # Times of what happened, and what is told of each answer.
         self._in: deque[float] = deque(maxlen=_MOST_FRAMES)
@@ -128,32 +120,18 @@ class Statistics:
             self._refused_at.append((self._clock(), refusal.reason))
         self._refusals.add(refusal.reason, refusal.detail)
 
-    def answered(self, frame: Frame, received: float) -> None:
-        """A frame was published that had been received at this time of the clock."""
-        estimate = frame.estimate
-        residuals = estimate.residuals[estimate.inliers]
-        answer = Answer(
-            points=len(estimate.inliers),
-            inliers=len(residuals),
-            global_shutter_inliers=estimate.global_shutter_inliers,
-            residual=float(np.sqrt(residuals @ residuals / max(len(residuals), 1))),
-            model_error=estimate.model_error,
-            iterations=estimate.iterations,
-            tracked=estimate.tracked,
-        )
-        self.note(frame.input_stamp_ns, answer, received)
-
-    def note(self, input_stamp_ns: int, answer: Any, received: float) -> None:
-        """A frame with this stamp was answered, and what is told of it."""
+    def answered(self, result: Result, received: float) -> None:
+        """A result was published of a frame that had been received at this time of the clock."""
+        input_stamp_ns, told = self._tell(result)
         now = self._clock()
         delay = (self._ros_time() - input_stamp_ns) * 1e-9
         with self._lock:
             self._answered += 1
             self._in_a_row = 0
             self._out.append((now, now - received, delay))
-            self._last = answer
+            self._last = told
 
-    def summary(self) -> Summary:
+    def summary(self) -> Summary[Told]:
         """How things are now."""
         with self._lock:
             since = self._clock() - WINDOW

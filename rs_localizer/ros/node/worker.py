@@ -1,4 +1,4 @@
-"""Localizes beside the executor, so that a slow frame delays nothing but frames.
+"""Works beside the executor, so that a slow frame delays nothing but frames.
 
 The kernels release the GIL: meanwhile the executor takes messages, answers services, changes
 parameters and publishes diagnostics.
@@ -11,47 +11,49 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from rs_localizer.io.outputs import Frame
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.errors import describe
 from rs_localizer.ros.node.mailbox import Mailbox, Update, Work
 from rs_localizer.ros.node.statistics import Statistics
 
-Localize = Callable[[FrameLocalizer, Any], Frame | Refusal]
+State = TypeVar("State")
+Result = TypeVar("Result")
+Process = Callable[[State, Any], Result | Refusal]
+"""What is done with a message, given what the worker alone touches."""
+
 _NAME = "rs_localizer worker"
-# How often frames are looked at that wait for their mounting, in s, and how many may.
+# How often results are looked at that wait for something, in s, and how many may.
 _LATE_PERIOD = 0.005
 _MOST_LATE = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class Arrival(Generic[State, Result]):
     """A frame that has come."""
 
-    topic: str
     message: Any
-    localize: Localize
+    process: Process[State, Result]
     received: float  # s, time.monotonic()
 
 
 @dataclass(frozen=True, slots=True)
-class _Late:
-    """A frame that is localized and waits for its mounting."""
+class _Late(Generic[State, Result]):
+    """A frame whose result waits for something."""
 
-    work: Work[FrameLocalizer, Arrival]
-    arrival: Arrival
+    work: Work[State, Arrival[State, Result]]
+    arrival: Arrival[State, Result]
     result: Waiting
     deadline: float  # s, time.monotonic()
 
 
-class Worker:
-    """A thread, and what it alone touches: the localizer of the frames.
+class Worker(Generic[State, Result]):
+    """A thread, and what it alone touches.
 
     Args:
-        frames: localizes; from now on only through updates and arrivals.
-        publish: called in the thread with each localized frame, never after :meth:`pause`.
+        state: that; from now on only through updates and arrivals.
+        publish: called in the thread with each result, never after :meth:`pause`.
         statistics: told what becomes of each frame.
         failed: told in one sentence of errors in updates that nobody foresaw; the thread goes on.
             Those in frames are refusals, ``internal_error``.
@@ -59,29 +61,29 @@ class Worker:
 
     def __init__(
         self,
-        frames: FrameLocalizer,
-        publish: Callable[[Frame], None],
-        statistics: Statistics,
+        state: State,
+        publish: Callable[[Result], None],
+        statistics: Statistics[Result, Any],
         failed: Callable[[str], None],
     ) -> None:
-        self._frames = frames
+        self._state = state
         self._publish = publish
         self._statistics = statistics
         self._failed = failed
-        self._mailbox: Mailbox[FrameLocalizer, Arrival] = Mailbox()
-        self._late: deque[_Late] = deque()
+        self._mailbox: Mailbox[State, Arrival[State, Result]] = Mailbox()
+        self._late: deque[_Late[State, Result]] = deque()
         # Held while publishing: after pause() nothing comes any more.
         self._publishing = threading.Lock()
         in_thread(self._run)
 
-    def update(self, kind: str, update: Update[FrameLocalizer]) -> None:
+    def update(self, kind: str, update: Update[State]) -> None:
         """Have this done before the next frame (see :meth:`Mailbox.update`)."""
         self._mailbox.update(kind, update)
 
-    def localize(self, topic: str, message: Any, localize: Localize) -> None:
-        """Have this frame localized and published, unless a newer one comes first."""
+    def process(self, topic: str, message: Any, process: Process[State, Result]) -> None:
+        """Have this frame processed and published, unless a newer one comes first."""
         self._statistics.received(topic, message)
-        arrival = Arrival(topic, message, localize, time.monotonic())
+        arrival = Arrival(message, process, time.monotonic())
         if self._mailbox.put(topic, arrival):
             self._statistics.replaced()
 
@@ -100,10 +102,10 @@ class Worker:
     def _run(self) -> None:
         while (work := self._mailbox.take(_LATE_PERIOD if self._late else None)) is not None:
             for update in work.updates:
-                self._guarded(update, self._frames)
+                self._guarded(update, self._state)
             self._finish_late()
             if work.frame is not None:
-                self._localize(work, work.frame)
+                self._process(work, work.frame)
 
     def _guarded(self, function: Callable[..., None], *arguments: Any) -> None:
         try:
@@ -111,9 +113,11 @@ class Worker:
         except Exception as error:  # of one message: the others go on
             self._failed(describe(error))
 
-    def _localize(self, work: Work[FrameLocalizer, Arrival], arrival: Arrival) -> None:
+    def _process(
+        self, work: Work[State, Arrival[State, Result]], arrival: Arrival[State, Result]
+    ) -> None:
         self._statistics.started()
-        result = self._attempt(lambda: arrival.localize(self._frames, arrival.message))
+        result = self._attempt(lambda: arrival.process(self._state, arrival.message))
         self._statistics.ended()
         if isinstance(result, Waiting) and len(self._late) < _MOST_LATE:
             deadline = time.monotonic() + result.patience
@@ -140,7 +144,10 @@ class Worker:
             return Refusal("internal_error", describe(error))
 
     def _finish(
-        self, work: Work[FrameLocalizer, Arrival], arrival: Arrival, result: Frame | Refusal
+        self,
+        work: Work[State, Arrival[State, Result]],
+        arrival: Arrival[State, Result],
+        result: Result | Refusal,
     ) -> None:
         """Publish it, unless nobody wants it any more, and count it."""
         if isinstance(result, Refusal):

@@ -20,13 +20,15 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 SPREAD = np.linspace(0.0, 1.0, 400)
 
 GOOD = Frames(
-    taken=110,
-    speeds=np.concatenate([np.full(40, 20.0), np.full(60, 100.0)]),
-    plain={"p3p": 1.0 + SPREAD, "r6p": 0.5 + SPREAD, "r9p": 0.6 + SPREAD},
+    taken=410,
+    speeds=np.repeat([20.0, 100.0], [160, 240]),
+    plain={"p3p": 1.5 + SPREAD, "r6p": 0.5 + SPREAD, "r9p": 0.6 + SPREAD},
+    plain_owners=np.arange(400) % 100,
     products={"p3p": 1.0 + SPREAD, "r6p_vcwt": 0.1 + 0.5 * SPREAD},
-    positions={"p3p": np.full(100, 0.3), "r6p_vcwt": np.full(100, 0.01)},
-    seconds={"p3p": np.full(100, 1e-3), "r6p_vcwt": np.full(100, 2e-3)},
-    cube={"p3p": np.full(20, 9.0), "localizer": np.full(20, 0.4)},
+    owners=np.arange(400) % 100,
+    positions={"p3p": np.full(400, 0.3), "r6p_vcwt": np.full(400, 0.01)},
+    seconds={"p3p": np.full(400, 1e-3), "r6p_vcwt": np.full(400, 2e-3)},
+    cube={"p3p": np.full(80, 9.0), "localizer": np.full(80, 0.4)},
 )
 
 
@@ -50,22 +52,34 @@ def changed(values: np.ndarray, share: float, to: float) -> np.ndarray:
     [
         # One quantile above the median is enough, and so is one method.
         ("plain", {"plain": GOOD.plain | {"r6p": changed(0.5 + SPREAD, 0.02, 9.0)}}),
-        ("r9p_published", {"plain": GOOD.plain | {"r9p": 1.1 + SPREAD}}),
+        ("r9p", {"plain": GOOD.plain | {"r9p": 2.0 + SPREAD}}),
         ("localizer", {"products": GOOD.products | {"joint": changed(SPREAD, 0.02, np.inf)}}),
         ("localized", {"positions": GOOD.positions
-                       | {"r6p_vcwt": changed(np.full(100, 0.01), 0.04, np.inf)}}),
+                       | {"r6p_vcwt": changed(np.full(400, 0.01), 0.06, np.inf)}}),
         # 2.9 times better, where it is fast.
         ("position", {"positions": GOOD.positions
-                      | {"r6p_vcwt": changed(np.zeros(100), 0.6, 0.3 / 2.9)}}),
+                      | {"r6p_vcwt": changed(np.zeros(400), 0.6, 0.3 / 2.9)}}),
         ("reprojection", {"products": {"p3p": 9.0 + SPREAD, "r6p_vcwt": 0.1 + SPREAD}}),
-        ("time", {"seconds": GOOD.seconds | {"r6p_vcwt": changed(np.zeros(100), 0.06, 6e-3)}}),
-        ("cube", {"cube": GOOD.cube | {"localizer": changed(np.zeros(20), 0.15, 4.0)}}),
-        ("cube", {"cube": GOOD.cube | {"localizer": np.full(20, 1.1)}}),
+        ("time", {"seconds": GOOD.seconds | {"r6p_vcwt": changed(np.zeros(400), 0.09, 6e-3)}}),
+        ("cube", {"cube": GOOD.cube | {"localizer": np.where(np.arange(80) % 8, 0.4, 4.0)}}),
+        ("cube", {"cube": GOOD.cube | {"localizer": np.full(80, 1.1)}}),
     ],
 )  # fmt: skip
 def test_one_claim_falls_at_a_time(claim: str, change: dict) -> None:
     found = verdicts(replace(GOOD, **change))
     assert [name for name, verdict in found.items() if verdict is Verdict.NOT_HELD] == [claim]
+
+
+def test_what_so_few_cannot_tell_is_undecided() -> None:
+    few = {
+        "speeds": np.full(40, 100.0),
+        "positions": {name: values[:40] for name, values in GOOD.positions.items()},
+        "seconds": {name: values[:40] for name, values in GOOD.seconds.items()},
+        "cube": {name: values[:24] for name, values in GOOD.cube.items()},
+    }
+    found = verdicts(replace(GOOD, **few))
+    undecided = {name for name, verdict in found.items() if verdict is Verdict.UNDECIDED}
+    assert undecided == {"localized", "time", "cube"}
 
 
 def test_frames_without_a_pose_are_no_better_than_others() -> None:

@@ -27,7 +27,7 @@ from rs_localizer.pipeline.images import FrameDetector, correspondences
 from rs_localizer.ros.node.conversion import copy_message, make_message
 
 RUN = "import sys; from rs_localizer.ros.main import marker_detector; sys.exit(marker_detector())"
-MAP = MarkerMap(wall("4x4_50", 2, 1, 0.12, 0.06), map_frame="hall")
+MAP = MarkerMap(wall("4x4_50", (2, 1), 0.12, 0.06), map_frame="hall")
 K = np.array([[400.0, 0.0, 159.5], [0.0, 400.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K)
 DISTANCE = 0.6  # m, straight before the wall

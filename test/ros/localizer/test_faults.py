@@ -433,7 +433,7 @@ def garbage(world: World) -> str:
         subscription = world.node._inputs._subscriptions[topic]
         subscription.callback(serialize_message(message) if subscription.raw else message)
         if number % 20 == 0:
-            world.wait(lambda: not world.node._worker._mailbox._frames)
+            world.wait(lambda: not world.node.worker._mailbox._frames)
     growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert growth < 50_000, f"{growth} kB more memory"
     assert "internal_error" not in world.node.refusals.counts
@@ -444,7 +444,7 @@ def burst(world: World) -> str:
     """Frames faster than they can be localized: each is answered or counted."""
 
     def summary() -> Any:
-        return world.node._statistics.summary()
+        return world.node.statistics.summary()
 
     before = summary()
     for _ in range(300):
@@ -769,7 +769,7 @@ def replaced_within_a_frame(world: World) -> str:
     before = len(world.peer.poses)
     world.wait(lambda: world.send(keypoints(world)) or started.wait(0.1))
     world.send(map_message(world, frame="hall"))
-    world.wait(lambda: "map" in world.node._worker._mailbox._updates)
+    world.wait(lambda: "map_points" in world.node.worker._mailbox._updates)
     go_on.set()
     world.wait(lambda: len(world.peer.poses) > before)
     assert world.peer.poses[before].header.frame_id == "map"

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.pipeline.frames import Refusal
-from rs_localizer.ros.localizer.health import Condition, Level, diagnose, of_interest
+from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.ros.localizer.answers import tell
+from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest
+from rs_localizer.ros.node.health import Level
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
@@ -19,9 +21,7 @@ from rs_localizer.trajectory.online import MeasuredReadout
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")
-GOOD = Condition(
-    "active", False, (), ("correspondences",), {"camera_info": COMES, "correspondences": FRAMES}
-)
+GOOD = Condition("active", False, (), {"camera_info": COMES, "correspondences": FRAMES})
 
 
 def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
@@ -43,7 +43,9 @@ class World:
     def __init__(self) -> None:
         self.now = 1000.0
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Statistics(self.refusals, lambda: round(self.now * 1e9), lambda: self.now)
+        self.statistics = Statistics(
+            self.refusals, tell, lambda: round(self.now * 1e9), lambda: self.now
+        )
 
     def receive(self) -> None:
         seconds, nanoseconds = divmod(round(self.now * 1e9), 1_000_000_000)
@@ -161,7 +163,7 @@ def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
 
 
 def test_the_readout_time_that_the_motion_shows() -> None:
-    summary, name = Statistics(Refusals(print)).summary(), "Readout time seen (ms)"
+    summary, name = Statistics(Refusals(print), tell).summary(), "Readout time seen (ms)"
     assert name not in diagnose(GOOD, summary).values
     seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100))
     assert diagnose(seen, summary).values[name] == "-20.04 +- 0.12"
@@ -222,7 +224,7 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
         ),
         (
             {
-                "missing": ("camera_info", "a map"),
+                "missing": ("camera_info", "map_points"),
                 "silence": {"camera_info": COMES, "correspondences": silent("/c", "")},
             },
             Level.WARN,
@@ -250,7 +252,6 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
         # One of two frame topics is enough.
         (
             {
-                "frame_topics": ("correspondences", "keypoints"),
                 "silence": {"correspondences": FRAMES, "keypoints": silent("/k", "no publisher")},
             },
             Level.OK,
@@ -293,10 +294,10 @@ def test_topics_that_nothing_waits_for_are_left_out() -> None:
     kinds = ("correspondences", "keypoints")
 
     def names(missing: tuple[str, ...] = (), **silence: Silence) -> set[str]:
-        return set(of_interest(silence, kinds, missing))
+        return set(of_interest(silence, missing))
 
     assert names(correspondences=nobody, keypoints=nobody) == set(kinds)
     assert names(correspondences=COMES, keypoints=nobody) == {"correspondences"}
     assert names(correspondences=COMES, keypoints=deaf) == set(kinds)
     assert names(keypoints=COMES, map_points=nobody) == {"keypoints"}
-    assert names(("a map",), keypoints=COMES, map_points=nobody) == {"keypoints", "map_points"}
+    assert names(("map_points",), keypoints=COMES, map_points=nobody) == {"keypoints", "map_points"}

@@ -30,8 +30,8 @@ from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.lab.simulation.recording import write_simulated
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import ConstantVelocity
-from rs_localizer.ros.localizer import node as localizer_node
 from rs_localizer.ros.localizer.node import LocalizerNode
+from rs_localizer.ros.node import managed
 from rs_localizer.ros.node.conversion import copy_message, message_class
 from rs_localizer.ros.node.inputs import Inputs
 
@@ -518,7 +518,7 @@ def test_publishers_are_active_before_a_frame_can_come(monkeypatch: pytest.Monke
             active.extend(publisher.is_activated for publisher in publishers)
             super().__init__(node, *arguments)
 
-    monkeypatch.setattr(localizer_node, "Inputs", Early)
+    monkeypatch.setattr(managed, "Inputs", Early)
     context = Context()
     rclpy.init(context=context)
     node = LocalizerNode(context=context)

@@ -9,8 +9,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 
-from rs_localizer.ros.localizer.health import Health, Level
 from rs_localizer.ros.node.diagnostics import Diagnostics
+from rs_localizer.ros.node.health import Health, Level
 
 
 class Bench:
@@ -31,6 +31,8 @@ class Bench:
             node,
             lambda: (self.health, "camera"),
             lambda *texts: self.lines.append(": ".join(texts)),
+            "localizer",
+            "no_pose",
         )
 
     def _create_timer(self, period: float, callback: Any, clock: Any) -> None:

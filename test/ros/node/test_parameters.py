@@ -30,9 +30,9 @@ class Recorder:
 
     def __init__(self, context: Context, *arguments: str) -> None:
         self.node = Node("some_node", context=context, cli_args=["--ros-args", *arguments])
-        self.config = parameters.declare(self.node)
+        self.config = parameters.declare(self.node, NodeConfig)
         self.applied: list[NodeConfig] = []
-        parameters.on_change(self.node, self.check, self.applied.append)
+        parameters.on_change(self.node, NodeConfig, self.check, self.applied.append)
 
     def check(self, config: NodeConfig) -> None:
         if config.seed == 13:
@@ -86,7 +86,7 @@ def test_several_at_once_are_one_change(recorder: Recorder) -> None:
         solver="p3p", seed=4, velocity_prior=VelocityPrior(VelocityPrior().angular, 0.5)
     )
     assert recorder.applied == [expected]
-    assert parameters.read(recorder.node) == expected
+    assert parameters.read(recorder.node, NodeConfig) == expected
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_what_is_refused_stays_as_it_was(
     assert not successful
     assert re.search(reason, text)
     assert recorder.applied == []
-    assert parameters.read(recorder.node) == NodeConfig()
+    assert parameters.read(recorder.node, NodeConfig) == NodeConfig()
 
 
 def test_other_parameters_change_no_settings(recorder: Recorder) -> None:
@@ -151,7 +151,7 @@ def test_names_that_no_parameter_has(context: Context) -> None:
         "seed:=3",
     )
     recorder = Recorder(context, *(word for text in assignments for word in ("-p", text)))
-    texts = parameters.unknown_names(recorder.node)
+    texts = parameters.unknown_names(recorder.node, NodeConfig)
     recorder.node.destroy_node()
     colour, readout_time, angular = texts
     assert colour.startswith("'colour' is no setting; there are solver, ")

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sensor_msgs.msg import Image
 
-from rs_localizer.pipeline.frames import Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
 from rs_localizer.ros.node.worker import Worker, wait_for_workers
@@ -18,14 +18,15 @@ from rs_localizer.ros.node.worker import Worker, wait_for_workers
 PATIENCE = 10.0  # s, of a machine that is busy
 
 
-class Count(Statistics):
-    """Frames are plain text here, of which there are no details and no stamps."""
+class Count(Statistics[str, str]):
+    """Frames are plain text here, without stamps."""
 
     def received(self, topic: str, message: Any) -> None:
         super().received(topic, Image())
 
-    def answered(self, frame: Any, received: float) -> None:
+    def answered(self, result: str, received: float) -> None:
         assert received <= time.monotonic()
+        super().answered(result, received)
 
 
 class Fake:
@@ -41,12 +42,11 @@ class Fake:
         self.mounted: set[str] = set()
         self.patience = 10.0
         self.refusals = Refusals(lambda text: None)
-        self.statistics = Count(self.refusals)
-        frames: Any = self
-        self.worker = Worker(frames, self._publish, self.statistics, self._fail)
+        self.statistics = Count(self.refusals, lambda text: (0, text))
+        self.worker: Worker[Fake, str] = Worker(self, self._publish, self.statistics, self._fail)
 
     def send(self, frame: str, topic: str = "frames") -> None:
-        self.worker.localize(topic, frame, lambda frames, message: self._localize(message))
+        self.worker.process(topic, frame, lambda frames, message: self._localize(message))
 
     def wait(self, semaphore: threading.Semaphore) -> None:
         assert semaphore.acquire(timeout=PATIENCE)

@@ -29,7 +29,8 @@ from rs_localizer.lab.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.lab.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC, write_truth
 from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
 from rs_localizer.markers.detection import Detections, MarkerDetector
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
 
 MOTIONS = {"tum_vi_room5": "forward_left_up", "tum_rgbd_fr1_xyz": "optical"}
 """Trajectories by name, and the axes of the body whose poses they hold."""

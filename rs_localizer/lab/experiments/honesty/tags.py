@@ -17,8 +17,9 @@ from rs_localizer.io.outputs import Frame
 from rs_localizer.lab.experiments.honesty.scores import REGION, motion_evidence, percent
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
 from rs_localizer.lab.independent.rotations import logarithm
-from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
+from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.moments import twist_at
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.solvers.table import find_solver
 
 CAMERA_INFO, CORRESPONDENCES = "/camera/camera_info", "/camera/correspondences"

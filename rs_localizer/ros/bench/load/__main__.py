@@ -1,7 +1,7 @@
 """Measure the node under load: ``python -m rs_localizer.ros.bench.load --rate 100 --minutes 10``.
 
 Publisher, node and measuring subscriber are processes of their own on this machine. The exit code
-is 0 if the figures meet the limits that the README states, else 1.
+is 0 if the figures meet the limits (on a quiet machine of two cores), else 1.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES
 from rs_localizer.ros.bench.load.frames import Frames
 
 _DISCOVERY_TIMEOUT = 60.0  # s
@@ -24,10 +25,10 @@ class Camera:
     def __init__(self, node: Node, namespace: str, frames: Frames) -> None:
         self._frames = frames
         self._infos = node.create_publisher(
-            CameraInfo, f"{namespace}/camera_info", qos_profile_sensor_data
+            CameraInfo, f"{namespace}/{CAMERA_INFO}", qos_profile_sensor_data
         )
         self._clouds = node.create_publisher(
-            PointCloud2, f"{namespace}/correspondences", qos_profile_sensor_data
+            PointCloud2, f"{namespace}/{CORRESPONDENCES}", qos_profile_sensor_data
         )
 
     def wait(self) -> None:

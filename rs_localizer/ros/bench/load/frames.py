@@ -73,7 +73,7 @@ class Frames:
 
     def index(self, serialized: bytes) -> int:
         """The number of the frame that a serialized message with its stamp belongs to."""
-        seconds, nanoseconds = np.frombuffer(serialized[_STAMP], "<u4").tolist()
+        seconds, nanoseconds = map(int, np.frombuffer(serialized[_STAMP], "<u4"))
         return round((seconds * 1_000_000_000 + nanoseconds - _FIRST_NS) * 1e-9 * self.rate)
 
 
@@ -85,7 +85,8 @@ def simulated(points: int, outliers: float, rate: float, different: int = _DIFFE
     start = motion.intervals_ns[0][0]
     stamps = [start + round(k * 1e9 / rate) for k in range(different)]
     settings = FrameSettings(points=points, noise=0.7, outliers=outliers, rate=rate)
-    infos, clouds = [], []
+    infos: list[bytearray] = []
+    clouds: list[bytearray] = []
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "frames"
         with BagWriter(path) as bag:

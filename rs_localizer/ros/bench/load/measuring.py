@@ -23,6 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.io import topics
 from rs_localizer.ros.bench.load.camera import Camera
 from rs_localizer.ros.bench.load.frames import READOUT_TIME, Frames
 from rs_localizer.ros.node.intake import Intake, NotByExecutor
@@ -80,10 +81,10 @@ class Ear:
                 raw=raw,
             )
             for kind, topic, callback, raw in (
-                (PoseStamped, f"{prefix}/pose", self._take, True),
+                (PoseStamped, f"{prefix}/{topics.POSE}", self._take, True),
                 # Somebody listens to the twist, too: it is what this node is for.
-                (Odometry, f"{prefix}/odometry", lambda _: None, True),
-                (DiagnosticArray, "/diagnostics", self._take_status, False),
+                (Odometry, f"{prefix}/{topics.ODOMETRY}", lambda _: None, True),
+                (DiagnosticArray, topics.DIAGNOSTICS, self._take_status, False),
             )
         ]
         self.close = Intake(node.context, listeners, sys.exit).close

@@ -71,10 +71,8 @@ class Tf:
         self._heard = heard
         self._failed = failed
         self._buffer: Any = None
-        self._listener: Any = None
-        self._intake: Intake | None = None
-        self._jumps: Any = None
-        self._errors: ModuleType | None = None  # tf2_ros
+        self._errors: Any = None  # tf2_ros
+        self._undo = contextlib.ExitStack()
 
     def configure(self, config: NodeConfig) -> None:
         """Listen if these settings need it.
@@ -87,7 +85,7 @@ class Tf:
         tf2_ros = import_tf2_ros(config)
         buffer = tf2_ros.Buffer()
         # By its own clock tf2 would not see the time of a simulation or a recording go back.
-        self._jumps = self._node.get_clock().create_jump_callback(
+        jumps = self._node.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
             ),
@@ -95,18 +93,15 @@ class Tf:
         )
         self._errors, self._buffer = tf2_ros, buffer
         node = _WithoutExecutor(self._node)
-        self._listener = _listen(tf2_ros, buffer, node, self._heard)
-        self._intake = Intake(self._node.context, node.subscriptions, self._failed)
+        listener = _listen(tf2_ros.TransformListener, buffer, node, self._heard)
+        intake = Intake(self._node.context, node.subscriptions, self._failed)
+        for undo in (jumps.unregister, listener.unregister, intake.close):
+            self._undo.callback(undo)
 
     def close(self) -> None:
         """Stop listening; whoever asks for a transform gets none."""
-        if self._buffer is None:
-            return
         self._buffer = None
-        self._intake.close()
-        self._listener.unregister()
-        self._jumps.unregister()
-        self._intake = self._listener = self._jumps = None
+        self._undo.close()
 
     def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
         """``target_from_source`` at a time; None: the latest.
@@ -173,19 +168,19 @@ class _WithoutExecutor:
         return getattr(self._node, name)
 
 
-def _listen(tf2_ros: ModuleType, buffer: Any, node: Any, hear: Callable[[list[Any]], None]) -> Any:
-    """A TransformListener that tells of what has come."""
+def _listen(base: Any, buffer: Any, node: Any, hear: Callable[[list[Any]], None]) -> Any:
+    """A tf2_ros.TransformListener that tells of what has come."""
 
-    class Listener(tf2_ros.TransformListener):
-        def callback(self, data: Any) -> None:
-            super().callback(data)
-            hear(data.transforms)
+    def callback(self: Any, data: Any) -> None:
+        base.callback(self, data)
+        hear(data.transforms)
 
-        def static_callback(self, data: Any) -> None:
-            super().static_callback(data)
-            hear(data.transforms)
+    def static_callback(self: Any, data: Any) -> None:
+        base.static_callback(self, data)
+        hear(data.transforms)
 
-    return Listener(buffer, node)
+    methods = {"callback": callback, "static_callback": static_callback}
+    return type("Listener", (base,), methods)(buffer, node)
 
 
 def _text(error: Exception) -> str:

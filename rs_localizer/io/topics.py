@@ -1,0 +1,28 @@
+"""The names of topics, relative to a node's namespace.
+
+What the inputs are: :mod:`rs_localizer.pipeline.inputs`; the outputs: :mod:`.outputs`.
+"""
+
+from __future__ import annotations
+
+# Inputs of the localizer.
+CORRESPONDENCES = "correspondences"  # which the marker detector publishes
+KEYPOINTS = "keypoints"
+MAP_POINTS = "map_points"
+CAMERA_INFO = "camera_info"
+# Inputs of the marker detector.
+IMAGE = "image"
+COMPRESSED_IMAGE = "image/compressed"
+# Outputs, below the name of their node.
+POSE = "pose"
+TWIST = "twist"
+POSE_WITH_COVARIANCE = "pose_with_covariance"
+TWIST_WITH_COVARIANCE = "twist_with_covariance"
+ODOMETRY = "odometry"
+INLIERS = "inliers"
+DEBUG_IMAGE = "debug_image"
+COMPRESSED_DEBUG_IMAGE = "debug_image/compressed"
+# Of everybody.
+TF = "/tf"
+TF_STATIC = "/tf_static"
+DIAGNOSTICS = "/diagnostics"

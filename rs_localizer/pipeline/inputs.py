@@ -1,0 +1,124 @@
+"""THE list of the localizer's inputs: topic, type, role, and who reads and uses its messages.
+
+The node subscribes to it, replay looks for it in recordings, the commands have an option for each
+topic, and the diagnostics judge what does not come. A new input is one row and one reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any
+
+from rs_localizer.io import topics
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.keypoints import read_map
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Frame
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
+
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+
+
+class Role(Enum):
+    """What becomes of the messages of an input."""
+
+    FRAMES = auto()  # each is localized, unless a newer one comes first
+    STATE = auto()  # the latest one says how frames are localized
+
+
+def _as_it_is(message: Any) -> Any:
+    """The reader of frames: most of them are read where they are localized, or never."""
+    return message
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """One input.
+
+    ``read`` takes a message and returns what it says, which ``use`` gives to the localizer. Both
+    raise ``MessageError`` for what cannot be used; it is refused for the reason ``refused``.
+    """
+
+    topic: str  # relative to the node's namespace; also the name of the input
+    type: str  # of its messages
+    role: Role
+    use: Callable[[FrameLocalizer, Any], Frame | Refusal | None]
+    refused: str
+    read: Callable[[Any], Any] = _as_it_is
+    said: str = ""  # what a user is told that is missing
+    necessary: bool = False  # without it no frame can be localized
+    only_with: str = ""  # the input without which this one is of no use
+    latched: bool = False  # who comes late wants the last message, too
+    lasting: bool = False  # one message is enough
+    # Of what comes with every image, and only its stamp is new: what the localizer has of it.
+    held: Callable[[FrameLocalizer], Any] | None = None
+    help: str | None = None  # of its option in commands
+
+    @property
+    def option(self) -> str:
+        """The option of commands that names its topic in a recording."""
+        return f"--{self.topic.replace('_', '-')}"
+
+    def take(self, localizer: FrameLocalizer, message: Any) -> Frame | Refusal | None:
+        """Read and use a message at once; of a frame, its result."""
+        try:
+            return self.use(localizer, self.read(message))
+        except MessageError as error:
+            return Refusal(self.refused, str(error))
+
+
+# What changes the state comes before the frames: waiting messages are taken in this order.
+_ROWS = (
+    Input(
+        topics.CAMERA_INFO,
+        CAMERA_INFO_TYPE,
+        Role.STATE,
+        read=read_camera_info,
+        use=lambda localizer, calibration: localizer.calibrate(calibration),
+        refused="bad_camera_info",
+        said="camera_info",
+        necessary=True,
+        latched=True,
+        held=lambda localizer: localizer.calibration,
+    ),
+    Input(
+        topics.MAP_POINTS,
+        CLOUD_TYPE,
+        Role.STATE,
+        read=read_map,
+        use=lambda localizer, landmarks: localizer.use_map(landmarks),
+        refused="bad_map",
+        said="a map",
+        only_with=topics.KEYPOINTS,
+        latched=True,
+        lasting=True,
+        help="the map of the keypoints",
+    ),
+    Input(
+        topics.CORRESPONDENCES,
+        CLOUD_TYPE,
+        Role.FRAMES,
+        use=lambda localizer, message: localizer.localize(message),
+        refused="bad_cloud",
+    ),
+    Input(
+        topics.KEYPOINTS,
+        CLOUD_TYPE,
+        Role.FRAMES,
+        use=lambda localizer, message: localizer.localize_keypoints(message),
+        refused="bad_keypoints",
+        help="instead of correspondences",
+    ),
+)
+
+INPUTS = {row.topic: row for row in _ROWS}
+"""All inputs by name."""
+
+
+def with_role(role: Role) -> list[Input]:
+    """The inputs of a role."""
+    return [row for row in _ROWS if row.role == role]

@@ -1,0 +1,38 @@
+"""What is told of a localized frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.io.outputs import Frame
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the statistics keep of a frame."""
+
+    points: int
+    inliers: int
+    global_shutter_inliers: int  # what a pose without motion would have explained
+    residual: float  # px, root mean square of the inliers
+    model_error: float  # px, root mean square of what map, lens and motion leave beside the noise
+    iterations: int
+    tracked: bool
+
+
+def tell(frame: Frame) -> tuple[int, Answer]:
+    """The stamp of the input (ns), and what is told."""
+    estimate = frame.estimate
+    residuals = estimate.residuals[estimate.inliers]
+    answer = Answer(
+        points=len(estimate.inliers),
+        inliers=len(residuals),
+        global_shutter_inliers=estimate.global_shutter_inliers,
+        residual=float(np.sqrt(residuals @ residuals / max(len(residuals), 1))),
+        model_error=estimate.model_error,
+        iterations=estimate.iterations,
+        tracked=estimate.tracked,
+    )
+    return frame.input_stamp_ns, answer

@@ -1,0 +1,87 @@
+"""Every command that README and docs show can be understood by the program that it calls."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import re
+import shlex
+
+import pages
+import pytest
+
+from rs_localizer.cli.main import COMMANDS
+from rs_localizer.config import DetectorConfig
+from rs_localizer.settings import parse_assignment, settings
+
+LINES = sorted({(page, line) for page in pages.NAMES for line in pages.shell(page)})
+# As in a workspace, after make, or with a variable before.
+_BEFORE = r"^(?:\w+=\S+ +)*(?:RUN +.*&& +)?(?:ros2 run rs_localizer +|(?:\.venv/bin/))?"
+_OURS = [
+    (page, match[1])
+    for page, line in LINES
+    if (match := re.match(_BEFORE + "rs_localizer (.+)", line))
+]
+_MODULES = [
+    (page, match[1], match[2])
+    for page, line in LINES
+    if (match := re.match(_BEFORE + r"python -m (\S+) ?(.*)", line))
+]
+_LAUNCHES = [(page, line) for page, line in LINES if line.startswith("ros2 launch rs_localizer ")]
+
+
+def test_commands_are_found() -> None:
+    assert len(_OURS) > 40
+    assert len(_MODULES) > 8
+    assert len(_LAUNCHES) > 4
+
+
+@pytest.mark.parametrize(("page", "words"), _OURS)
+def test_commands_and_options_exist(page: str, words: str) -> None:
+    if words.startswith("COMMAND"):
+        return
+    name, *rest = shlex.split(words)
+    module = importlib.import_module(COMMANDS[name].module)
+    parser = argparse.ArgumentParser(prog=f"{page}: {name}", exit_on_error=False)
+    module.add_arguments(parser)
+    arguments = parser.parse_args(rest)
+    for assignment in getattr(arguments, "assignments", None) or []:
+        parse_assignment(assignment)
+
+
+@pytest.mark.parametrize(("page", "module", "words"), _MODULES)
+def test_modules_exist(page: str, module: str, words: str) -> None:
+    assert importlib.util.find_spec(module) is not None, page
+    if module == "pytest":
+        for word in shlex.split(words):
+            assert not word.startswith("test/") or (pages.ROOT / word).exists(), word
+
+
+@pytest.mark.parametrize(("page", "line"), _LAUNCHES)
+def test_launch_files_exist(page: str, line: str) -> None:
+    file, *arguments = shlex.split(line)[3:]
+    if file == "...":
+        return
+    code = (pages.ROOT / "launch" / file).read_text()
+    code += (pages.ROOT / "rs_localizer" / "ros" / "launching.py").read_text()
+    known = {*settings(), *settings(DetectorConfig), *re.findall(r"\"(\w+)\"", code)}
+    if file == "two_cameras.launch.py":  # which puts these names together
+        known |= {"left", "right", "left_params_file", "right_params_file"}
+    assert {word.partition(":=")[0] for word in arguments if not word.startswith("--")} <= known, (
+        page
+    )
+
+
+@pytest.mark.parametrize("page", pages.NAMES)
+def test_commands_in_sentences_exist(page: str) -> None:
+    said = pages.names_in(pages.prose(page))
+    called = {words.split()[1] for words in said if re.match(r"rs_localizer [a-z]", words)}
+    assert called <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("page", pages.NAMES)
+def test_targets_of_make_exist(page: str) -> None:
+    known = re.findall(r"^(\w+):", (pages.ROOT / "Makefile").read_text(), re.MULTILINE)
+    used = [line.split()[1] for line in pages.shell(page) if re.match(r"make \w", line)]
+    assert set(used) <= set(known)

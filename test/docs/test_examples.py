@@ -1,0 +1,65 @@
+"""The Python examples of README and docs run, page by page, with what a reader would have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pages
+import pytest
+
+import rs_localizer as rsl
+from rs_localizer import data
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import RecordedMotion
+
+# The reference shows signatures, no examples.
+WITH_EXAMPLES = [p for p in pages.NAMES if p != "docs/api.md" and pages.fenced(p, "python")]
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = rsl.Camera(width=640, height=480, K=K, readout_time=0.03)
+
+
+@pytest.fixture(scope="module")
+def images() -> list[tuple[int, Array, Array]]:
+    """Time of the middle row in ns, points and pixels: a second and a half of a hand's motion."""
+    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    seen = FrameSettings(points=60, noise=0.5, outliers=0.1)
+    stamps = frame_stamps(motion, CAMERA, seen.rate)[600:645]
+    way = motion.state(stamps[0], np.linspace(0.0, 1.5, 50)).positions
+    frames = simulate_frames(
+        CAMERA, motion, room(way, np.random.default_rng(0)), seen, stamps_ns=stamps
+    )
+    return [(frame.middle_ns, frame.points, frame.pixels) for frame in frames]
+
+
+@pytest.mark.parametrize("page", WITH_EXAMPLES)
+def test_examples_run(page: str, images: list[tuple[int, Array, Array]]) -> None:
+    _, points, pixels = images[0]
+    reader: dict[str, Any] = {
+        "K": K, "D": np.zeros(5), "points": points, "pixels": pixels, "camera": CAMERA,
+        "images": images,
+    }  # fmt: skip
+    for example in pages.fenced(page, "python"):
+        exec(compile(example, page, "exec"), reader)
+    for check in CHECKS.get(page, []):
+        check(SimpleNamespace(**reader))
+
+
+CHECKS: dict[str, list[Callable[[Any], None]]] = {
+    "README.md": [lambda it: _true(isinstance(it.result, rsl.Estimate))],
+    "docs/solvers.md": [lambda it: _near(np.median(it.t[:, 0], axis=0), [0.1, 0.0, 0.0], 1e-6)],
+    "docs/calibration.md": [lambda it: _near(it.found.readout_time, 0.03, 2e-3)],
+}
+
+
+def _true(value: bool) -> None:
+    assert value
+
+
+def _near(value: Any, expected: Any, within: float) -> None:
+    np.testing.assert_allclose(value, expected, rtol=0.0, atol=within)

@@ -1,0 +1,63 @@
+"""Every link of README and docs leads somewhere."""
+
+from __future__ import annotations
+
+import re
+
+import pages
+import pytest
+
+
+@pytest.mark.parametrize("page", pages.NAMES)
+def test_links_lead_to_files_and_headings(page: str) -> None:
+    wrong = []
+    for link in pages.links(page):
+        if link.startswith(("http://", "https://", "mailto:")):
+            continue
+        file, _, anchor = link.partition("#")
+        target = (pages.ROOT / page).parent / file if file else pages.ROOT / page
+        if not target.is_file():
+            wrong.append(f"{link}: no such file")
+        elif anchor and anchor not in pages.anchors(str(target.resolve().relative_to(pages.ROOT))):
+            wrong.append(f"{link}: no such heading")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("page", pages.NAMES)
+def test_files_and_folders_that_are_named_exist(page: str) -> None:
+    """`rs_localizer/.../x.py`, `test/...`, `docs/...`, `config/...`, `launch/...`."""
+    known = r"(?:rs_localizer/\w+[./]|test/|docs/|config/|launch/|\.ci/)[\w./-]*"
+    named = {name for name in pages.names_in(pages.prose(page)) if re.fullmatch(known, name)}
+    missing = {name for name in named if not (pages.ROOT / name).exists() and "NAME" not in name}
+    assert missing == set()
+
+
+def test_every_page_can_be_reached_from_the_readme() -> None:
+    reached, waiting = set(), ["README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page in reached or not page.endswith(".md"):
+            continue
+        reached.add(page)
+        here = (pages.ROOT / page).parent
+        targets = (here / link.partition("#")[0] for link in pages.links(page) if "://" not in link)
+        waiting += [str(target.resolve().relative_to(pages.ROOT)) for target in targets]
+    assert reached == set(pages.NAMES)
+
+
+def test_the_readme_is_short() -> None:
+    assert len(pages.text("README.md").splitlines()) <= 140
+
+
+def test_modules_that_the_architecture_names_exist() -> None:
+    modules = {n for n in pages.names_in(pages.prose("docs/architecture.md")) if n.endswith(".py")}
+    assert len(modules) > 20
+    inside = {name for name in modules if not (pages.ROOT / name).is_file()}
+    assert {name for name in inside if not (pages.ROOT / "rs_localizer" / name).is_file()} == set()
+
+
+def test_the_tree_of_the_architecture_is_that_of_the_package() -> None:
+    (tree,) = pages.fenced("docs/architecture.md", "text")
+    named = {line.split()[0].rstrip("/") for line in tree.splitlines()[1:]}
+    parts = {path.name for path in (pages.ROOT / "rs_localizer").iterdir()}
+    assert named == {name for name in parts if name not in ("__pycache__", "py.typed")}

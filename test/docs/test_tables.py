@@ -1,0 +1,166 @@
+"""Tables of README and docs that repeat the code say what the code says."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import pages
+import pytest
+
+from rs_localizer.cli.main import COMMANDS
+from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.io.outputs import TYPES
+from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.settings import Kind, settings
+from rs_localizer.solvers.table import SOLVERS, find_solver
+
+PACKAGE = pages.ROOT / "rs_localizer"
+OF_NODES: list[tuple[Kind, set[str]]] = [
+    (NodeConfig, {page for page in pages.NAMES if page != "docs/detector.md"}),
+    (DetectorConfig, {"docs/detector.md"}),
+]
+
+
+def documented(where: set[str]) -> Iterator[tuple[str, str, str]]:
+    """Page, name and default of every parameter in a table."""
+    for table in pages.all_tables("parameter", "default"):
+        if table.page in where:
+            rows = zip(table.column("parameter"), table.column("default"), strict=True)
+            for names, defaults in rows:
+                given, values = pages.names_in(names), re.split(r", *", defaults)
+                assert len(values) in (1, len(given)), (table.page, names)
+                values *= len(given) if len(values) == 1 else 1
+                yield from ((table.page, *item) for item in zip(given, values, strict=True))
+
+
+@pytest.mark.parametrize(("kind", "where"), OF_NODES)
+def test_every_parameter_is_in_a_table_with_its_default(kind: Kind, where: set[str]) -> None:
+    known = settings(kind)
+    rows = [row for row in documented(where) if "*" not in row[1]]
+    assert {name for _, name, _ in rows} == set(known)
+    for page, name, default in rows:
+        assert read(default, known[name].default) == known[name].default, (page, name)
+
+
+def read(cell: str, like: Any) -> Any:
+    """A default as a table writes it."""
+    said = re.sub(r": none$", "", cell).strip("`")
+    if isinstance(like, bool):
+        return {"true": True, "false": False}[said]
+    return said.strip('"') if isinstance(like, str) else type(like)(said)
+
+
+def test_the_table_of_solvers() -> None:
+    (table,) = [t for t in pages.all_tables("`solver`", "points") if t.page == "docs/solvers.md"]
+    said = {pages.names_in(row[0])[0]: (int(row[1]), int(row[2])) for row in table.rows}
+    solvers = {name: find_solver(name) for name in SOLVERS}
+    assert said == {name: (it.sample_size, it.solutions) for name, it in solvers.items()}
+
+
+def test_figures_are_of_solvers_that_exist() -> None:
+    (table,) = [t for t in pages.all_tables("`solver`", "µs") if t.page == "docs/benchmarks.md"]
+    assert {name for row in table.rows for name in pages.names_in(row[0])} <= set(SOLVERS)
+
+
+def test_the_topics_of_the_localizer() -> None:
+    (table,) = [t for t in pages.all_tables("topic or service") if t.page == "docs/node.md"]
+    said = {pages.names_in(row[1])[0]: (row[0], row[2]) for row in table.rows}
+    unused: Any = None
+    inputs = Feed(unused, unused, unused, unused).topics()
+    taken = {name: topic.type for name, topic in inputs.items()}
+    assert {name for name, (way, _) in said.items() if way == "in"} == set(taken)
+    for name, kind in taken.items():
+        assert said[name][1] == f"{kind.__module__.split('.')[0]}/{kind.__name__}"
+    sent = {name.removeprefix("~/"): kind for name, (_, kind) in said.items() if name[0] == "~"}
+    assert sent.pop("reset") == "std_srvs/Trigger"
+    assert sent == {name: kind.replace("/msg/", "/") for name, kind in TYPES.items()}
+
+
+def test_the_diagram_of_the_readme_has_every_topic() -> None:
+    (diagram,) = pages.fenced("README.md", "mermaid")
+    unused: Any = None
+    for name in Feed(unused, unused, unused, unused).topics():
+        assert name in diagram
+    for name in TYPES:
+        assert f"~/{name}" in diagram
+
+
+def literals() -> Iterator[tuple[str, ast.AST]]:
+    for path in PACKAGE.rglob("*.py"):
+        if "lab" not in path.parts:
+            for node in ast.walk(ast.parse(path.read_text())):
+                yield str(path), node
+
+
+def test_every_notice_is_explained() -> None:
+    (table,) = pages.all_tables("notice")
+    said = {name for cell in table.column("notice") for name in pages.names_in(cell)}
+    called, texts = set(), set()
+    for _, node in literals():
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            texts.add(node.value)
+        elif isinstance(node, ast.Call) and node.args:
+            function = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            name = getattr(node.args[0], "value", None)
+            if function.endswith("notice") and isinstance(name, str):
+                called.add(name)
+    (reasons,) = [t for t in pages.all_tables("reason", "look at") if "residual" in str(t.rows)]
+    refusals = {name for cell in reasons.column("reason") for name in pages.names_in(cell)}
+    assert called - refusals <= said
+    assert said <= texts
+
+
+def states(node: str) -> set[str]:
+    """What a node's functions return beside a level, as far as it is written there."""
+    found = set()
+    for path in sorted((PACKAGE / "ros").glob("*/health.py")):
+        if path.parent.name in (node, "node"):
+            module = importlib.import_module(f"rs_localizer.ros.{path.parent.name}.health")
+            for item in ast.walk(ast.parse(path.read_text())):
+                match item:
+                    case ast.Return(ast.Tuple([ast.Attribute() | ast.Name(), state, _])):
+                        found.add(spelled(state, module))
+    return found - {""}
+
+
+def spelled(node: ast.AST, module: ModuleType) -> str:
+    """A text of the code: as it stands, by its name, or put together."""
+    match node:
+        case ast.Constant(str(text)):
+            return text
+        case ast.Name(name):
+            return str(getattr(module, name, ""))
+        case ast.JoinedStr(values):
+            return "".join(spelled(value, module) for value in values)
+        case ast.FormattedValue(value):
+            return spelled(value, module)
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("node", "heading"),
+    [
+        ("localizer", "## States of the localizer"),
+        ("detector", "## States of the marker detector"),
+    ],
+)
+def test_every_state_is_explained(node: str, heading: str) -> None:
+    page = pages.text("docs/reasons.md").split(heading)[1].split("\n## ")[0]
+    rows = [line.split("|")[2] for line in page.splitlines() if line.startswith("| ")][1:]
+    said = {name.split(" for")[0] for cell in rows for name in pages.names_in(cell)}
+    told = {name.split(" for")[0] for name in states(node)}
+    assert len(told) >= 4
+    assert told <= said
+    # The others are variables there: a pose was tracked or not, something is waited for.
+    code = (PACKAGE / "ros" / node / "health.py").read_text().lower()
+    assert {name for name in said - told if name not in code} == set()
+
+
+def test_commands_are_all_told_of() -> None:
+    told = "\n".join(line for page in pages.NAMES for line in pages.shell(page))
+    assert {name for name in COMMANDS if f"rs_localizer {name}" not in told} <= {"demo"}

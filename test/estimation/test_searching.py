@@ -1,0 +1,79 @@
+"""How long the search goes on: ``max_iterations`` does what it says."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer import Camera, Localizer
+
+K = np.array([[1200.0, 0.0, 499.5], [0.0, 1200.0, 499.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(1000, 1000, K)
+TURN, WAY = np.radians(10.0), 0.1  # per readout
+
+
+def frame(seed, outliers, count=200, turn=TURN, way=WAY):
+    """Points and pixels of a camera that turns and moves: the points lie on the rays of pixels."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform(0.0, 999.0, (count, 2))
+    tau = pixels[:, 1] / 999.0 - 0.5
+    axis, along = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
+    local = rng.uniform(1.0, 4.0, count)[:, None] * np.column_stack(
+        [(pixels - 499.5) / 1200.0, np.ones(count)]
+    )
+    # The camera at the middle row is the map.
+    points = Rotation.from_rotvec(turn * tau[:, None] * axis).apply(local)
+    points += way * tau[:, None] * along
+    measured = pixels + rng.normal(size=(count, 2))
+    wrong = round(outliers * count)
+    measured[:wrong] = rng.uniform(0.0, 999.0, (wrong, 2))
+    return points, measured
+
+
+def found(estimate):
+    """The pose is that of the map, and not that of 0.1 m or 1 deg aside."""
+    return bool(estimate) and (
+        np.linalg.norm(estimate.position) < 0.1
+        and Rotation.from_matrix(estimate.rotation).magnitude() < np.radians(1.0)
+    )
+
+
+def share(outliers, max_iterations, frames=30, **more):
+    localizer = Localizer(CAMERA, max_iterations=max_iterations)
+    return np.mean([
+        found(localizer.localize(*frame(seed, outliers, **more))) for seed in range(frames)
+    ])  # fmt: skip
+
+
+def test_more_iterations_find_what_fewer_do_not():
+    few, default, many = (share(0.9, most) for most in (100, 1000, 10_000))
+    assert few <= 0.6
+    assert few + 0.2 <= default
+    assert many >= max(default, 0.95)
+
+
+def test_of_an_ordinary_frame_no_more_samples_are_drawn():
+    """Those of the default, however many there may be."""
+    for outliers in (0.0, 0.5, 0.7):
+        for seed in range(5):
+            default, patient = (
+                Localizer(CAMERA, max_iterations=most).localize(*frame(seed, outliers))
+                for most in (1000, 1_000_000)
+            )
+            assert default.iterations == patient.iterations <= 128
+            np.testing.assert_array_equal(default.rotation, patient.rotation)
+
+
+def test_a_fast_camera_is_found_from_the_first_samples():
+    """No pose of a global shutter explains its points: the motion tells that it was enough."""
+    localizer = Localizer(CAMERA, max_iterations=1_000_000, inlier_threshold=4.0)
+    for seed in range(10):
+        points, pixels = frame(seed, 0.5, turn=np.radians(30.0), way=0.3)
+        assert localizer.localize(points, pixels).iterations <= 384
+
+
+@pytest.mark.parametrize("solver", ["p3p", "r6p_vcwt"])
+def test_one_iteration_is_a_block_of_one(solver):
+    points, pixels = frame(0, 0.0, turn=0.0, way=0.0)
+    estimate = Localizer(CAMERA, max_iterations=1, solver=solver).localize(points, pixels)
+    assert found(estimate)
+    assert estimate.iterations <= 1

@@ -1,0 +1,78 @@
+"""The list of inputs, and what is derived from it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.io.bags import BagError
+from rs_localizer.offline.replay import NO_FRAMES, find_topics
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.inputs import INPUTS, Role
+from rs_localizer.pipeline.reasons import REASONS
+from rs_localizer.pipeline.refusal import Refusal
+
+ROOT = Path(__file__).parents[2]
+INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
+
+
+def bag(**topics: str) -> Any:
+    return SimpleNamespace(path="bag", topics={f"/{name}": kind for name, kind in topics.items()})
+
+
+def test_the_page_of_the_node_has_every_input_with_its_type() -> None:
+    rows = re.findall(
+        r"^\| in \| `(\w+)`.*? \| (.*?) \|", (ROOT / "docs" / "node.md").read_text(), re.M
+    )
+    assert [name for name, _ in rows] == sorted(INPUTS, key=[name for name, _ in rows].index)
+    for name, kind in rows:
+        assert kind.startswith(INPUTS[name].type.replace("/msg/", "/"))
+
+
+def test_the_launch_file_has_every_input() -> None:
+    text = (ROOT / "launch" / "localizer.launch.py").read_text()
+    assert set(re.findall(r"^    \"(\w+)\": \"", text, re.M)) == set(INPUTS)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name: str) -> None:
+    item = INPUTS[name]
+    nameless = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
+    sizes = dict.fromkeys(("height", "width", "point_step", "row_step", "is_bigendian"), 1)
+    broken = SimpleNamespace(header=nameless, fields=[], data=b"", **sizes)
+    refusal = item.take(FrameLocalizer(NodeConfig()), broken)
+    assert isinstance(refusal, Refusal)
+    assert refusal.reason == item.refused
+    assert refusal.reason in REASONS
+    assert (refusal.reason in NO_FRAMES) == (item.role != Role.FRAMES)
+
+
+def test_topics_are_found_by_name_then_by_type() -> None:
+    topics = find_topics(bag(odd=CLOUD, camera_info=INFO))
+    assert topics.of == {"camera_info": "/camera_info", "correspondences": "/odd"}
+    assert topics.frames == "/odd"
+    named = bag(odd=CLOUD, correspondences=CLOUD, map_points=CLOUD, camera_info=INFO)
+    assert find_topics(named).names == ("/camera_info", "/correspondences")
+    given = find_topics(named, {"keypoints": "/odd", "camera_info": None})
+    assert given.of == {
+        "camera_info": "/camera_info",
+        "map_points": "/map_points",
+        "keypoints": "/odd",
+    }
+    assert given.inputs["/odd"] is INPUTS["keypoints"]
+
+
+def test_what_is_not_there_or_not_clear_is_said() -> None:
+    with pytest.raises(BagError, match="CameraInfo for the camera_info"):
+        find_topics(bag(correspondences=CLOUD))
+    with pytest.raises(BagError, match="choose with --correspondences or --keypoints"):
+        find_topics(bag(correspondences=CLOUD, keypoints=CLOUD, camera_info=INFO))
+    with pytest.raises(BagError, match="/camera_info is of type sensor_msgs"):
+        find_topics(bag(camera_info=INFO, a=CLOUD), {"correspondences": "/camera_info"})
+    with pytest.raises(BagError, match="choose one with --correspondences"):
+        find_topics(bag(camera_info=INFO, a=CLOUD, b=CLOUD))

@@ -1,0 +1,119 @@
+"""What the tracker learns of a frame, against a Kalman filter that is known to be right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rs_localizer as rsl
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.tracking import _followed, _surprise, _Track
+
+# Radians, metres, per readout and per readout squared.
+UNITS = np.repeat([1e-2, 3e-2, 1e-3, 2e-3, 1e-4, 3e-4], 3)
+START = Rotation.from_rotvec([0.4, -1.0, 0.2]).as_matrix()
+
+
+def covariance(rng, size=1.0):
+    root = rng.normal(size=(18, 18)) / np.sqrt(18) + np.eye(18)
+    return size**2 * np.outer(UNITS, UNITS) * (root @ root.T)
+
+
+def at(step, joint):
+    """The estimate that lies a step (18,) from the prediction: turned and moved in its own axes."""
+    turn = Rotation.from_rotvec(-step[:3]).as_matrix()
+    rest = step[6:].reshape(4, 3)
+    return Estimate(
+        turn @ START, turn @ ([0.1, 0.2, 3.0] - step[3:6]), rest[0], rest[1],
+        angular_acceleration=rest[2], linear_acceleration=rest[3],
+        inliers=np.ones(5, dtype=bool), residuals=np.zeros(5), joint_covariance=joint,
+        global_shutter_inliers=0, iterations=0,
+        of_shake_sizes=np.array([0.0, 2.0]), of_field_sizes=np.array([0.0, -1.0, 4.0]),
+    )  # fmt: skip
+
+
+def predicted(spread):
+    still = rsl.Motion(START, np.array([0.1, 0.2, 3.0]), np.zeros(3), np.zeros(3))
+    return Prior(motion=still, covariance=spread)
+
+
+def surprises(times, seen=slice(0, 18), frames=400):
+    """Of motions that change ``times`` as much as predicted, of which part is measured."""
+    rng = np.random.default_rng(0)
+    # Small steps: what is not linear in them is left out of the filter here.
+    prior, noise = (covariance(rng, size) for size in (1e-2, 5e-3))
+    measured = np.eye(18)[seen]
+    gain = prior @ measured.T @ np.linalg.inv(measured @ (prior + noise) @ measured.T)
+    posterior = prior - gain @ measured @ prior
+    # Shaking behind the motion is none of its business.
+    joint = np.eye(24)
+    joint[:18, :18] = posterior
+    found = []
+    for _ in range(frames):
+        truth = times * rng.multivariate_normal(np.zeros(18), prior)
+        look = measured @ (truth + rng.multivariate_normal(np.zeros(18), noise))
+        found.append(_surprise(predicted(prior), at(gain @ look, joint)))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("seen", [slice(0, 18), slice(0, 6)], ids=["all", "pose"])
+def test_a_motion_as_predicted_surprises_by_one(seen):
+    assert np.mean(surprises(1.0, seen)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_larger_changes_surprise_by_their_square():
+    calm, wild = (np.mean(surprises(times)) for times in (1.0, 5.0))
+    assert 0.7 * 25 < wild / calm < 25
+    assert np.mean(surprises(0.0)) < 0.5
+
+
+def test_a_frame_that_decides_nothing_does_not_surprise():
+    spread = covariance(np.random.default_rng(1))
+    assert _surprise(predicted(spread), at(np.zeros(18), spread)) == pytest.approx(0.0, abs=1e-9)
+    # Rounding errors are not divided by the nothing that was expected.
+    assert _surprise(predicted(spread), at(1e-6 * UNITS, spread)) < 1e-6
+
+
+def followed(times_deviation, tracked=True, jolts=1.0):
+    spread = covariance(np.random.default_rng(2))
+    first = at(np.zeros(18), 0.01 * spread)
+    step = times_deviation * np.sqrt(18.0) * np.linalg.cholesky(spread)[:, 0]
+    found = replace(at(step, 0.01 * spread), tracked=tracked,
+                    inliers=np.array([True, False, False, False, False]))  # fmt: skip
+    track = _Track(first, 0, 1.0, np.array([1.0, 1.0]), np.array([2.0, 0.0, 1.0]), jolts)
+    return _followed(track, predicted(spread), found, 5)
+
+
+def test_surprises_raise_what_is_expected_and_calm_lowers_it():
+    assert followed(1.0).jolts == pytest.approx(1.0, abs=0.01)
+    assert followed(10.0).jolts == pytest.approx(100**0.2, rel=0.02)
+    assert followed(0.1, jolts=8.0).jolts == pytest.approx(8.0 * 0.01**0.2, rel=0.02)
+    # Never below what the configuration says, nor without bound.
+    assert followed(0.0).jolts == 1.0
+    assert followed(100.0, jolts=9e3).jolts == 1e4
+
+
+def test_what_frames_say_of_sizes_adds_up_and_fades():
+    track = followed(1.0)
+    np.testing.assert_allclose(track.of_shake_sizes, 0.95 * np.ones(2) + 0.3 * np.array([0.0, 2.0]))
+    np.testing.assert_allclose(
+        track.of_field_sizes, 0.95 * np.array([2.0, 0.0, 1.0]) + 0.3 * np.array([0.0, -1.0, 4.0])
+    )
+    # A constant message settles at six times itself: 0.3 / (1 - 0.95).
+    for _ in range(400):
+        track = _followed(track, predicted(covariance(np.random.default_rng(2))), track.estimate, 9)
+    np.testing.assert_allclose(track.of_shake_sizes, [0.0, 12.0], atol=1e-6)
+
+
+def test_a_first_frame_is_taken_as_it_is():
+    found = at(np.zeros(18), np.eye(18))
+    track = _followed(None, None, found, 7)
+    np.testing.assert_array_equal(track.of_field_sizes, found.of_field_sizes)
+    assert (track.time_ns, track.share, track.jolts) == (7, 1.0, 1.0)
+
+
+def test_the_share_of_inliers_follows_tracked_frames_slowly():
+    assert followed(1.0).share == pytest.approx(0.7 * 1.0 + 0.3 * 0.2)
+    assert followed(1.0, tracked=False).share == pytest.approx(0.2)
