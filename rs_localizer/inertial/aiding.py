@@ -25,6 +25,7 @@ from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
 SEEN = np.r_[TURN, ANGULAR]
 """Of a step: what a gyroscope contradicts."""
+_SEEN_BLOCK = np.ix_(SEEN, SEEN)
 # Points that fit with the gyroscope, beyond those that fit without it, that speak for it although
 # it contradicts what the camera sees.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
@@ -74,6 +75,21 @@ class GyroscopeAid:
         self._watch = GyroscopeWatch(settings, self.filter)
         self._last_ns: int | None = None
         self._state = Alone.NO_SAMPLES
+
+    def warm_up(self) -> None:
+        """Compile every kernel that frames may need, or load it from the cache."""
+        times = np.arange(-60, 30) * 2_000_000
+        samples = ImuSamples(times, np.zeros((len(times), 3)))
+        filter_ = GyroscopeFilter(self._settings)
+        within = turning.turn_within(samples, 0, 0.02, filter_.errors)
+        between = turning.turn_between(samples, -30_000_000, 0, filter_.errors)
+        assert within is not None
+        assert between is not None
+        still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+        identity = np.eye(PARAMETERS)
+        predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
+        added = replace(predicted, covariance=predicted.covariance + identity)
+        filter_.update(added, np.zeros(PARAMETERS), 0.5 * added.covariance)
 
     @property
     def status(self) -> InertialStatus:
@@ -229,4 +245,4 @@ def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
 def _contradicts(foreseen: Foreseen, step: Array) -> bool:
     if foreseen.predicted is None:
         return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3])
-    return contradicts(step[SEEN], foreseen.predicted.covariance[np.ix_(SEEN, SEEN)])
+    return contradicts(step[SEEN], foreseen.predicted.covariance[_SEEN_BLOCK])

@@ -55,9 +55,9 @@ def run(context: Context) -> Result:
         "Frames of the simulator that shares no code with the estimator (30 Hz, 640x480, 30 ms "
         "readout) with a gyroscope of 400 Hz, 0.01 deg/s/sqrt(Hz) and a bias of 0.5 deg/s, whose "
         "bias and time offset the tracker has to find. Vibration: 0.3 deg at 60 Hz and 0.1 deg at "
-        "120 Hz on top of a hand's motion, after the first three seconds. Planes and few points: single "
-        "frames, with the gyroscope less its bias, which is known to 0.05 deg/s and 50 us. Shares "
-        "in %, medians of the errors.",
+        "120 Hz on top of a hand's motion, after the first three seconds. Planes and few points: "
+        "single frames, with the gyroscope less its bias, which is known to 0.05 deg/s and 50 us. "
+        "Shares in %, medians of the errors.",
         claims,
         tables,
     )
@@ -244,7 +244,7 @@ def _cost(context: Context) -> _Step:
         "inertial.cost", _US, "A gyroscope costs little time",
         f"a tracked frame of 80 points takes at most {_MOST_COST:g} times as long",
         f"{ratio:.2f} times", ratio <= _MOST_COST,
-        "integration, filter and steadied bearings are 0.3 ms beside a frame of 1.4 ms, whatever "
+        "integration, filter and steadied bearings are 0.5 ms beside a frame of 1.4 ms, whatever "
         "the number of points",
     )  # fmt: skip
     return "cost", Table(("condition", "ms", *_COLUMNS), rows), [claim]
