@@ -22,12 +22,8 @@ from rs_localizer.estimation.assumptions import (
 from rs_localizer.estimation.inputs import checked, unfit
 from rs_localizer.estimation.observing import Observed, find_usable, packed
 from rs_localizer.estimation.posterior import Posterior
-from rs_localizer.estimation.prior import (
-    Prior,
-    PriorTerms,
-    state_in,
-    with_motion,
-)
+from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.prior_terms import PriorTerms, with_motion
 from rs_localizer.estimation.ransac import Candidate
 from rs_localizer.estimation.refine import step_between
 from rs_localizer.estimation.result import estimate_of

@@ -8,7 +8,8 @@ import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior import PriorTerms, state_in
+from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import refine
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info

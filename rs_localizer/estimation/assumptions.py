@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.state import ANGULAR
-from rs_localizer.estimation.prior import (
-    Prior,
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.estimation.prior_terms import (
     PriorTerms,
     held_terms,
     motion_terms,
     with_measurements,
     with_turn,
 )
-from rs_localizer.estimation.settling import FIELD_SIZES, SHAKE_SIZES, Assumed, TurnSeen
 from rs_localizer.solvers.table import Solver
 
 # Where the readout time is unknown, that of a slow camera: its motion per readout is the largest.
@@ -28,6 +28,48 @@ _UNKNOWN_READOUT_TIME = 0.03
 _JERK_RATE = 4.0 * math.pi
 # Third derivative of the cubic among the polynomials of the shaking.
 _JERK_OF_CUBIC = 120.0
+# Sizes to try, as multiples of the least, and their probabilities.
+SHAKE_SIZES = 10.0 ** np.arange(0.0, 5.1)
+SHAKE_PRIOR = np.array([0.6, 0.15, 0.12, 0.09, 0.03, 0.01])
+FIELD_SIZES = 10.0 ** np.arange(0.0, 2.1, 0.5)
+# Lenses and maps are never better than this, px: a hundredth; whose errors are a pixel, are rare.
+_LEAST_FIELD = 0.01
+FIELD_PRIOR = np.array([0.5, 0.25, 0.2, 0.048, 0.002])
+
+
+@dataclass(frozen=True, slots=True)
+class TurnSeen:
+    """What a gyroscope says of the speed of a motion."""
+
+    squared_rate: float  # (rad per readout)^2
+    variance: float  # of each axis, if the camera is at rest
+    typical_variance: float  # of each axis, by the prior of the motion
+
+    def evidence(self, speed: float) -> float:
+        """Logarithm of the likelihood of a typical speed, but for a constant."""
+        variance = self.variance + speed**2 * self.typical_variance
+        return -0.5 * (self.squared_rate / variance + 3.0 * math.log(variance))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assumed:
+    """What is assumed of a camera and its map, beside the prior of the motion."""
+
+    shake: float  # rad, of each polynomial: as much as the jerk of an ordinary motion
+    map_deviation: float  # m
+    focal_length: float  # px
+    # Logarithms of the odds of each size beside those of any camera: what its last frames said.
+    of_shake_sizes: Array
+    of_field_sizes: Array
+    may_rest: bool  # nothing speaks for a motion but the points
+    rolling: bool  # velocities are estimated
+    turn: TurnSeen | None = None  # by a gyroscope
+
+    def field_sizes(self, depth: float) -> Array:
+        """Standard deviations (k,) of the field to try, px, of points so far away (m)."""
+        least = math.hypot(_LEAST_FIELD, self.map_deviation * self.focal_length / depth)
+        sizes: Array = least * FIELD_SIZES
+        return sizes
 
 
 def assumptions(
@@ -49,8 +91,8 @@ def assumptions(
         shake=jerk / _JERK_OF_CUBIC,
         map_deviation=config.map_deviation,
         focal_length=camera.focal_length,
-        of_shake_sizes=np.zeros(SHAKE_SIZES),
-        of_field_sizes=np.zeros(FIELD_SIZES),
+        of_shake_sizes=np.zeros(len(SHAKE_SIZES)),
+        of_field_sizes=np.zeros(len(FIELD_SIZES)),
         may_rest=solver.rolling_shutter and min(velocity.angular, velocity.linear) > 0.0,
         rolling=solver.rolling_shutter,
     )

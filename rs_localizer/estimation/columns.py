@@ -11,7 +11,8 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import FIRST_DEGREE, legendre, shake_basis
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.prior import PriorTerms, add_prior
+from rs_localizer.estimation.prior_kernels import add_prior
+from rs_localizer.estimation.prior_terms import PriorTerms
 
 # Coefficients of the field: polynomials of the image up to the third degree, in two directions.
 _FIELD_DEGREE = 3

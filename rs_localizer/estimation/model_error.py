@@ -20,7 +20,7 @@ from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import Columns, columns_of, with_prior
 from rs_localizer.estimation.evidence import Sizes, sizes_of
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
 

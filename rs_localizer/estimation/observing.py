@@ -11,11 +11,11 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.steadied import steadied
+from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.inputs import distinct, median_point, near_image
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.sampling import Random
-from rs_localizer.estimation.settling import Assumed
 
 # Points farther away than this (m) are faults, and their squares would be infinite.
 _FARTHEST_POINT = 1e9

@@ -11,7 +11,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import inverted, refine, smallest_eigenvalue
 from rs_localizer.estimation.residuals import set_weights, squared_errors
 

@@ -14,7 +14,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.state import STATE_SIZE
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.sampling import Pool, Random, draw
 from rs_localizer.estimation.scoring import best_models, optimize
 

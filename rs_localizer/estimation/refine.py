@@ -12,7 +12,8 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.so3 import exp, log
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
-from rs_localizer.estimation.prior import PriorTerms, add_prior
+from rs_localizer.estimation.prior_kernels import add_prior
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.residuals import normal_equations
 
 _MOST_DAMPING = 1e8

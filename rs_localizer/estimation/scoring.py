@@ -7,7 +7,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import STATE_SIZE
-from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import anneal, refine
 from rs_localizer.estimation.residuals import truncated_cost
 

@@ -9,7 +9,7 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.observing import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
-from rs_localizer.estimation.prior import PriorTerms, held_terms
+from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
 from rs_localizer.estimation.ransac import NOTHING, Candidate, Hypotheses, search
 from rs_localizer.estimation.sampling import Pool
 from rs_localizer.estimation.scoring import optimize

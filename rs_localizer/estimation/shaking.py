@@ -21,7 +21,8 @@ from rs_localizer.estimation.columns import columns_of
 from rs_localizer.estimation.model_error import RIDGE, neighbours_agree
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE
-from rs_localizer.estimation.prior import PriorTerms, add_prior
+from rs_localizer.estimation.prior_kernels import add_prior
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.residuals import linearized
 

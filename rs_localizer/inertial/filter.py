@@ -106,8 +106,8 @@ class GyroscopeFilter:
     ) -> Predicted:
         """The motion some readout times later, beside the turn that the gyroscope knows.
 
-        As :func:`rs_localizer.tracking.predict`, but for the rotation: the camera turns as the
-        gyroscope says, and what it leaves has no memory but in the parameters.
+        As :func:`rs_localizer.estimation.motion_model.predict`, but for the rotation: the camera
+        turns as the gyroscope says, and what it leaves has no memory but in the parameters.
 
         Args:
             motion, covariance: of the last frame, beside its known turn; (18,18).

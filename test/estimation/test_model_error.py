@@ -12,7 +12,7 @@ from rs_localizer.core.shake import shake_at, shake_basis, shake_in_the_middle
 from rs_localizer.estimation.columns import columns_of, with_prior
 from rs_localizer.estimation.evidence import evidence_of_sizes, possible, project_out, sizes_of
 from rs_localizer.estimation.model_error import neighbours_agree, shared_errors, with_model_error
-from rs_localizer.estimation.prior import motion_terms
+from rs_localizer.estimation.prior_terms import motion_terms
 
 from .projection import polynomials
 

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from rs_localizer.config import VelocityPrior
 from rs_localizer.core.arrays import Array
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior import motion_terms, state_in
+from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.prior_terms import motion_terms
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.errors import angles
