@@ -37,7 +37,12 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
         steps[i] = times[i + 1] - times[i]
     width = 2.0 * np.pi * _BAND / np.median(steps)
     factor = np.empty((count, count))
-    solved = rates.copy()
+    # Nothing is supposed of the mean.
+    mean = np.zeros(3)
+    for i in range(count):
+        for axis in range(3):
+            mean[axis] += rates[i, axis] / count
+    solved = rates - mean
     for i in range(count):  # Cholesky, and the first substitution beside it
         for j in range(i + 1):
             total = _cardinal(width * (times[i] - times[j])) + (_NOISE if i == j else 0.0)
@@ -59,6 +64,7 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
         found[2 * i] = rates[i]
         if i + 1 < count:
             between = 0.5 * (times[i] + times[i + 1])
+            found[2 * i + 1] = mean
             dense[2 * i + 1] = between
             for k in range(count):
                 weight = _cardinal(width * (between - times[k]))

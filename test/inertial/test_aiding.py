@@ -1,0 +1,103 @@
+"""A tracker and its gyroscope: offsets are found, and one that lies is dropped and said to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rs_localizer.inertial.samples import ImuSamples
+from rs_localizer.inertial.status import Alone
+from rs_localizer.lab.experiments.honesty.estimating import believed
+from rs_localizer.lab.experiments.inertial.recordings import follow, record
+from rs_localizer.lab.independent.cameras import Camera
+from rs_localizer.lab.independent.gyroscopes import Imu
+from rs_localizer.lab.independent.motions import hand, shaken_hand
+from rs_localizer.lab.independent.scenes import Rich
+from rs_localizer.localizer import Localizer
+from rs_localizer.tracking import Tracker
+
+
+def vibrating(count, rng):
+    return shaken_hand(count, rng, ((0.3, 60.0), (0.1, 120.0)))
+
+
+def statuses(recorded, change, frames=60):
+    """The gyroscope's status after each frame, with samples that were changed, and the results."""
+    tracker = Tracker(Localizer(believed(recorded.frames.camera)), recorded.settings)
+    found = []
+    for frame in range(frames):
+        samples = change(recorded.around(frame), frame)
+        seen = recorded.frames.seen(frame, 1.0)
+        result = tracker.localize(recorded.frames.middle_ns(frame), *seen, None, samples)
+        found.append((tracker.inertial, result))
+    return found
+
+
+@pytest.fixture(scope="module")
+def held():
+    return record(Camera(), hand, Rich(), 1, 60, seed=4)
+
+
+@pytest.mark.parametrize("motion", [hand, vibrating])
+def test_a_time_offset_is_found(motion):
+    recorded = record(Camera(), motion, Rich(), 1, 75, 4, replace(Imu(), offset=0.005))
+    followed = follow(recorded, 1.0, True, 60)
+    assert abs(followed.time_offsets[0] - 0.005) < 5e-4
+    assert followed.scores.localized.all()
+    assert followed.scores.median("angular") < 5.0  # 50 without the gyroscope
+
+
+def test_the_bias_is_found(held):
+    status, result = statuses(held, lambda samples, frame: samples)[-1]
+    assert status.used
+    assert result.turn is not None
+    assert 0.1 < np.degrees(np.linalg.norm(status.bias)) < 0.9  # of 0.5
+    assert np.degrees(status.bias_deviation) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("axes", "angle"), [((1.0, -1.0, -1.0), 180.0), ((-1.0, 1.0, -1.0), 180.0)]
+)
+def test_upside_down_is_dropped_with_its_angle(held, axes, angle):
+    def turned(samples, frame):
+        return ImuSamples(samples.times_ns, samples.angular_velocity * axes)
+
+    found = statuses(held, turned)
+    status, _ = found[-1]
+    assert status.alone is Alone.TURNED
+    assert abs(np.degrees(status.extrinsic_angle) - angle) < 3.0
+    assert all(result for _, result in found)
+
+
+def test_noise_is_dropped(held):
+    rng = np.random.default_rng(0)
+
+    def noise(samples, frame):
+        return ImuSamples(samples.times_ns, rng.normal(size=(len(samples), 3)))
+
+    found = statuses(held, noise)
+    assert found[-1][0].alone is Alone.DISAGREES
+    assert all(result for _, result in found)
+
+
+def test_interruptions_lose_nothing(held):
+    rng = np.random.default_rng(1)
+
+    def interrupted(samples, frame):
+        kind = rng.integers(4)
+        if kind == 0:
+            return None
+        if kind == 1:  # late
+            return ImuSamples(samples.times_ns[:-30], samples.angular_velocity[:-30])
+        if kind == 2:  # began a moment ago
+            return ImuSamples(samples.times_ns[-30:], samples.angular_velocity[-30:])
+        return samples
+
+    found = statuses(held, interrupted)
+    truths = held.frames.middle.position
+    assert all(result for _, result in found)
+    far = [np.linalg.norm(result.position - truths[k]) for k, (_, result) in enumerate(found)]
+    assert max(far) < 0.03
+    assert {status.alone for status, _ in found} == {
+        Alone.NONE, Alone.NO_SAMPLES, Alone.NOT_COVERED
+    }  # fmt: skip

@@ -1,0 +1,61 @@
+"""The filter of bias and offset: as the whole Kalman filter, of motion and parameters at once."""
+
+import numpy as np
+
+from rs_localizer.core.shutter import Motion
+from rs_localizer.inertial.filter import GyroscopeFilter, Predicted
+from rs_localizer.inertial.settings import InertialSettings
+
+STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+
+
+def test_the_update_is_that_of_the_whole_filter():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(22, 22)) / np.r_[np.full(18, 1.0), 30.0, 30.0, 30.0, 1e3][:, None]
+    joint = root @ root.T
+    observed = rng.normal(size=(7, 18))  # an image that sees the motion alone
+    noise = 0.1 * np.eye(7)
+    seen = np.hstack([observed, np.zeros((7, 4))])
+    gain = joint @ seen.T @ np.linalg.inv(seen @ joint @ seen.T + noise)
+    after = joint - gain @ seen @ joint
+    innovation = rng.normal(size=7)
+
+    gyroscope = GyroscopeFilter(InertialSettings(1e-4, 1e-4, True))
+    gyroscope._set(np.zeros(4), joint[18:, 18:])
+    predicted = Predicted(STILL, joint[:18, :18], joint[:18, 18:])
+    gyroscope.update(predicted, gain[:18] @ innovation, after[:18, :18])
+    expected = gain[18:] @ innovation
+    found = np.append(gyroscope.errors.bias, gyroscope.errors.time_offset)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-12)
+    scale = np.sqrt(np.diag(after)[18:])
+    np.testing.assert_allclose(
+        gyroscope.errors.covariance / np.outer(scale, scale),
+        after[18:, 18:] / np.outer(scale, scale), atol=2e-3,
+    )  # fmt: skip
+    np.testing.assert_allclose(gyroscope._with_motion / scale, after[:18, 18:] / scale, atol=2e-3)
+
+
+def test_an_image_that_says_nothing_changes_nothing():
+    gyroscope = GyroscopeFilter(InertialSettings(1e-4, 1e-4, True))
+    before = gyroscope.errors
+    covariance = np.eye(18)
+    # Worse than predicted, as where the camera shakes.
+    gyroscope.update(
+        Predicted(STILL, covariance, np.zeros((18, 4))), np.zeros(18), 2.0 * covariance
+    )
+    np.testing.assert_allclose(gyroscope.errors.covariance, before.covariance)
+
+
+def test_an_offset_that_is_given_stays():
+    gyroscope = GyroscopeFilter(InertialSettings(1e-4, 1e-4, False))
+    gyroscope.hear_delay(1e-4, 1e-12)
+    assert gyroscope.errors.time_offset == 0.0
+    gyroscope.walk(10.0)
+    assert gyroscope.errors.covariance[3, 3] < 2e-8
+
+
+def test_time_makes_the_bias_less_certain():
+    gyroscope = GyroscopeFilter(InertialSettings(1e-4, 1e-3, True))
+    before = gyroscope.errors.covariance[0, 0]
+    gyroscope.walk(4.0)
+    np.testing.assert_allclose(gyroscope.errors.covariance[0, 0] - before, 4e-6)

@@ -1,0 +1,122 @@
+"""The turn within a frame: against SciPy's splines and its integration of the kinematics."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.so3 import hat
+from rs_localizer.core.steadied import steadied
+from rs_localizer.inertial.band import densified
+
+TAU = np.linspace(-0.8, 0.8, 33)
+ROWS = np.linspace(-0.5, 0.5, 7)
+
+
+def shaking(tau):
+    return 0.3 * np.column_stack([np.sin(9.0 * tau), np.cos(5.0 * tau), 0.4 + tau])
+
+
+def integrated(rate, tau):
+    """Rotation (3,3) camera_then_from_camera_at_0 of a body rate."""
+
+    def kinematics(time, rotation):
+        return -(hat(rate(time)) @ rotation.reshape(3, 3)).ravel()
+
+    found = solve_ivp(kinematics, (0.0, tau), np.eye(3).ravel(), rtol=1e-12, atol=1e-13)
+    return found.y[:, -1].reshape(3, 3)
+
+
+def test_rates_are_a_natural_spline():
+    turn = KnownTurn.of(TAU, shaking(TAU))
+    expected = CubicSpline(TAU, shaking(TAU), bc_type="natural")
+    np.testing.assert_allclose(turn.at_rows(ROWS)[1], expected(ROWS), atol=1e-14)
+    np.testing.assert_allclose(turn.change, expected(0.0, 1), atol=1e-12)
+
+
+def test_rotations_are_the_integral_of_the_rates():
+    turn = KnownTurn.of(TAU, shaking(TAU))
+    spline = CubicSpline(TAU, shaking(TAU), bc_type="natural")
+    for tau, rotation in zip(ROWS, turn.at_rows(ROWS)[0], strict=True):
+        np.testing.assert_allclose(rotation, integrated(spline, tau), atol=1e-7)
+
+
+def test_no_turn_is_the_identity():
+    turn = KnownTurn.of(TAU, np.zeros((len(TAU), 3)))
+    np.testing.assert_array_equal(turn.at_rows(ROWS)[0], np.broadcast_to(np.eye(3), (7, 3, 3)))
+
+
+def test_a_parabola_leaves_nothing():
+    rates = np.column_stack([1.0 + TAU, TAU**2, 0.0 * TAU])
+    # A natural spline is none at its ends; a cubic through many samples is one in the middle.
+    turn = KnownTurn.of(np.linspace(-3.0, 3.0, 121), np.zeros((121, 3)))
+    assert turn.roughness == 0.0
+    dense = np.linspace(-3.0, 3.0, 121)
+    rates = np.column_stack([1.0 + dense, dense**2, 0.0 * dense])
+    turn = KnownTurn.of(dense, rates)
+    np.testing.assert_allclose(turn.parabola, [[1, 0, 0], [1, 0, 0], [0, 1, 0]], atol=1e-6)
+    assert turn.roughness < 1e-6
+    np.testing.assert_allclose(turn.late(0.3), np.zeros((2, 3)), atol=1e-5)
+
+
+@pytest.mark.parametrize("tau", [np.zeros(1), np.array([0.0, 0.0]), np.array([1.0, 0.0])])
+def test_times_must_increase(tau):
+    with pytest.raises(ValueError, match="increasing"):
+        KnownTurn.of(tau, np.zeros((len(tau), 3)))
+
+
+def test_steadied_bearings_are_those_of_the_middle_row():
+    rng = np.random.default_rng(1)
+    rays, tau = rng.uniform(-0.6, 0.6, (20, 2)), rng.uniform(-0.5, 0.5, 20)
+    turn = KnownTurn.of(TAU, shaking(TAU))
+    by_ray = np.broadcast_to(400.0 * np.eye(2), (20, 2, 2)).copy()
+    found, _ = steadied(rays, tau, by_ray, np.zeros(2), turn)
+    bearings = np.column_stack([rays, np.ones(20)])
+    expected = np.einsum("nji,nj->ni", turn.at_rows(tau)[0], bearings)
+    np.testing.assert_allclose(found, expected[:, :2] / expected[:, 2:], atol=1e-14)
+
+
+def test_derivatives_of_steadied_bearings_by_differences():
+    """Noise of the pixel moves the bearing and, with the row time, the turn."""
+    turn, gradient, step = KnownTurn.of(TAU, shaking(TAU)), np.array([3e-4, 2e-3]), 1e-4
+    ray, tau, focal = np.array([0.2, -0.3]), 0.21, 400.0
+
+    def steady(pixel):  # where a pixel's own row time puts its bearing
+        later = tau + gradient @ (pixel - focal * ray)
+        return steadied(
+            pixel[None] / focal, np.array([later]), np.zeros((1, 2, 2)), gradient, turn
+        )[0][0]
+
+    by_pixel = np.array(
+        [
+            (steady(focal * ray + step * axis) - steady(focal * ray - step * axis)) / (2.0 * step)
+            for axis in np.eye(2)
+        ]
+    ).T
+    _, found = steadied(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
+    np.testing.assert_allclose(found[0] @ by_pixel, np.eye(2), atol=1e-6)
+
+
+def test_bearings_that_turn_behind_the_camera_are_left_out():
+    turn = KnownTurn.of(TAU, np.broadcast_to([0.0, 3.0, 0.0], (len(TAU), 3)).copy())
+    rays = np.array([[0.0, 0.0], [-30.0, 0.0], [30.0, 0.0]])
+    found, _ = steadied(rays, np.full(3, 0.5), np.ones((3, 2, 2)), np.zeros(2), turn)
+    assert np.isfinite(found[0, 0])
+    assert np.isnan(found[1:]).any()
+
+
+def test_rates_between_the_samples_of_a_fast_vibration():
+    def shown(time):
+        waves = (113.0 * np.sin(2 * np.pi * 60.0 * time + p) for p in (0.0, 1.0, 2.0))
+        return np.column_stack(list(waves)) + 75.0 * np.cos(2 * np.pi * 120.0 * time)[:, None]
+
+    times = np.arange(-10, 11) / 400.0 + 3e-4
+    dense, rates = densified(times, shown(times))
+    inside = np.abs(dense) < 0.016
+    cubic = CubicSpline(times, shown(times), bc_type="natural")(dense)
+    error = np.abs(rates - shown(dense))[inside].max()
+    assert error < 0.5
+    assert error < 0.1 * np.abs(cubic - shown(dense))[inside].max()
+    np.testing.assert_array_equal(dense[::2], times)
+    np.testing.assert_array_equal(rates[::2], shown(times))

@@ -1,0 +1,75 @@
+"""Samples, mounting and gravity."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.inertial.gravity import STANDARD_GRAVITY, gravity_seen
+from rs_localizer.inertial.mounting import fit_mounting
+from rs_localizer.inertial.samples import MARGIN, ImuSamples, needed
+from rs_localizer.inertial.turning import GyroscopeErrors
+
+ERRORS = GyroscopeErrors(np.zeros(3), 0.0, 1e-8 * np.eye(4), 1e-4)
+TIMES = 10**12 + np.arange(400) * 2_500_000
+
+
+def test_samples_are_checked():
+    with pytest.raises(ValueError, match="increase"):
+        ImuSamples(np.array([1, 1]), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="angular_velocity must be"):
+        ImuSamples(np.array([1, 2]), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="specific_force must be"):
+        ImuSamples(np.array([1, 2]), np.zeros((2, 3)), np.full((2, 3), np.nan))
+
+
+def test_what_is_needed_is_what_is_taken():
+    samples = ImuSamples(TIMES, np.zeros((400, 3)))
+    first, last = needed(0.03, int(TIMES[200]), 2_500_000)
+    part = samples.around(int(TIMES[200]) - 15_000_000, int(TIMES[200]) + 15_000_000)
+    assert TIMES[part][0] >= first
+    assert TIMES[part][-1] <= last
+    assert part == slice(195 - MARGIN, 206 + MARGIN) or len(TIMES[part]) >= 13 + 2 * (MARGIN - 1)
+    assert samples.around(int(TIMES[0]) - 1, int(TIMES[5])) is None
+    assert samples.around(int(TIMES[5]), int(TIMES[-1]) + 1) is None
+
+
+def test_the_mounting_is_found():
+    rng = np.random.default_rng(0)
+    shown = rng.normal(0.0, 0.05, (40, 3))
+    mounted = Rotation.from_rotvec([0.5, 1.2, -0.3])
+    found = fit_mounting(shown, mounted.apply(shown) + rng.normal(0.0, 1e-3, (40, 3)))
+    assert found.explains
+    np.testing.assert_allclose(found.rotation, mounted.as_matrix(), atol=0.01)
+    assert abs(found.angle - mounted.magnitude()) < 0.01
+    assert not fit_mounting(shown, rng.normal(0.0, 0.05, (40, 3))).explains
+
+
+def test_turns_about_one_axis_say_nothing_of_the_mounting():
+    shown = np.outer(np.linspace(-1.0, 1.0, 20), [0.0, 0.0, 1.0])
+    assert fit_mounting(shown, shown) is None
+
+
+def test_gravity_of_a_camera_that_turns():
+    rate = np.array([0.2, -0.5, 0.3])
+    seconds = 1e-9 * (TIMES - TIMES[200])
+    down = np.array([0.0, 0.6, 0.8])
+    force = Rotation.from_rotvec(np.outer(seconds, rate)).inv().apply(-STANDARD_GRAVITY * down)
+    samples = ImuSamples(TIMES, np.broadcast_to(rate, (400, 3)), force)
+    found, deviation = gravity_seen(samples, int(TIMES[200]), ERRORS)
+    np.testing.assert_allclose(found, down, atol=1e-5)
+    assert deviation == pytest.approx(0.03, rel=1e-3)
+
+
+def test_a_camera_that_accelerates_knows_gravity_less():
+    seconds = 1e-9 * (TIMES - TIMES[200])
+    still = np.broadcast_to([0.0, -STANDARD_GRAVITY, 0.0], (400, 3))
+    pushed = still + np.outer(np.sin(2.0 * np.pi * 3.0 * seconds), [3.0, 0.0, 0.0])
+    rates = np.zeros((400, 3))
+    _, calm = gravity_seen(ImuSamples(TIMES, rates, still), int(TIMES[200]), ERRORS)
+    direction, rough = gravity_seen(ImuSamples(TIMES, rates, pushed), int(TIMES[200]), ERRORS)
+    off = np.arccos(min(direction @ [0.0, 1.0, 0.0], 1.0))
+    assert rough > 3.0 * calm
+    assert off < 2.0 * rough
+    falling = ImuSamples(TIMES, rates, 0.1 * still)
+    assert gravity_seen(falling, int(TIMES[200]), ERRORS) is None
+    assert gravity_seen(ImuSamples(TIMES, rates), int(TIMES[200]), ERRORS) is None
