@@ -63,6 +63,7 @@ _MOST_JOLTS = 1e4
 _SHORT = 0.03
 # The least angular acceleration there is, rad/s^2: turns are told by a gyroscope.
 _NO_TURN = 0.001
+_IDENTITY = np.eye(3)
 
 
 def predict(
@@ -143,7 +144,7 @@ def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time:
     for deviation, parts in ((acceleration.angular, angular), (acceleration.linear, linear)):
         for i, rows in enumerate(parts):
             for j, columns in enumerate(parts):
-                covariance[rows, columns] = deviation**2 * block[i, j] * np.eye(3)
+                covariance[rows, columns] = deviation**2 * block[i, j] * _IDENTITY
     return covariance
 
 

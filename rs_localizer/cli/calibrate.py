@@ -12,6 +12,8 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
+from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
+from rs_localizer.cli.calibrate_table import tell, tell_lens
 from rs_localizer.cli.detect import add_board_arguments, find_map
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
@@ -30,6 +32,7 @@ from rs_localizer.offline.image_sources import (
     INFO_TYPE,
     Carried,
     Shot,
+    SourceError,
     find_topic,
     from_bag,
     from_files,
@@ -37,6 +40,7 @@ from rs_localizer.offline.image_sources import (
     have_times,
     image_files,
 )
+from rs_localizer.offline.imu_recording import read_imu_recording
 from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
@@ -45,6 +49,7 @@ from rs_localizer.settings import build, load_params_file, parse_assignment
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
+from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.observe import Observed, in_order
 
 
@@ -66,6 +71,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--intrinsics", action="store_true", help="find the lens as well, and write camera_info"
+    )
+    parser.add_argument(
+        "--imu",
+        nargs="?",
+        const="",
+        metavar="TOPIC",
+        help="find how the IMU of a bag goes with the camera: offset of its stamps, rotation, bias "
+        "(default: the only topic of its type)",
     )
     parser.add_argument(
         "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
@@ -95,6 +108,7 @@ class _Source:
     images: list[Observed]
     camera: Camera | None
     size: tuple[int, int]
+    imu: ImuRecording | None = None
 
 
 def run(args: argparse.Namespace) -> None:
@@ -105,17 +119,21 @@ def run(args: argparse.Namespace) -> None:
         camera = first_lens(source.size, in_order(source.images))
     camera = replace(camera, scan_direction=config.scan_direction)
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
-        found = calibrate(camera, source.images, intrinsics=intrinsics, done=bar.update)
-    _tell(found, args.rate)
+        found = calibrate(
+            camera, source.images, intrinsics=intrinsics, imu=source.imu, done=bar.update
+        )
+    tell(found, args.rate)
     if intrinsics:
-        _tell_lens(found)
+        tell_lens(found)
+    for line in imu_lines(found, source.imu, config):
+        print(line)
     if args.plots is not None:
         save_plots(camera, found, args.plots)
     refusal = verdict.refusal(found)
     if refusal:
         raise ValueError(refusal)
     if args.out is not None:
-        _write(found, args.out, intrinsics)
+        _write(found, args.out, intrinsics, config)
 
 
 def _config(args: argparse.Namespace) -> NodeConfig:
@@ -133,17 +151,31 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
     if not path.exists():
         raise ValueError(f"{path} does not exist")
     if not is_bag(path):
+        if args.imu is not None:
+            raise UsageError("--imu is for bags: a video or files have no IMU")
         with _files(args) as shots:
             return _detected(args, shots)
     with open_bag(path) as bag:
+        imu = None
+        if args.imu is not None:
+            imu = read_imu_recording(bag, args.imu or None, _camera_frame(args, bag))
         if args.image is None and has_frames(bag):
-            return _correspondences(args, bag, config)
+            return replace(_correspondences(args, bag, config), imu=imu)
         topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
         given = None if args.calibration is None else read_calibration(args.calibration)
         info = None
         if given is None:
             info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
-        return _detected(args, from_bag(bag, topic, info, given))
+        return replace(_detected(args, from_bag(bag, topic, info, given)), imu=imu)
+
+
+def _camera_frame(args: argparse.Namespace, bag: BagReader) -> str:
+    """Optical frame of the camera, by its first camera_info; without one, TF cannot be asked."""
+    try:
+        topic = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
+    except SourceError:
+        return ""
+    return next((str(m.header.frame_id) for _, _, m in bag.messages([topic])), "")
 
 
 def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:
@@ -221,52 +253,13 @@ def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Sou
     return _Source(images, camera, size)
 
 
-def _tell(found: Calibration, rate: float | None) -> None:
-    direction = verdict.scan_direction(found)
-    rows = [
-        ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
-        ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
-        ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
-        ("scan direction", str(direction)),
-        ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
-        ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
-        ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
-        ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
-        ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
-    ]
-    for name, text in rows:
-        print(f"{name:26} {text}")
-    for block in found.blocks:
-        print(
-            f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"
-            f"{1e3 * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
-        )
-    for remark in verdict.remarks(found):
-        print(remark)
-    if rate is not None:
-        share = abs(found.readout_time) / found.stamps.interval
-        print(
-            f"the readout time is {share:.3f} of the interval: it scales with --rate, "
-            f"assumed to be {rate:g} Hz"
-        )
-
-
-def _tell_lens(found: Calibration) -> None:
-    values, state = found.fit.border_covariance, found.fit.state
-    deviations = np.sqrt(np.diag(values)[1 : 1 + len(state.lens)])
-    names = ("fx", "fy", "cx", "cy")
-    for k, value in enumerate(state.lens):
-        name = names[k] if k < len(names) else f"D[{k - len(names)}]"
-        print(f"{name:26} {value:.5g} +- {found.inflation * deviations[k]:.2g}")
-
-
-def _write(found: Calibration, path: Path, intrinsics: bool) -> None:
+def _write(found: Calibration, path: Path, intrinsics: bool, config: NodeConfig) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
         "/**:\n  ros__parameters:\n"
         f"    readout_time: {verdict.readout_time(found)!r}\n"
         f"    readout_time_deviation: {found.deviation!r}\n"
-        f"    scan_direction: {verdict.scan_direction(found)}\n",
+        f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config),
         encoding="utf-8",
     )
     print(f"written: {path}")

@@ -227,7 +227,11 @@ def turns_at(wanted: Array, times: Array, cubics: Array, rotations: Array) -> tu
         place = _place(wanted[i], times)
         since = wanted[i] - times[place]
         found[i] = multiplied(exp(-_turn(cubics[place], since)), rotations[place])
-        rates[i] = _rate_at(wanted[i], times, cubics)
+        cubic = cubics[place]
+        for axis in range(3):
+            rates[i, axis] = cubic[0, axis] + since * (
+                cubic[1, axis] + since * (cubic[2, axis] + since * cubic[3, axis])
+            )
     return found, rates
 
 

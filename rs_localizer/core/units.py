@@ -60,7 +60,6 @@ def camera_state(motion: Motion, camera: Camera, tau: float = 0.0) -> CameraStat
         position=-in_map @ translation,
         orientation=so3.quaternion(in_map),
         rotation=in_map,
-        # The body rate is constant in the body's own axes: they turn about it.
-        angular_velocity=motion.angular_velocity / per_readout,
+        angular_velocity=motion.angular_velocity_at(tau) / per_readout,
         linear_velocity=motion.linear_velocity_at(tau) / per_readout,
     )

@@ -41,7 +41,10 @@ _TINY = 1e-12
 def delay_of(
     observations: Observations, posterior: Posterior, turn: KnownTurn
 ) -> tuple[float, float]:
-    """By how many readouts the known turn has to be delayed, and the variance of that."""
+    """By how many readouts the known turn has to be delayed, and the variance of that.
+
+    An infinite variance says that it is not known, or that it is beyond what was tried.
+    """
     unknown = 0.0, math.inf
     if turn.roughness * min(turn.delay, _STEP) < _LEAST_TURN:
         return unknown
@@ -56,7 +59,8 @@ def delay_of(
     best = int(np.argmin(costs))
     if not 0 < best < len(costs) - 1:
         if count > 1:
-            return unknown
+            beyond = costs[best] < costs[count] - _CLEARLY
+            return (float(delays[best]), math.inf) if beyond else unknown
         best = 1
     bend = float(costs[best - 1] - 2.0 * costs[best] + costs[best + 1])
     far = np.abs(np.arange(len(costs)) - best) > _OTHER

@@ -25,6 +25,7 @@ from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
 SEEN = np.r_[TURN, ANGULAR]
 """Of a step: what a gyroscope contradicts."""
+_SEEN_BLOCK = np.ix_(SEEN, SEEN)
 # Points that fit with the gyroscope, beyond those that fit without it, that speak for it although
 # it contradicts what the camera sees.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
@@ -229,4 +230,4 @@ def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
 def _contradicts(foreseen: Foreseen, step: Array) -> bool:
     if foreseen.predicted is None:
         return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3])
-    return contradicts(step[SEEN], foreseen.predicted.covariance[np.ix_(SEEN, SEEN)])
+    return contradicts(step[SEEN], foreseen.predicted.covariance[_SEEN_BLOCK])

@@ -26,6 +26,7 @@ from rs_localizer.core.state import (
 from rs_localizer.inertial import turning
 from rs_localizer.inertial.settings import (
     BIAS_DEVIATION,
+    JITTER,
     OFFSET_DEVIATION,
     OFFSET_WALK,
     InertialSettings,
@@ -42,9 +43,9 @@ _MOST_GAIN = 0.9999
 RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 """Of a step: what the gyroscope leaves to the points."""
 _TURNS = np.arange(3)
-# What the rows say of the time offset is never better than this (s), and not believed beyond chance
-# (squared, in variances).
-_LEAST_DELAY, _MOST_DELAY = 1e-5, 16.0
+# What the rows say of the time offset is not believed beyond chance (squared, in variances),
+# but then its variance grows.
+_MOST_DELAY, _WIDER = 16.0, 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,8 +164,17 @@ class GyroscopeFilter:
         """
         covariance = self.errors.covariance
         known = float(covariance[OFFSET, OFFSET])
-        total = known + variance + _LEAST_DELAY**2
-        if not self._settings.estimate_time_offset or delay * delay > _MOST_DELAY * total:
+        total = known + variance + JITTER**2
+        if not self._settings.estimate_time_offset:
+            return
+        beyond = math.isinf(variance) and delay != 0.0
+        if beyond or delay * delay > _MOST_DELAY * total:
+            # The offset is not known as well as it seemed to be.
+            wider = covariance.copy()
+            wider[OFFSET, OFFSET] = min(_WIDER * known, max(known, OFFSET_DEVIATION**2))
+            self._set(np.append(self.errors.bias, self.errors.time_offset), wider)
+            return
+        if math.isinf(variance):
             return
         gain = covariance[:, OFFSET] / total
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain * delay
@@ -175,12 +185,13 @@ class GyroscopeFilter:
         self, known: IntArray, before: Array, with_parameters: Array, step: Array, posterior: Array
     ) -> None:
         """``known``: places of a step that the prediction ``before`` was of."""
-        after = np.ascontiguousarray(posterior[np.ix_(known, known)])
+        whole = len(known) == PARAMETERS
+        after = np.ascontiguousarray(posterior if whole else posterior[np.ix_(known, known)])
         gain, gained, left = _gain(before, after, np.ascontiguousarray(with_parameters))
         covariance = self.errors.covariance - gained
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain @ step
         tied = left @ gain.T
-        if len(known) < PARAMETERS:
+        if not whole:
             tied = posterior[:, known] @ np.linalg.solve(after, tied)
         self._with_motion = np.ascontiguousarray(tied)
         self._set(parameters, 0.5 * (covariance + covariance.T))

@@ -15,7 +15,9 @@ BIAS_DEVIATION = math.radians(3.0)  # rad/s, of each axis
 # Stamps of cameras and IMUs are off by some milliseconds in the driver.
 OFFSET_DEVIATION = 0.01  # s
 # Once estimated, the offset changes by clocks that drift apart, s/sqrt(s).
-OFFSET_WALK = 2e-6
+OFFSET_WALK = 5e-6
+# What stamps of single frames and samples are off by beside it, at best, s.
+JITTER = 4e-5
 
 
 @dataclass(frozen=True, slots=True)

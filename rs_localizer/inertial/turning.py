@@ -26,7 +26,7 @@ from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.so3 import coefficients, log
 from rs_localizer.inertial.band import densified
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.inertial.settings import SCALE_DEVIATION
+from rs_localizer.inertial.settings import JITTER, SCALE_DEVIATION
 
 PARAMETERS = 4
 """Of a gyroscope: its bias (3, rad/s), and the time offset of its stamps (s)."""
@@ -94,7 +94,7 @@ def turn_within(
     )
     period = (times[-1] - times[0]) / (len(times) - 1)
     rate_noise = errors.noise * readout_time / math.sqrt(period)
-    delay = math.sqrt(errors.covariance[OFFSET, OFFSET]) / readout_time
+    delay = math.sqrt(errors.covariance[OFFSET, OFFSET] + JITTER**2) / readout_time
     return TurnWithin(KnownTurn(*turn, error, rate_noise, delay), by_parameters, variances)
 
 

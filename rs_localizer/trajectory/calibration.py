@@ -6,14 +6,15 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
-from scipy.stats import chi2
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
-from rs_localizer.trajectory.fit import Fit, cost_at, fit
+from rs_localizer.trajectory.blocks import Block, blocks_of, disagreement
+from rs_localizer.trajectory.fit import Fit, cost_at, fit, image_speeds
+from rs_localizer.trajectory.gyro import NoMount
+from rs_localizer.trajectory.imu import ImuRecording, MountFound, mount_of, with_gyro
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
 from rs_localizer.trajectory.observe import Observed, Posed, collect, in_order, localize_each
 from rs_localizer.trajectory.spline import Spline
@@ -25,10 +26,6 @@ _LEAST_IMAGES = 20
 _MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
 # A given lens, and one that is to be found (see Freedom.lens_deviations).
 _GIVEN_LENS, _UNKNOWN_LENS = (0.02, 0.1), (0.3, 1.0)
-# Parts of the recording that are calibrated on their own.
-_BLOCK_SECONDS, _MOST_BLOCKS = 3.0, 8
-# Blocks that would differ this much by chance once in a hundred recordings disagree.
-_DISAGREEMENT = 0.01
 # Blocks whose scatter is this part of the value: the camera may turn its picture.
 _STABILISED = 0.1
 # Images that were not taken at their even stamps may be missing others between them: the mean
@@ -48,16 +45,6 @@ _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
 _COST_PER_PARAMETER = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
-    """A part of the recording on its own."""
-
-    start: float  # s
-    end: float  # s
-    readout_time: float  # s
-    deviation: float  # s
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """What a recording says of its camera."""
@@ -72,11 +59,13 @@ class Calibration:
     fit: Fit
     posed: Posed
     images: int
+    mount: MountFound | None = None  # of the IMU, where there is one
+    no_mount: str = ""  # why there is none
 
     @property
     def jitter(self) -> float:
         """By how much (s rms) images were exposed beside their stamps; 0: they were not."""
-        return float(np.std(self.fit.state.delays)) if self.fit.freedom.stamps > 0.0 else 0.0
+        return self.fit.freedom.stamps
 
     @property
     def odds(self) -> float:
@@ -111,6 +100,7 @@ def calibrate(
     images: list[Observed],
     *,
     intrinsics: bool = False,
+    imu: ImuRecording | None = None,
     done: Callable[[], object] = lambda: None,
 ) -> Calibration:
     """Readout time, and lens, of a camera from a recording in which it moves.
@@ -119,6 +109,7 @@ def calibrate(
         camera: its lens, and the axis and assumed direction of its scan; not its readout time.
         images: with at least a dozen correspondences each.
         intrinsics: the lens is to be found; otherwise it is known to a percent or two.
+        imu: how it goes with the camera is to be found; its turns then help to find all else.
         done: called after each image.
 
     Raises:
@@ -142,7 +133,15 @@ def calibrate(
         found = _best(camera, posed, stamps.interval, freedom)
     except Undetermined as error:
         raise ValueError(str(error)) from error
-    return _judged(camera, posed, stamps, found, len(images))
+    seen, no_mount = within(posed.observations, found.state.spline), ""
+    if imu is not None:
+        try:
+            samples = imu.samples(posed.start_ns)
+            seen, found = with_gyro(camera, seen, found, samples, imu.camera_from_imu)
+        except (NoMount, Undetermined) as error:
+            no_mount = str(error)
+    judged = _judged(camera, posed, seen, stamps, found, len(images))
+    return replace(judged, no_mount=no_mount)
 
 
 def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
@@ -167,8 +166,8 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
     found = fit(camera, seen, plain.state, _calm(plain.state, freedom), plain.deviation)
     with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
         other = _unsteady(camera, seen, found, interval, freedom)
-        delays = other.state.delays
-        if np.std(delays) > _LEAST_JITTER * interval and _cheaper(other, found, len(delays)):
+        unsteady = other.freedom.stamps > _LEAST_JITTER * interval
+        if unsteady and _cheaper(other, found, len(other.state.delays)):
             found = other
     with suppress(Undetermined):
         state = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
@@ -187,8 +186,21 @@ def _unsteady(
     for share in _FIRST_JITTERS:
         own = replace(own, stamps=share * interval)
         other = fit(camera, seen, other.state, own)
-    own = replace(own, stamps=max(float(np.std(other.state.delays)), _LEAST_STAMPS))
+    own = replace(own, stamps=max(_jitter(camera, seen, other.state), _LEAST_STAMPS))
     return fit(camera, seen, other.state, own, other.deviation)
+
+
+def _jitter(camera: Camera, seen: Observations, state: State) -> float:
+    """What the images' own times are off their stamps, s rms.
+
+    By how one image differs from the mean of its neighbours: times that drift are nearly a motion
+    that drifts. And by the fast images: in slow ones a hundredth of a pixel, which may be the
+    detector's error, is worth a millisecond.
+    """
+    weights = np.bincount(seen.frames, image_speeds(camera, seen, state) ** 2, len(state.delays))
+    weights = np.minimum(weights[1:-1], np.minimum(weights[:-2], weights[2:]))
+    beside = np.diff(state.delays, 2)
+    return float(np.sqrt(weights @ beside**2 / (6.0 * np.sum(weights))))
 
 
 def _calm(state: State, freedom: Freedom) -> Freedom:
@@ -218,12 +230,16 @@ def within(observations: Observations, spline: Spline) -> Observations:
     return observations.subset(spline.layout.inside(observations.times))
 
 
-def _judged(camera: Camera, posed: Posed, stamps: Stamps, found: Fit, images: int) -> Calibration:
-    seen = within(posed.observations, found.state.spline)
+def _judged(
+    camera: Camera, posed: Posed, seen: Observations, stamps: Stamps, found: Fit, images: int
+) -> Calibration:
     opposite = cost_at(camera, seen, found, -found.state.readout_time)
-    blocks = _blocks(camera, seen, found)
+    blocks = blocks_of(seen, found)
     formal = found.readout_time_deviation
-    inflation = _disagreement(blocks)
+    inflation, mount = _disagreement(blocks, "readout_time", "deviation"), None
+    if seen.gyro is not None:
+        doubt = _disagreement(blocks, "delay", "delay_deviation")
+        mount = mount_of(camera, found, seen.gyro, doubt)
     return Calibration(
         readout_time=found.state.readout_time,
         deviation=math.hypot(formal * inflation, _interval_deviation(found, stamps)),
@@ -235,64 +251,20 @@ def _judged(camera: Camera, posed: Posed, stamps: Stamps, found: Fit, images: in
         fit=found,
         posed=posed,
         images=images,
+        mount=mount,
     )
 
 
-def _blocks(camera: Camera, observations: Observations, found: Fit) -> tuple[Block, ...]:
-    """Parts of the recording, each with lens and landmarks as the whole has them."""
-    first, last = observations.times.min(), observations.times.max()
-    count = int(np.clip((last - first) / _BLOCK_SECONDS, 2, _MOST_BLOCKS))
-    edges = np.linspace(first, last + 1e-6, count + 1)
-    blocks = []
-    for start, end in pairwise(edges):
-        inside = (observations.times >= start) & (observations.times < end)
-        # Not only what fits the whole: a part that differs would be left out of its own estimate.
-        part = observations.subset(inside)
-        part = replace(part, landmarks=found.state.landmarks)
-        state = _cut(found.state, start, end)
-        if state is None or not np.any(part.trusted):
-            continue
-        held = replace(found.freedom, lens=False, landmarks=0.0)
-        try:
-            own = fit(found.camera, part, state, held)
-        except Undetermined:
-            continue
-        deviation = own.readout_time_deviation
-        blocks.append(Block(float(start), float(end), own.state.readout_time, deviation))
-    return tuple(blocks)
-
-
-def _cut(state: State, start: float, end: float) -> State | None:
-    """The state with the motion between two times only."""
-    layout = state.spline.layout
-    intervals = np.column_stack([layout.starts, layout.ends])
-    margin = abs(state.readout_time)
-    kept = np.clip(intervals, start - margin, end + margin)
-    kept = kept[kept[:, 1] - kept[:, 0] > layout.spacing]
-    if len(kept) == 0:
-        return None
-    return replace(state, spline=refined(state.spline, layout.spacing, kept))
+def _disagreement(blocks: tuple[Block, ...], value: str, deviation: str) -> float:
+    return disagreement(
+        *(np.array([getattr(block, name) for block in blocks]) for name in (value, deviation))
+    )
 
 
 def _interval_deviation(found: Fit, stamps: Stamps) -> float:
     """Of the readout time (s), where stamps are even and the images were not."""
-    unsaid = float(np.var(found.state.delays)) - stamps.jitter**2
+    # So many images know a variance no better than that.
+    chance = 1.0 + 2.0 * math.sqrt(2.0 / len(found.state.delays))
+    unsaid = found.freedom.stamps**2 - chance * stamps.jitter**2
     share = math.sqrt(max(unsaid, 0.0)) / stamps.interval
     return _INTERVAL_SHARE * share * abs(found.state.readout_time)
-
-
-def _disagreement(blocks: tuple[Block, ...]) -> float:
-    """By how much the deviations are too small (Birge's ratio), 1 if that may be chance."""
-    if len(blocks) < 2:
-        return 1.0
-    values = np.array([block.readout_time for block in blocks])
-    weights = np.array([block.deviation for block in blocks]) ** -2.0
-    total = float(np.sum(weights))
-    mean = np.sum(weights * values) / total
-    squared = float(np.sum(weights * (values - mean) ** 2))
-    freedoms = len(blocks) - 1
-    if chi2.sf(squared, freedoms) > _DISAGREEMENT:
-        return 1.0
-    # What the blocks disagree in is not their noise: none of them is better than the others.
-    scatter = np.std(values, ddof=1) / math.sqrt(len(blocks))
-    return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))

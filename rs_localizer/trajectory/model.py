@@ -8,6 +8,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.trajectory.gyro import GyroMount, GyroSamples
 from rs_localizer.trajectory.lens import lens_values
 from rs_localizer.trajectory.spline import Spline
 
@@ -23,6 +24,7 @@ class Observations:
     points: IntArray  # (n,) rows of ``landmarks``
     frames: IntArray  # (n,) number of the image, rising
     trusted: BoolArray  # (n,) inliers of their frame alone
+    gyro: GyroSamples | None = None
 
     def subset(self, chosen: BoolArray) -> Observations:
         """The chosen keypoints (n,), with all landmarks."""
@@ -53,6 +55,7 @@ class State:
     lens: Array  # (m,) as of lens_values
     landmarks: Array  # (p,3) m
     delays: Array  # (g,) s, how much later than stamped each image was exposed
+    mount: GyroMount | None = None  # of the gyroscope, where there is one
 
 
 def start_state(

@@ -9,9 +9,13 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.core.types import Estimate, Failure, Reason
 from rs_localizer.localizer import Localizer
 from rs_localizer.trajectory.model import Observations
+
+# What a wrong lens looks like in one image, and how much larger errors may be there.
+_OF_THE_LENS = (Reason.MODEL_ERROR, Reason.RESIDUAL)
+_ROUGH = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,11 +48,19 @@ def in_order(images: Iterable[Observed]) -> list[Observed]:
 def localize_each(
     camera: Camera, images: list[Observed], done: Callable[[], object] = lambda: None
 ) -> list[Estimate | Failure]:
-    """Each image on its own: the readout time need not be known."""
+    """Each image on its own: the readout time need not be known.
+
+    Nor need the lens be right: where it is too wrong for a pose to be published, a rough one is a
+    start for an estimator that finds the lens as well.
+    """
     localizer = Localizer(camera)
+    rough = Localizer(camera, inlier_threshold=_ROUGH * localizer.config.inlier_threshold)
     results = []
     for image in images:
-        results.append(localizer.localize(image.points, image.pixels))
+        result = localizer.localize(image.points, image.pixels)
+        if isinstance(result, Failure) and result.reason in _OF_THE_LENS:
+            result = rough.localize(image.points, image.pixels)
+        results.append(result)
         done()
     return results
 

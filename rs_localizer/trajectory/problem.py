@@ -14,6 +14,8 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored, Undetermined
+from rs_localizer.trajectory.gyro_kernels import MOUNT
+from rs_localizer.trajectory.gyro_terms import GyroTerms
 from rs_localizer.trajectory.lens import lens_values, project
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.normal_kernels import (
@@ -65,8 +67,16 @@ class Problem:
         self.free_points = np.flatnonzero(self.slots >= 0)
         readout = 1 if freedom.readout_time else 0
         self.border = readout + self.lens_count + 3 * len(self.free_points)
+        self.gyro: GyroTerms | None = None
+        if observations.gyro is not None and start.mount is not None:
+            self.gyro = GyroTerms(observations.gyro, start, self.border)
+            self.border += MOUNT
         self.lens_column = readout if self.lens_count else -1
         self.point_column = readout + self.lens_count if len(self.free_points) else -1
+
+    @property
+    def _point_columns(self) -> slice:
+        return slice(self.point_column, self.point_column + 3 * len(self.free_points))
 
     def look(self, state: State) -> tuple[Curve, list[Sights]]:
         """The spline, and all keypoints on it in so many parts of the recording."""
@@ -140,6 +150,8 @@ class Problem:
             float(self.freedom.linear_acceleration), normal,
         )  # fmt: skip
         cost += self._add_priors(state, normal)
+        if self.gyro is not None:
+            cost += self.gyro.add(state, normal)
         if self.freedom.stamps > 0.0:
             eliminate_stamps(normal)
         return cost, normal
@@ -180,7 +192,7 @@ class Problem:
         if self.point_column >= 0:
             known = self.observations.landmarks[self.free_points]
             offset = (state.landmarks[self.free_points] - known).ravel() / self.freedom.landmarks
-            at = slice(self.point_column, self.border)
+            at = self._point_columns
             normal.border_slope[at] += offset / self.freedom.landmarks
             normal.corner[diagonal[at], diagonal[at]] += self.freedom.landmarks**-2
             cost += float(offset @ offset)
@@ -199,14 +211,16 @@ class Problem:
             lens = lens + border[self.lens_column : self.lens_column + self.lens_count]
         if self.point_column >= 0:
             landmarks = landmarks.copy()
-            landmarks[self.free_points] += border[self.point_column :].reshape(-1, 3)
-        delays = state.delays
+            landmarks[self.free_points] += border[self._point_columns].reshape(-1, 3)
+        delays, mount = state.delays, state.mount
+        if self.gyro is not None and mount is not None:
+            mount = self.gyro.moved(mount, border)
         if self.freedom.stamps > 0.0:
             width = normal.image_controls.shape[1]
             own = controls[CONTROL * normal.image_first[:, None] + np.arange(width)]
             pull = np.einsum("gk,gk->g", normal.image_controls, own) + normal.image_border @ border
             delays = delays - (normal.image_slope + pull) / normal.image_information
-        return State(state.spline.moved(controls), readout_time, lens, landmarks, delays)
+        return State(state.spline.moved(controls), readout_time, lens, landmarks, delays, mount)
 
     def minimise(self, state: State, deviation: float, steps: int = _STEPS) -> State:
         """The state of least cost near to this one, after at most so many steps."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.trajectory.spline import Layout, Spline
 
@@ -56,10 +57,18 @@ def first_spline(
 
 
 def refined(spline: Spline, spacing: float, intervals: Array | None = None) -> Spline:
-    """The same motion with other knots, over all of it or over parts (s,2) of its time."""
+    """The same motion with other knots, over all of it or over parts (s,2) of its time.
+
+    At a knot the curve lies a sixth of the controls' second difference beside its control; where
+    the new knots are among the old ones, or between them, the motion stays exactly the same.
+    """
     layout = spline.layout
     if intervals is None:
         intervals = np.column_stack([layout.starts, layout.ends])
     finer = Layout.over(intervals, spacing)
     states = spline.states(finer.control_times())
-    return Spline(finer, states.rotations, states.positions)
+    share = -(spacing**2) / 6.0
+    turns = so3.exp_many(share * states.angular_acceleration)
+    return Spline(
+        finer, states.rotations @ turns, states.positions + share * states.linear_acceleration
+    )

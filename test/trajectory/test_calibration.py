@@ -72,7 +72,7 @@ def test_irregular_stamps_are_noticed_and_do_little_harm() -> None:
     rng = np.random.default_rng(1)
     images = [
         replace(image, stamp_ns=image.stamp_ns + round(3e6 * rng.normal()))
-        for image in recording(0.02, seconds=4.0)
+        for image in recording(0.02, seconds=3.0)
     ]
     found = calibrate(CAMERA, images)
     agrees(found, 0.02, 1e-3)
@@ -83,9 +83,9 @@ def test_irregular_stamps_are_noticed_and_do_little_harm() -> None:
 
 def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree() -> None:
     """Stabilisation: a part of the motion is taken out of the images, more or less of it."""
-    images = list(recording(0.02, seconds=2.0)) + [
+    images = list(recording(0.02, seconds=1.3)) + [
         replace(image, stamp_ns=image.stamp_ns + 10**10)
-        for image in recording(0.008, seconds=2.0, seed=22)
+        for image in recording(0.008, seconds=1.3, seed=22)
     ]
     found = calibrate(CAMERA, images)
     assert found.stabilised
@@ -93,7 +93,7 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree() -> None:
 
 
 def test_a_lens_from_nothing() -> None:
-    images = list(recording(0.02, seconds=4.0, turn=0.15))
+    images = list(recording(0.02, seconds=3.0, turn=0.15))
     camera = first_lens((projector.WIDTH, projector.HEIGHT), in_order(images))
     assert camera.K[0, 0] == pytest.approx(projector.FOCAL, rel=0.3)
     found = calibrate(camera, images, intrinsics=True)

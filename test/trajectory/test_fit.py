@@ -158,7 +158,7 @@ def test_noise_outliers_directions(readout: float, outliers: float, axis: int) -
     rng = np.random.default_rng(4)
     motion = projector.Motion.random(rng)
     camera = make_camera(scan_direction="top_to_bottom" if axis else "left_to_right")
-    frames = projector.record(rng, motion, projector.room(rng), readout=readout, seconds=3.0,
+    frames = projector.record(rng, motion, projector.room(rng), readout=readout, seconds=2.0,
                               outliers=outliers, axis=axis)  # fmt: skip
     seen = observe(camera, frames)
     # Half of the outliers pass for inliers of their frame.
@@ -168,7 +168,7 @@ def test_noise_outliers_directions(readout: float, outliers: float, axis: int) -
     assert abs(found.state.readout_time - readout) < 4.0 * found.readout_time_deviation < 2e-4
     assert found.deviation == pytest.approx(0.3, rel=0.06)
     assert np.mean(found.inliers == seen.trusted) > 0.99
-    times = np.linspace(0.2, 2.8, 60)
+    times = np.linspace(0.2, 1.8, 40)
     _, positions = motion.pose(times + 0.5 * abs(readout))
     angular, linear = motion.twist(times + 0.5 * abs(readout))
     states, covariances = found.state.spline.states(times), found.state_covariances(times)
@@ -183,9 +183,9 @@ def test_noise_outliers_directions(readout: float, outliers: float, axis: int) -
 
 def test_a_wrong_lens_and_a_bent_board_are_found() -> None:
     rng = np.random.default_rng(5)
-    motion, flat = projector.Motion.random(rng, 0.2, 0.12), projector.board()
+    motion, flat = projector.Motion.random(rng, 0.2, 0.12), projector.board(6, 5, 0.16)
     bent = flat + np.column_stack([np.zeros((len(flat), 2)), 4e-3 * np.sin(5.0 * flat[:, 0])])
-    frames = projector.record(rng, motion, bent, readout=READOUT, seconds=6.0, noise=0.1)
+    frames = projector.record(rng, motion, bent, readout=READOUT, seconds=4.0, noise=0.1)
     camera = make_camera()
     wrong = replace(camera, K=camera.K * [[1.02], [1.02], [1.0]], D=0.5 * camera.D)
     believed = [replace(f, points=flat[[np.flatnonzero((bent == p).all(axis=1))[0]
@@ -202,7 +202,7 @@ def test_images_with_times_of_their_own() -> None:
     """Stamps that are 3 ms off: without the images' own times the readout time pays for it."""
     rng = np.random.default_rng(6)
     motion, camera = projector.Motion.random(rng), make_camera()
-    frames = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=3.0)
+    frames = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=2.0)
     late = rng.normal(0.0, 3e-3, len(frames))
     stamped = [replace(f, stamp=f.stamp - d) for f, d in zip(frames, late, strict=True)]
     seen = observe(camera, stamped)

@@ -11,6 +11,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
+from rs_localizer.lab.experiments.readout_faults import readout_faults
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
 from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
 from rs_localizer.lab.simulation.scene import room
@@ -58,15 +59,21 @@ def run(context: Context) -> Result:
     motion = RecordedMotion(read_tum(context.hand_motion))
     seconds = float(np.clip(context.trials / _TRIALS_PER_SECOND, _SHORTEST, _LONGEST))
     trials = [_trial(motion, seconds, k, context.seed) for k in context.track(range(count), count)]
+    points = _map(motion, "room", np.random.default_rng([context.seed, count]))
+    spoilt, faults = readout_faults(motion, points, seconds, context.seed)
     moving = [trial for trial in trials if trial.truth > 0.0]
     return Result(
         "Readout time",
         f"{count} recordings of {seconds:g} s from the recorded motion of a hand, {_RATE:g} "
         f"images per second of 640x480, up to {_POINTS} points with {_NOISE:g} px noise in a room "
         "or on one wall, 0 to 40 % outliers, readout times of 5 to 30 ms in all four directions, "
-        "and global shutters; lens known to 2 %, estimated along.",
-        [_efficient(moving), _covered(trials), _directed(moving), _global(trials)],
-        {"readout_time": Table(_COLUMNS, [_row(trial) for trial in trials])},
+        "and global shutters; lens known to 2 %, estimated along. One more, with a fault at a "
+        "time.",
+        [_efficient(moving), _covered(trials), _directed(moving), _global(trials), spoilt],
+        {
+            "readout_time": Table(_COLUMNS, [_row(trial) for trial in trials]),
+            "readout_faults": faults,
+        },
         {"readout_time": _figure(trials)},
     )
 

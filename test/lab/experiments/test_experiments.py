@@ -18,7 +18,7 @@ from rs_localizer.lab.experiments.table import EXPERIMENTS
 
 TRIALS = 400
 # Of many conditions; what they measure is held by tests of their own.
-FEW = {"honesty": 5}
+FEW = {"honesty": 5, "inertial": 20}
 
 HELD = {
     "motion.r6p_vcwt_equals_r6p",
@@ -41,6 +41,7 @@ HELD = {
     "p3p-initialisation.relinearized",
     "readout-time.coverage",
     "readout-time.direction",
+    "readout-time.faults",
     "readout-time.global",
     "real.vcwt_equals_r6p",
     "real.vcwt_ahead_of_p3p",
@@ -126,6 +127,21 @@ OPEN = {
     "augmented-reality.r9p",
     "augmented-reality.localized",
     "augmented-reality.time",
+    *(
+        f"inertial.vibration-{noise}-{what}"
+        for noise in ("0.3px", "1px")
+        for what in ("localized", "orientation")
+    ),
+    "inertial.offset",
+    "inertial.planes-error",
+    *(
+        f"inertial.vibration-{noise}-{what}"
+        for noise in ("0.3px", "1px")
+        for what in ("rate", "coverage")
+    ),
+    *(f"inertial.few-{few}" for few in (7, 8, 12)),
+    "inertial.planes-coverage",
+    "inertial.cost",
 }
 
 

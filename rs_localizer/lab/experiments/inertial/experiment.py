@@ -55,9 +55,9 @@ def run(context: Context) -> Result:
         "Frames of the simulator that shares no code with the estimator (30 Hz, 640x480, 30 ms "
         "readout) with a gyroscope of 400 Hz, 0.01 deg/s/sqrt(Hz) and a bias of 0.5 deg/s, whose "
         "bias and time offset the tracker has to find. Vibration: 0.3 deg at 60 Hz and 0.1 deg at "
-        "120 Hz on top of a hand's motion, after the first three seconds. Planes and few points: single "
-        "frames, with the gyroscope less its bias, which is known to 0.05 deg/s and 50 us. Shares "
-        "in %, medians of the errors.",
+        "120 Hz on top of a hand's motion, after the first three seconds. Planes and few points: "
+        "single frames, with the gyroscope less its bias, which is known to 0.05 deg/s and 50 us. "
+        "Shares in %, medians of the errors.",
         claims,
         tables,
     )

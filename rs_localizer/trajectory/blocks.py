@@ -1,0 +1,98 @@
+"""Parts of a recording that are calibrated on their own, and whether they agree."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.stats import chi2
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.trajectory.banded import Undetermined
+from rs_localizer.trajectory.fit import Fit, fit
+from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
+from rs_localizer.trajectory.model import Observations, State
+from rs_localizer.trajectory.start import refined
+
+# Parts of the recording that are calibrated on their own.
+_BLOCK_SECONDS, _MOST_BLOCKS = 3.0, 8
+# Blocks that would differ this much by chance once in a hundred recordings disagree.
+_DISAGREEMENT = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A part of the recording on its own."""
+
+    start: float  # s
+    end: float  # s
+    readout_time: float  # s
+    deviation: float  # s
+    delay: float = math.nan  # s, of the gyroscope where there is one
+    delay_deviation: float = math.nan  # s
+
+
+def blocks_of(observations: Observations, found: Fit) -> tuple[Block, ...]:
+    """Parts of the recording, each with lens and landmarks as the whole has them."""
+    first, last = observations.times.min(), observations.times.max()
+    count = int(np.clip((last - first) / _BLOCK_SECONDS, 2, _MOST_BLOCKS))
+    edges = np.linspace(first, last + 1e-6, count + 1)
+    blocks: list[Block] = []
+    for start, end in pairwise(edges):
+        inside = (observations.times >= start) & (observations.times < end)
+        # Not only what fits the whole: a part that differs would be left out of its own estimate.
+        part = observations.subset(inside)
+        part = replace(part, landmarks=found.state.landmarks)
+        state = _cut(found.state, start, end)
+        if state is None or not np.any(part.trusted):
+            continue
+        held = replace(found.freedom, lens=False, landmarks=0.0)
+        try:
+            own = fit(found.camera, part, state, held)
+        except Undetermined:
+            continue
+        deviation = own.readout_time_deviation
+        blocks.append(
+            Block(float(start), float(end), own.state.readout_time, deviation, *_delay(own))
+        )
+    return tuple(blocks)
+
+
+def _delay(own: Fit) -> tuple[float, float]:
+    """Delay of the gyroscope and its deviation, s; NaN without one."""
+    if own.state.mount is None:
+        return math.nan, math.nan
+    at = DELAY - MOUNT
+    return own.state.mount.delay, math.sqrt(float(own.border_covariance[at, at]))
+
+
+def _cut(state: State, start: float, end: float) -> State | None:
+    """The state with the motion between two times only."""
+    layout = state.spline.layout
+    intervals = np.column_stack([layout.starts, layout.ends])
+    margin = abs(state.readout_time)
+    kept = np.clip(intervals, start - margin, end + margin)
+    kept = kept[kept[:, 1] - kept[:, 0] > layout.spacing]
+    if len(kept) == 0:
+        return None
+    return replace(state, spline=refined(state.spline, layout.spacing, kept))
+
+
+def disagreement(values: Array, deviations: Array) -> float:
+    """By how much deviations (b,) are too small for the scatter of values (b,) (Birge's ratio),
+    1 if that may be chance.
+    """
+    if len(values) < 2:
+        return 1.0
+    weights = deviations**-2.0
+    total = float(np.sum(weights))
+    mean = np.sum(weights * values) / total
+    squared = float(np.sum(weights * (values - mean) ** 2))
+    freedoms = len(values) - 1
+    if chi2.sf(squared, freedoms) > _DISAGREEMENT:
+        return 1.0
+    # What the blocks disagree in is not their noise: none of them is better than the others.
+    scatter = np.std(values, ddof=1) / math.sqrt(len(values))
+    return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))

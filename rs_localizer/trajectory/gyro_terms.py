@@ -1,0 +1,100 @@
+"""A gyroscope's samples as a part of the trajectory's cost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.trajectory.gyro import GyroMount, GyroSamples
+from rs_localizer.trajectory.gyro_kernels import MOUNT, Turns, accumulate_turns
+from rs_localizer.trajectory.model import State
+from rs_localizer.trajectory.normal_kernels import Normal
+
+_LIMIT = 6.0  # of Tukey's weight, in standard deviations
+# What a first guess of turn (rad), bias (rad/s) and delay (s) may be off: as good as nothing, but
+# what the motion does not tell stays where it is. Scales and angles are good to some percent.
+_DEVIATIONS = np.repeat([1.0, 1.0, 0.5, 0.03], (3, 3, 1, 6))
+# Samples nearer (s) to the edge of the motion are left out: the delay may yet change.
+_MARGIN = 0.02
+# Median of the squared length of three standard Gaussian numbers.
+_MEDIAN = 2.366
+
+
+class GyroTerms:
+    """The cost of a gyroscope's errors.
+
+    Args:
+        samples: with the deviation of their noise.
+        start: with a first guess of the mount.
+        column: of the border, where the numbers of the mount begin.
+    """
+
+    def __init__(self, samples: GyroSamples, start: State, column: int) -> None:
+        assert start.mount is not None
+        delay = start.mount.delay
+        self.samples = samples.subset(samples.covered(start.spline.layout, delay, _MARGIN))
+        self.start, self.column = start.mount, column
+
+    def look(self, state: State) -> Turns:
+        """The samples on the spline."""
+        mount = state.mount
+        assert mount is not None
+        times = self.samples.times + mount.delay
+        states = state.spline.states(times)
+        first, jacobians = state.spline.jacobians(times)
+        turned = states.angular @ mount.camera_from_imu
+        by_mount = np.empty((len(first), 3, MOUNT))
+        by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
+        by_mount[:, :, 3:6] = np.eye(3)
+        by_mount[:, :, 6] = states.angular_acceleration @ mount.matrix.T
+        by_mount[:, :, 7:] = _by_shape(turned)
+        errors = states.angular @ mount.matrix.T + mount.bias - self.samples.rates
+        return Turns(first, errors, mount.matrix @ jacobians[:, 6:9], by_mount)
+
+    def squared_errors(self, state: State) -> Array:
+        """Squared errors (k,), (rad/s)^2, of three axes together."""
+        errors: Array = np.sum(np.square(self.look(state).errors), axis=1)
+        return errors
+
+    def noise(self, state: State) -> float:
+        """Standard deviation of an axis (rad/s), by the errors' median."""
+        return float(np.sqrt(np.median(self.squared_errors(state)) / _MEDIAN))
+
+    def add(self, state: State, normal: Normal) -> float:
+        """Add samples and what is known of the mount to the normal equations; returns the cost."""
+        variance = self.samples.deviation**2
+        cost = accumulate_turns(
+            self.look(state), self.column, variance, _LIMIT**2 * variance, normal
+        )
+        offset = self._offset(state) / _DEVIATIONS
+        at = np.arange(self.column, self.column + MOUNT)
+        normal.border_slope[at] += offset / _DEVIATIONS
+        normal.corner[at, at] += _DEVIATIONS**-2
+        return float(cost) + float(offset @ offset)
+
+    def _offset(self, state: State) -> Array:
+        mount = state.mount
+        assert mount is not None
+        turn = so3.log(np.ascontiguousarray(self.start.camera_from_imu.T @ mount.camera_from_imu))
+        bias, delay = mount.bias - self.start.bias, mount.delay - self.start.delay
+        return np.concatenate([turn, bias, [delay], mount.shape])
+
+    def moved(self, mount: GyroMount, border: Array) -> GyroMount:
+        """The mount after a step of the border."""
+        step = border[self.column : self.column + MOUNT]
+        return GyroMount(
+            mount.camera_from_imu @ so3.exp(step[:3]), mount.bias + step[3:6],
+            mount.delay + float(step[6]), mount.shape + step[7:],
+        )  # fmt: skip
+
+
+def _by_shape(rates: Array) -> Array:
+    """Derivative (k,3,6) of ``shape rate`` by the six numbers of a symmetric matrix."""
+    out = np.zeros((len(rates), 3, 6))
+    for axis in range(3):
+        others = [other for other in range(3) if other != axis]
+        out[:, axis, axis] = rates[:, axis]
+        for one, other in (others, others[::-1]):  # the entry beside the diagonal without this axis
+            out[:, one, 3 + axis] = rates[:, other]
+    return out
