@@ -95,6 +95,10 @@ class Localizer:
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
+        # And beside the turn that a gyroscope knows, of which the delay is in doubt.
+        tau = np.linspace(-0.7, 0.7, 29)
+        rates = 0.1 * np.column_stack([np.sin(20.0 * tau)] * 3)
+        self.localize(points, pixels, turn=KnownTurn.of(tau, rates, 1e-4 * np.eye(6), delay=0.01))
 
     def localize(
         self,

@@ -238,6 +238,8 @@ class Tracker:
         self._track: _Track | None = None
         readout_time = localizer.camera.readout_time
         self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
+        if self._aid is not None:
+            self._aid.warm_up()
 
     def reset(self) -> None:
         """Forget all frames so far."""

@@ -76,6 +76,21 @@ class GyroscopeAid:
         self._last_ns: int | None = None
         self._state = Alone.NO_SAMPLES
 
+    def warm_up(self) -> None:
+        """Compile every kernel that frames may need, or load it from the cache."""
+        times = np.arange(-60, 30) * 2_000_000
+        samples = ImuSamples(times, np.zeros((len(times), 3)))
+        filter_ = GyroscopeFilter(self._settings)
+        within = turning.turn_within(samples, 0, 0.02, filter_.errors)
+        between = turning.turn_between(samples, -30_000_000, 0, filter_.errors)
+        assert within is not None
+        assert between is not None
+        still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+        identity = np.eye(PARAMETERS)
+        predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
+        added = replace(predicted, covariance=predicted.covariance + identity)
+        filter_.update(added, np.zeros(PARAMETERS), 0.5 * added.covariance)
+
     @property
     def status(self) -> InertialStatus:
         """What became of the gyroscope in the last frame."""
