@@ -181,7 +181,7 @@ def _camera_frame(args: argparse.Namespace, bag: BagReader) -> str:
 def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:
     if args.board is not None:
         raise UsageError("--board is for images; the recording has correspondences")
-    topics = find_topics(bag, given_topics(args))
+    topics = find_topics(bag, given_topics(args, but=(IMU,))).without(IMU)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     recorded = read_recording(bag, topics, config.matching, landmarks)
     camera = recorded.calibration.camera(0.0, config.scan_direction)

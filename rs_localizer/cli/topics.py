@@ -15,6 +15,6 @@ def add_topics(group: argparse._ArgumentGroup, but: Collection[str] = ()) -> Non
             group.add_argument(item.option, metavar="TOPIC", help=item.help)
 
 
-def given_topics(args: argparse.Namespace) -> dict[str, str | None]:
+def given_topics(args: argparse.Namespace, but: Collection[str] = ()) -> dict[str, str | None]:
     """What was given, by input; None: nothing."""
-    return {name: getattr(args, name, None) for name in INPUTS}
+    return {name: getattr(args, name) for name in INPUTS if name not in but}

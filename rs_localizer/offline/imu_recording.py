@@ -13,9 +13,8 @@ from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.offline.image_sources import find_topic
 from rs_localizer.offline.recordings import RecordingError
 from rs_localizer.offline.replay import TF_TYPE, as_tf2, tf_topics
+from rs_localizer.pipeline.inputs import IMU_TYPE
 from rs_localizer.trajectory.imu import ImuRecording
-
-IMU_TYPE = "sensor_msgs/msg/Imu"
 
 
 def read_imu_recording(bag: BagReader, topic: str | None, camera_frame: str) -> ImuRecording:

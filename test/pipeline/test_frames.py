@@ -61,6 +61,7 @@ class MockLocalizer:
         scores: Array | None = None,
         prior: Prior | None = None,
         expected_share: float = 0.5,
+        turn: object = None,
     ) -> Estimate | Failure:
         self.priors.append(prior)
         if len(points) < 4:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.transforms.rigid import Transform, make_transform
 from rs_localizer.lab.simulation.imu import ImuSettings, ImuTrack, Lever
 
-IMU_TOPIC = "/imu"
+IMU_TOPIC = f"/{topics.IMU}"
 IMU_FRAME = "imu_link"
 # Readings go on for so long after the last frame.
 _REST_NS = 100_000_000

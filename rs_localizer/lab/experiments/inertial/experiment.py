@@ -75,7 +75,7 @@ def _vibration(context: Context) -> _Step:
     for noise in _NOISES:
         found: dict[str, Scores] = {}
         for name, motion in (("hand", hand), ("shaken", shaken)):
-            recorded = record(Camera(), motion, Rich(), count, length, context.seed)
+            recorded = record(Camera(), motion, Rich(), (count, length), context.seed)
             for aided in (False, True):
                 scores = follow(recorded, noise, aided, _SETTLED).scores
                 label = f"{name}/{'gyroscope' if aided else 'alone'}"
@@ -125,7 +125,7 @@ def _offsets(context: Context) -> _Step:
     rows: list[tuple[str | float, ...]] = []
     worst = 0.0
     for name, motion in (("hand", hand), ("shaken", partial(shaken_hand, shaking=_SHAKING))):
-        recorded = record(Camera(), motion, Rich(), count, _TEN_SECONDS, context.seed, imu)
+        recorded = record(Camera(), motion, Rich(), (count, _TEN_SECONDS), context.seed, imu)
         followed = follow(recorded, 1.0, True, _SECOND)
         errors = 1e3 * (np.array(followed.time_offsets) - _OFFSET)
         worst = max(worst, float(np.abs(errors).max()))
@@ -179,7 +179,7 @@ def _single(
 ) -> tuple[Scores, Scores]:
     """Scores of single frames at 1 px: alone, and with the gyroscope less its bias."""
     count = max(4, context.trials // 20)
-    recorded = record(camera, motion, scene, count, 1, context.seed, replace(Imu(), bias=0.0))
+    recorded = record(camera, motion, scene, (count, 1), context.seed, replace(Imu(), bias=0.0))
     seen = believed(camera)
     localizer = Localizer(seen) if few is None else Localizer(seen, min_inliers=_FEW[0])
     rng = np.random.default_rng(context.seed)
@@ -233,7 +233,7 @@ def _few_points(context: Context) -> _Step:
 
 def _cost(context: Context) -> _Step:
     count = max(1, context.trials // 100)
-    recorded = record(Camera(), hand, Rich(), count, 2 * _SECOND, context.seed)
+    recorded = record(Camera(), hand, Rich(), (count, 2 * _SECOND), context.seed)
     alone, aided = _interleaved(recorded)
     ratio = float(np.median(aided.seconds) / np.median(alone.seconds))
     rows = [

@@ -55,12 +55,12 @@ def record(
     camera: Camera,
     make_motions: MakeMotions,
     scene: Scene,
-    recordings: int,
-    length: int,
+    size: tuple[int, int],
     seed: int,
     imu: Imu | None = None,
 ) -> Recorded:
-    """Simulate recordings and their IMU."""
+    """Simulate recordings and their IMU: so many, and so many frames of each."""
+    recordings, length = size
     imu = imu or Imu()
     made: list[Motions] = []
 
