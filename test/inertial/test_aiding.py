@@ -35,12 +35,12 @@ def statuses(recorded, change, frames=60):
 
 @pytest.fixture(scope="module")
 def held():
-    return record(Camera(), hand, Rich(), 1, 60, seed=4)
+    return record(Camera(), hand, Rich(), (1, 60), seed=4)
 
 
 @pytest.mark.parametrize("motion", [hand, vibrating])
 def test_a_time_offset_is_found(motion):
-    recorded = record(Camera(), motion, Rich(), 1, 75, 4, replace(Imu(), offset=0.005))
+    recorded = record(Camera(), motion, Rich(), (1, 75), 4, replace(Imu(), offset=0.005))
     followed = follow(recorded, 1.0, True, 60)
     assert abs(followed.time_offsets[0] - 0.005) < 5e-4
     assert followed.scores.localized.all()
