@@ -14,7 +14,7 @@ from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.outputs import Frame, messages
+from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.topics import TF
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms.rigid import TransformError, make_transform
@@ -62,7 +62,7 @@ def _is_ours(out: Path) -> bool:
 
 
 def write_frame(
-    writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
+    writer: BagWriter, frame: Localized, localizer: FrameLocalizer, recorded_ns: int
 ) -> bool:
     """Write all messages of a frame; whether its transform could be told."""
     for name, message in messages(frame, writer.make).items():
@@ -71,7 +71,7 @@ def write_frame(
 
 
 def _write_transform(
-    writer: BagWriter, frame: Frame, localizer: FrameLocalizer, recorded_ns: int
+    writer: BagWriter, frame: Localized, localizer: FrameLocalizer, recorded_ns: int
 ) -> bool:
     """Write what publish_tf asks for; whether it could be told."""
     try:
@@ -86,7 +86,7 @@ def _write_transform(
     return True
 
 
-def write_texts(out: Path, frames: list[Frame], config: NodeConfig) -> int:
+def write_texts(out: Path, frames: list[Localized], config: NodeConfig) -> int:
     """Write poses and twists in the order of their stamps; how many stamps came repeatedly."""
     stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
     first = np.unique(stamps, return_index=True)[1]
@@ -125,7 +125,7 @@ class _About(NamedTuple):
     twists: list[str]
 
 
-def _about(frames: list[Frame], config: NodeConfig) -> _About:
+def _about(frames: list[Localized], config: NodeConfig) -> _About:
     bodies = " or ".join(sorted({repr(frame.body_frame) for frame in frames})) or "the camera"
     maps = " or ".join(sorted({repr(frame.map_frame) for frame in frames})) or "the map"
     when = {
@@ -145,5 +145,5 @@ def _about(frames: list[Frame], config: NodeConfig) -> _About:
     )
 
 
-def _quaternion(frame: Frame) -> Array:
+def _quaternion(frame: Localized) -> Array:
     return so3.quaternion(np.ascontiguousarray(frame.pose.rotation))

@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.cli.replay_result import BRIDGED
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.image_clock import readout_fault
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.offline.smoothed import SmoothedFrames
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.reasons import explained
@@ -29,7 +29,7 @@ class Tally:
 
     total: int
     notices: Counter[str]
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[Localized] = field(default_factory=list)
     refused: Counter[str] = field(default_factory=Counter)
     last_refusal: str = "nothing came"
     not_sent: int = 0
@@ -39,7 +39,7 @@ class Tally:
     imu: ImuState | None = None
 
     @property
-    def written(self) -> list[Frame]:
+    def written(self) -> list[Localized]:
         """What the result holds: the frames, or samples of one motion through all of them."""
         return self.smoothed.frames if self.smoothed else self.frames
 
@@ -95,7 +95,7 @@ def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:
     ]
 
 
-def _quality(frames: Sequence[Frame], config: NodeConfig) -> list[tuple[str, str]]:
+def _quality(frames: Sequence[Localized], config: NodeConfig) -> list[tuple[str, str]]:
     if not frames:
         return []
     estimates = [frame.estimate for frame in frames]
@@ -121,7 +121,7 @@ def _quality(frames: Sequence[Frame], config: NodeConfig) -> list[tuple[str, str
     return rows
 
 
-def _period(frames: Sequence[Frame]) -> float:
+def _period(frames: Sequence[Localized]) -> float:
     """Seconds from frame to frame, median; NaN for less than two."""
     stamps = np.unique(np.array([frame.input_stamp_ns for frame in frames], np.int64))
     if len(stamps) < 2:

@@ -47,7 +47,7 @@ class Twist:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class Localized:
     """A localized frame: all that gets published of it; true in a condition."""
 
     input_stamp_ns: int
@@ -64,7 +64,7 @@ class Frame:
         return True
 
 
-def messages(frame: Frame, make: Make) -> dict[str, Any]:
+def messages(frame: Localized, make: Make) -> dict[str, Any]:
     """The messages of a frame by output topic (see :data:`TYPES`), the same for node and replay.
 
     Without a twist there is no odometry either: zeros would be a claim.
@@ -72,7 +72,9 @@ def messages(frame: Frame, make: Make) -> dict[str, Any]:
     return dict(each_message(frame, make, TYPES))
 
 
-def each_message(frame: Frame, make: Make, wanted: Collection[str]) -> Iterator[tuple[str, Any]]:
+def each_message(
+    frame: Localized, make: Make, wanted: Collection[str]
+) -> Iterator[tuple[str, Any]]:
     """Those of these topics, one after the other; each is built when it is asked for."""
     parts = _Parts(frame, make)
     builders = _WITHOUT_TWIST if frame.twist is None else _BUILDERS
@@ -82,7 +84,7 @@ def each_message(frame: Frame, make: Make, wanted: Collection[str]) -> Iterator[
 class _Parts:
     """What the messages of a frame share, built when the first of them needs it."""
 
-    def __init__(self, frame: Frame, make: Make) -> None:
+    def __init__(self, frame: Localized, make: Make) -> None:
         self.frame = frame
         self.make = make
 

@@ -9,7 +9,7 @@ from typing import Any
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, IMU, TF, TF_STATIC
 from rs_localizer.io.transforms.rigid import TransformError
 from rs_localizer.io.transforms.tree import TransformTree
@@ -203,7 +203,7 @@ def _connected(tree: TransformTree, target: str, source: str) -> bool:
 
 def replay(
     bag: BagReader, topics: Topics, localizer: FrameLocalizer
-) -> Iterator[tuple[int, Frame | Refusal]]:
+) -> Iterator[tuple[int, Localized | Refusal]]:
     """Time of recording (ns) and result of every frame, as the node would have answered.
 
     A message that is no frame and cannot be used gives a Refusal of its own, for a reason of

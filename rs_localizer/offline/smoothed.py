@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.config import PoseTime
 from rs_localizer.core.arrays import IntArray
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
+from rs_localizer.pipeline.clock import published_moment
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.moments import pose_at, twist_at
 from rs_localizer.pipeline.refusal import Refusal
@@ -21,13 +21,13 @@ from rs_localizer.trajectory.smoothing import smooth
 class SmoothedFrames:
     """What the whole recording says of each moment."""
 
-    frames: list[Frame]
+    frames: list[Localized]
     bridged: IntArray  # (b,) ns, stamps of those without an image of their own
     undetermined: int  # moments that neighbours do not determine
 
 
 def smooth_frames(
-    localizer: FrameLocalizer, localized: list[Frame], stamps_ns: list[int], rate: float | None
+    localizer: FrameLocalizer, localized: list[Localized], stamps_ns: list[int], rate: float | None
 ) -> SmoothedFrames:
     """The frames of a recording again, each with the motion that all of them say.
 
@@ -55,9 +55,7 @@ def smooth_frames(
         for frame in frames
     ]
     found = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
-    delay = 0
-    if config.pose_time == PoseTime.MID_FRAME:
-        delay = round(1e9 * (config.stamp_offset - config.readout_time * camera.first_row_time))
+    delay, _ = published_moment(config, camera, 0)
     inputs = np.array(sorted(set(stamps_ns)), dtype=np.int64)
     if rate is not None:
         first, last = frames[0].input_stamp_ns, frames[-1].input_stamp_ns
@@ -73,7 +71,7 @@ def smooth_frames(
             continue
         own = once.get(int(inputs[k])) if rate is None else None
         frame = localizer.mounted(
-            Frame(
+            Localized(
                 input_stamp_ns=int(inputs[k]),
                 stamp_ns=int(moments[k]),
                 map_frame=frames[0].map_frame,
@@ -92,5 +90,5 @@ def smooth_frames(
     return SmoothedFrames(result, moments[bridged], int(np.count_nonzero(~kept)))
 
 
-def _columns(frame: Frame, names: str) -> NDArray[np.float64]:
+def _columns(frame: Localized, names: str) -> NDArray[np.float64]:
     return np.stack([frame.inliers[name].astype(np.float64) for name in names], axis=1)

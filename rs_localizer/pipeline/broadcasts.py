@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rs_localizer.config import NodeConfig, PublishTf
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms.rigid import Transform, TransformError, Transforms
 
 
@@ -26,7 +26,7 @@ class Broadcast:
     parent_from_child: Transform
 
 
-def broadcast(frame: Frame, config: NodeConfig, transforms: Transforms) -> Broadcast | None:
+def broadcast(frame: Localized, config: NodeConfig, transforms: Transforms) -> Broadcast | None:
     """The transform to publish of a frame; None when ``publish_tf`` is ``none``.
 
     Raises:

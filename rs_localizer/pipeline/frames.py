@@ -7,14 +7,12 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rs_localizer import matching
-from rs_localizer.config import MatchBy, NodeConfig, PoseTime
+from rs_localizer.config import MatchBy, NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
@@ -24,25 +22,25 @@ from rs_localizer.io.clouds import (
     Correspondences,
     EmptyCloudError,
     read_correspondences,
-    select_inliers,
 )
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import Keypoints, read_keypoints, read_map
-from rs_localizer.io.maps.files import read_map_file
-from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
-from rs_localizer.io.transforms.rigid import NotYetError, TransformError, Transforms
+from rs_localizer.io.transforms.rigid import Transforms
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.localizer import Localizer
 from rs_localizer.matching import Matcher, MatchError
-from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
+from rs_localizer.pipeline.clock import middle_row_ns
 from rs_localizer.pipeline.imu import ImuInput, inertial_settings
-from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
+from rs_localizer.pipeline.maps import oddities_of_map, read_landmarks
+from rs_localizer.pipeline.moments import pose_at, twist_at
 from rs_localizer.pipeline.oddities import oddities
+from rs_localizer.pipeline.published import NO_TRANSFORM, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
-from rs_localizer.pipeline.refusal import Refusal, Waiting
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -63,8 +61,6 @@ _STILL = Estimate(
     global_shutter_inliers=0,
     iterations=0,
 )
-
-_NO_TRANSFORM = "no_transform"
 
 
 class FrameLocalizer:
@@ -196,7 +192,7 @@ class FrameLocalizer:
         """
         if self._tracker is None:
             return False
-        time_ns = self._middle_row_ns(stamp_ns)
+        time_ns = middle_row_ns(self._config, self._camera, stamp_ns)
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
     def load_map(self) -> None:
@@ -205,19 +201,8 @@ class FrameLocalizer:
         Raises:
             MapError: for a file that cannot be read or holds no map to match keypoints with.
         """
-        if not self._config.map_file:
-            return
-        path = Path(self._config.map_file).expanduser()
-        try:
-            landmarks = read_map_file(path, self._config.map_frame)
-        except (MapError, OSError) as error:
-            raise MapError(f"map_file: {error}") from error
-        if landmarks.ids is None and landmarks.descriptors is None:
-            raise MapError(
-                f"map_file: {path}: keypoints cannot be matched with a map that has neither ids "
-                "nor descriptors"
-            )
-        self.use_map(landmarks)
+        if self._config.map_file:
+            self.use_map(read_landmarks(self._config.map_file, self._config.map_frame))
 
     def take_map(self, message: Any) -> None:
         """Use this sensor_msgs/PointCloud2 of landmarks from the next frame on.
@@ -232,22 +217,12 @@ class FrameLocalizer:
         previous = self.map
         if previous is not None and landmarks.equals(previous):
             return  # published again
-        if landmarks.dropped:
-            self._notice(
-                "map_incomplete",
-                f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
-                "descriptor",
-            )
-        if previous is not None:
-            self._notice(
-                "map_replaced",
-                f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
-                f"one of {len(previous)} in frame {previous.frame!r}",
-            )
+        for name, text in oddities_of_map(landmarks, previous).items():
+            self._notice(name, text)
         self._matcher = Matcher(landmarks)
         self._lacks_map = False
 
-    def localize(self, message: Any) -> Frame | Refusal:
+    def localize(self, message: Any) -> Localized | Refusal:
         """Localize one sensor_msgs/PointCloud2 of correspondences; never raises for bad ones."""
         try:
             cloud = read_correspondences(message)
@@ -261,7 +236,7 @@ class FrameLocalizer:
             self._lacks_map = False  # who sends correspondences needs none
         return result
 
-    def localize_keypoints(self, message: Any) -> Frame | Refusal:
+    def localize_keypoints(self, message: Any) -> Localized | Refusal:
         """Localize one sensor_msgs/PointCloud2 of keypoints; never raises for bad ones.
 
         Tracked, landmarks are first looked for where the motion predicts them only, then, if that
@@ -284,10 +259,12 @@ class FrameLocalizer:
         if by == MatchBy.DESCRIPTOR:
             self._say_if_too_many(keypoints)
             if self._tracker is not None and self._config.matching.gate > 0.0:
-                prior = self._tracker.prediction(self._middle_row_ns(keypoints.stamp_ns))
+                prior = self._tracker.prediction(
+                    middle_row_ns(self._config, self._camera, keypoints.stamp_ns)
+                )
                 result = None if prior is None else self._match(keypoints, prior)
                 # Without its mounting a pose is none the worse.
-                if result or (result is not None and result.reason == _NO_TRANSFORM):
+                if result or (result is not None and result.reason == NO_TRANSFORM):
                     return result
         return self._match(keypoints, None)
 
@@ -300,7 +277,7 @@ class FrameLocalizer:
                 "are matched",
             )
 
-    def _match(self, keypoints: Keypoints, prior: Prior | None) -> Frame | Refusal:
+    def _match(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
         assert self._matcher is not None
         settings = self._config.matching
         matches = self._matcher.match(keypoints, settings, self._camera, prior)
@@ -312,7 +289,7 @@ class FrameLocalizer:
             )
         return self._localize(matching.correspondences(matches, keypoints, self._matcher.map))
 
-    def _localize(self, cloud: Correspondences) -> Frame | Refusal:
+    def _localize(self, cloud: Correspondences) -> Localized | Refusal:
         if self._calibration is None:
             return Refusal("no_camera_info", "no usable camera_info has come yet")
         for name, text in oddities(cloud, self._camera, self._calibration.frame).items():
@@ -322,20 +299,24 @@ class FrameLocalizer:
             self.imu.without_tracker(self._config)
             result = self._localizer.localize(*given)
         else:
-            time_ns = self._middle_row_ns(cloud.stamp_ns)
+            time_ns = middle_row_ns(self._config, self._camera, cloud.stamp_ns)
             camera_frame = self._calibration.frame
             result = self.imu.track(
                 self._tracker, self._config, time_ns, camera_frame, self.transforms, given
             )
         if not result:
             return Refusal(str(result.reason), result.detail)
-        frame = self._frame(cloud, result, self._calibration.frame)
+        frame = of_camera(cloud, result, self._config, self._camera, self._calibration.frame)
         self._watch_readout(cloud, result)
         return self.mounted(frame)
 
+    def mounted(self, localized: Localized) -> Localized | Refusal:
+        """The result of ``base_frame``, from that of the camera."""
+        return of_body(localized, self._config, self.transforms)
+
     def _watch_readout(self, cloud: Correspondences, estimate: Estimate) -> None:
         assert self._calibration is not None
-        time_ns = self._middle_row_ns(cloud.stamp_ns)
+        time_ns = middle_row_ns(self._config, self._camera, cloud.stamp_ns)
         config = self.readout_watch.add(self._config, self._camera, time_ns, estimate, cloud)
         if config is not self._config:
             self._use(self._calibration, config)
@@ -359,65 +340,6 @@ class FrameLocalizer:
                     "the previous frames are forgotten",
                 )
         self._last = stamp_ns, frame
-
-    def _middle_row_ns(self, stamp_ns: int) -> int:
-        """When the middle row of the frame with this stamp was exposed."""
-        delay = self._config.stamp_offset - self._config.readout_time * self._camera.first_row_time
-        return stamp_ns + round(delay * 1e9)
-
-    def _frame(self, cloud: Correspondences, estimate: Estimate, body_frame: str) -> Frame:
-        readout_time = self._config.readout_time
-        first_row_time = self._camera.first_row_time
-        stamp_ns = cloud.stamp_ns
-        if self._config.pose_time == PoseTime.MID_FRAME:
-            tau = 0.0
-            stamp_ns = self._middle_row_ns(stamp_ns)
-        else:
-            tau = first_row_time
-            if readout_time > 0.0:
-                tau -= self._config.stamp_offset / readout_time
-        moving = readout_time > 0.0 and find_solver(self._config.solver).rolling_shutter
-        pose = pose_at(estimate, tau)
-        twist = twist_at(estimate, tau, readout_time) if moving else None
-        deviation = self._config.readout_time_deviation
-        if twist is not None and deviation > 0.0:
-            # The middle row comes later where the readout takes longer; the first one does not.
-            delay = deviation * first_row_time if tau == 0.0 else 0.0
-            pose, twist = with_timing(pose, twist, deviation / readout_time, delay)
-        return Frame(
-            input_stamp_ns=cloud.stamp_ns,
-            stamp_ns=stamp_ns,
-            map_frame=cloud.frame,
-            body_frame=body_frame,
-            pose=pose,
-            twist=twist,
-            inliers=select_inliers(cloud.table, estimate.inliers, estimate.residuals),
-            dropped=cloud.dropped,
-            estimate=estimate,
-        )
-
-    def mounted(self, frame: Frame) -> Frame | Refusal:
-        """The frame of ``base_frame``, from that of the camera."""
-        base = self._config.base_frame
-        if base in ("", frame.body_frame):
-            return frame
-        # Who gives no time gets the latest, as everywhere in TF.
-        stamp_ns = frame.stamp_ns if min(frame.input_stamp_ns, frame.stamp_ns) > 0 else None
-        span_ns = round(self._config.readout_time * 1e9) if frame.twist else 0
-        try:
-            mounting = find_mounting(self.transforms, frame.body_frame, base, stamp_ns, span_ns)
-        except TransformError as error:
-            text = f"from the camera {frame.body_frame!r} to base_frame {base!r}: {error}"
-            if not isinstance(error, NotYetError):
-                return Refusal(_NO_TRANSFORM, text)
-            patience = self._config.transform_tolerance
-            return Waiting(_NO_TRANSFORM, text, lambda: self.mounted(frame), patience)
-        return replace(
-            frame,
-            body_frame=base,
-            pose=base_pose(frame.pose, mounting),
-            twist=base_twist(frame.twist, mounting) if frame.twist else None,
-        )
 
 
 def _build(

@@ -16,7 +16,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 
@@ -49,7 +49,7 @@ class Input:
     topic: str  # relative to the node's namespace; also the name of the input
     type: str  # of its messages
     role: Role
-    use: Callable[[FrameLocalizer, Any], Frame | Refusal | None]
+    use: Callable[[FrameLocalizer, Any], Localized | Refusal | None]
     refused: str
     read: Callable[[Any], Any] = _as_it_is
     said: str = ""  # what a user is told that is missing
@@ -66,7 +66,7 @@ class Input:
         """The option of commands that names its topic in a recording."""
         return f"--{self.topic.replace('_', '-')}"
 
-    def take(self, localizer: FrameLocalizer, message: Any) -> Frame | Refusal | None:
+    def take(self, localizer: FrameLocalizer, message: Any) -> Localized | Refusal | None:
         """Read and use a message at once; of a frame, its result."""
         try:
             return self.use(localizer, self.read(message))

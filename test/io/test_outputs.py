@@ -11,11 +11,11 @@ import pytest
 from rs_localizer.core import so3
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message, typestore
-from rs_localizer.io.outputs import TYPES, Frame, Pose, Twist, messages
+from rs_localizer.io.outputs import TYPES, Localized, Pose, Twist, messages
 
 
 @pytest.fixture
-def frame() -> Frame:
+def frame() -> Localized:
     rng = np.random.default_rng(1)
     rows = np.zeros(3, [(name, "<f4") for name in ("x", "y", "z", "u", "v", "residual")])
     rows["u"] = [1.0, 2.0, 3.0]
@@ -30,7 +30,7 @@ def frame() -> Frame:
         global_shutter_inliers=3,
         iterations=1,
     )
-    return Frame(
+    return Localized(
         input_stamp_ns=1_999_999_999,
         stamp_ns=-1,  # half a readout before a stamp of 0
         map_frame="hall",
@@ -47,7 +47,7 @@ def vector(message: Any) -> list[float]:
     return [message.x, message.y, message.z]
 
 
-def test_types_and_headers(frame: Frame) -> None:
+def test_types_and_headers(frame: Localized) -> None:
     made = messages(frame, make_message)
     assert {name: message.__msgtype__ for name, message in made.items()} == TYPES
     for name, message in made.items():
@@ -60,7 +60,7 @@ def test_types_and_headers(frame: Frame) -> None:
         typestore().serialize_cdr(message, message.__msgtype__)
 
 
-def test_values(frame: Frame) -> None:
+def test_values(frame: Localized) -> None:
     made = messages(frame, make_message)
     assert frame.twist is not None
     odometry = made["odometry"]
@@ -83,6 +83,6 @@ def test_values(frame: Frame) -> None:
         assert np.array_equal(message.covariance.reshape(6, 6), frame.twist.covariance)
 
 
-def test_without_a_twist_nothing_claims_one(frame: Frame) -> None:
+def test_without_a_twist_nothing_claims_one(frame: Localized) -> None:
     made = messages(dataclasses.replace(frame, twist=None), make_message)
     assert set(made) == {"pose", "pose_with_covariance", "inliers"}

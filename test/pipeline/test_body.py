@@ -23,7 +23,7 @@ from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.outputs import Frame, Pose, Twist, messages
+from rs_localizer.io.outputs import Localized, Pose, Twist, messages
 from rs_localizer.io.transforms.rigid import Transform, TransformError, read_transform
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
@@ -186,12 +186,12 @@ def known_motion(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def localize(
     make_cloud_message: Make, make_camera_info: Make
-) -> Callable[..., tuple[Frame | Refusal, NodeConfig]]:
+) -> Callable[..., tuple[Localized | Refusal, NodeConfig]]:
     fields = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]
 
     def run(
         transforms: Any, stamp: tuple[int, int] = (5, 0), roi: Any = None, **settings: Any
-    ) -> tuple[Frame | Refusal, NodeConfig]:
+    ) -> tuple[Localized | Refusal, NodeConfig]:
         config = NodeConfig(
             **({"readout_time": READOUT_TIME, "base_frame": "base_link"} | settings)
         )
@@ -203,7 +203,7 @@ def localize(
     return run
 
 
-def localized(result: tuple[Frame | Refusal, NodeConfig]) -> Frame:
+def localized(result: tuple[Localized | Refusal, NodeConfig]) -> Localized:
     assert result[0], result[0]
     return result[0]
 

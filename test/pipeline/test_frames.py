@@ -20,7 +20,7 @@ from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import ConstantVelocity
@@ -92,12 +92,12 @@ def cloud(make_cloud_message: Make) -> SimpleNamespace:
     return make_cloud_message(rows, FIELDS, point_step=40, stamp=(5, 0))
 
 
-def localized(result: Frame | Refusal) -> Frame:
+def localized(result: Localized | Refusal) -> Localized:
     assert result, result
     return result
 
 
-def refused(result: Frame | Refusal) -> tuple[str, str]:
+def refused(result: Localized | Refusal) -> tuple[str, str]:
     assert isinstance(result, Refusal)
     assert not result
     return result.reason, result.detail

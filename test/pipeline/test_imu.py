@@ -19,7 +19,7 @@ from rs_localizer.config import Imu, NodeConfig
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import MessageError, stamp_ns
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.offline.imu_first import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
@@ -66,13 +66,13 @@ class Flown:
 
     def __init__(self, flight: Flight) -> None:
         self._truth = flight.truth
-        self.results: list[Frame | Refusal] = []
+        self.results: list[Localized | Refusal] = []
         self.notices: Counter[str] = Counter()
         self.state: ImuState | None = None
 
     @property
-    def frames(self) -> list[Frame]:
-        return [result for result in self.results if isinstance(result, Frame)]
+    def frames(self) -> list[Localized]:
+        return [result for result in self.results if isinstance(result, Localized)]
 
     def errors(self) -> tuple[Any, Any]:
         """Degrees and metres of each frame."""

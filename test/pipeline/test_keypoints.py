@@ -17,7 +17,7 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
 from rs_localizer.lab.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.lab.simulation.scene import room
@@ -72,12 +72,12 @@ def localizer(
     return result
 
 
-def refused(result: Frame | Refusal) -> tuple[str, str]:
+def refused(result: Localized | Refusal) -> tuple[str, str]:
     assert isinstance(result, Refusal), result
     return result.reason, result.detail
 
 
-def localized(result: Frame | Refusal, truth: SimulatedFrame) -> Frame:
+def localized(result: Localized | Refusal, truth: SimulatedFrame) -> Localized:
     assert result, result
     assert np.allclose(result.pose.position, truth.first_row.positions[0], atol=0.02)
     return result

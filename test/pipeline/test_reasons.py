@@ -21,7 +21,7 @@ def test_the_table_is_that_of_the_code() -> None:
         used |= set(re.findall(r"Refusal\(\s*\"(\w+)\"", path.read_text()))
     used |= {item.refused for item in INPUTS.values()}
     used |= set(
-        re.findall(r"_NO_TRANSFORM = \"(\w+)\"", (PACKAGE / "pipeline" / "frames.py").read_text())
+        re.findall(r"NO_TRANSFORM = \"(\w+)\"", (PACKAGE / "pipeline" / "published.py").read_text())
     )
     assert set(REASONS) == used - OF_IMAGES
 

@@ -16,7 +16,7 @@ from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments.matching_scores import scores_claim
 from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
@@ -151,7 +151,7 @@ def _measure(runs: Sequence[Run], frames: Sequence[SimulatedFrame], context: Con
                 _judge_frame(run, result, frame)
 
 
-def _judge_frame(run: Run, result: Frame, frame: SimulatedFrame) -> None:
+def _judge_frame(run: Run, result: Localized, frame: SimulatedFrame) -> None:
     error = np.linalg.norm(result.pose.position - frame.first_row.positions[0])
     run.localized += bool(error < _LOST)
     assert run.landmarks.ids is not None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Answer:
     tracked: bool
 
 
-def tell(frame: Frame) -> tuple[int, Answer]:
+def tell(frame: Localized) -> tuple[int, Answer]:
     """The stamp of the input (ns), and what is told."""
     estimate = frame.estimate
     residuals = estimate.residuals[estimate.inliers]

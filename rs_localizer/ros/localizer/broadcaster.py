@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 
 from rs_localizer.config import NodeConfig, PublishTf
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError, make_transform
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.ros.localizer.transforms import Tf, import_tf2_ros, needed
@@ -28,7 +28,7 @@ _MOST_PENDING = 100
 class _Pending:
     """A frame whose transform is to be sent."""
 
-    frame: Frame
+    frame: Localized
     config: NodeConfig
     deadline: float  # time.monotonic()
 
@@ -87,7 +87,7 @@ class Broadcaster:
             self._node.destroy_publisher(self._broadcaster.pub_tf)
             self._broadcaster = None
 
-    def publish(self, frame: Frame, config: NodeConfig) -> None:
+    def publish(self, frame: Localized, config: NodeConfig) -> None:
         """Send the frame's transform: now, or when odometry has come so far.
 
         After ``transform_tolerance`` it is given up.

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
 from rs_localizer.pipeline.refusal import Refusal
@@ -44,7 +44,7 @@ class Feed:
 
     def __init__(
         self,
-        worker: Worker[FrameLocalizer, Frame],
+        worker: Worker[FrameLocalizer, Localized],
         frames: FrameLocalizer,
         refusals: Refusals,
         say: Callable[[str], Any],
@@ -81,7 +81,7 @@ class Feed:
     def _frames_topic(self, item: Input) -> Topic:
         """A topic whose messages the worker localizes."""
 
-        def localize(frames: FrameLocalizer, message: Any) -> Frame | Refusal:
+        def localize(frames: FrameLocalizer, message: Any) -> Localized | Refusal:
             result = item.take(frames, message)
             assert result is not None  # a frame has one
             return result

@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.maps.landmarks import MapError
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.localizer import transforms
 from rs_localizer.ros.localizer.answers import Answer, tell
@@ -29,7 +29,7 @@ from rs_localizer.settings import NODE_NAME
 _ODD = ("map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed")
 
 
-class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Frame, Answer]):
+class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     """Localizes; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
 
     task = "localizer"

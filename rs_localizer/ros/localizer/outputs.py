@@ -8,7 +8,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from rs_localizer.io.outputs import TYPES, Frame, each_message
+from rs_localizer.io.outputs import TYPES, Localized, each_message
 from rs_localizer.ros.node.conversion import make_message, message_class
 
 _QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
@@ -23,7 +23,7 @@ class Outputs:
     """
 
     def __init__(
-        self, node: LifecycleNode, afterwards: Callable[[Frame], None] | None = None
+        self, node: LifecycleNode, afterwards: Callable[[Localized], None] | None = None
     ) -> None:
         self._node = node
         self._afterwards = afterwards
@@ -37,7 +37,7 @@ class Outputs:
             for name, type_name in TYPES.items()
         }
 
-    def publish(self, frame: Frame) -> None:
+    def publish(self, frame: Localized) -> None:
         """Publish what somebody listens to; nothing else is built."""
         wanted = [
             name

@@ -16,7 +16,7 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.io.outputs import Frame, Pose
+from rs_localizer.io.outputs import Localized, Pose
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError
 from rs_localizer.ros.localizer.broadcaster import Broadcaster
 from rs_localizer.ros.localizer.transforms import check
@@ -86,9 +86,9 @@ def made(peer: Any, robot: Any) -> Iterator[Callable[..., Any]]:
         part.close()
 
 
-def frame(stamp_ns: int, x: float = 0.0) -> Frame:
+def frame(stamp_ns: int, x: float = 0.0) -> Localized:
     pose = Pose(np.array([x, 0.0, 0.0]), np.eye(3), np.eye(6))
-    return Frame(
+    return Localized(
         input_stamp_ns=stamp_ns, stamp_ns=stamp_ns, map_frame="map", body_frame="base_link",
         pose=pose, twist=None, inliers=np.zeros(0), dropped=0, estimate=None,
     )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.outputs import Frame
+from rs_localizer.io.outputs import Localized
 from rs_localizer.lab.experiments.honesty.scores import REGION, motion_evidence, percent
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
 from rs_localizer.lab.independent.rotations import logarithm
@@ -68,14 +68,14 @@ def conditions() -> Sequence[Condition]:
 def measure(condition: Condition, recording: Path, frames: int = FRAMES) -> Replayed:
     """Replay the first frames of the recording as the node would see them."""
     localizer = FrameLocalizer(condition.config)
-    results: list[Frame | Refusal] = []
+    results: list[Localized | Refusal] = []
     with open_bag(recording) as bag:
         for topic, _, message in bag.messages((CAMERA_INFO, CORRESPONDENCES)):
             if topic == CAMERA_INFO:
                 localizer.take_camera_info(message)
             elif len(results) < frames:
                 results.append(localizer.localize(message))
-    found = [result for result in results if isinstance(result, Frame)]
+    found = [result for result in results if isinstance(result, Localized)]
     reasons = Counter(result.reason for result in results if isinstance(result, Refusal))
     moving = []
     if find_solver(condition.config.solver).rolling_shutter:
@@ -92,7 +92,7 @@ def measure(condition: Condition, recording: Path, frames: int = FRAMES) -> Repl
     )
 
 
-def _second_differences(frames: Iterable[Frame]) -> tuple[Array, IntArray]:
+def _second_differences(frames: Iterable[Localized]) -> tuple[Array, IntArray]:
     """Angles (n,) in deg between a turn and the next one, and the second of each."""
     turns = [
         (after.input_stamp_ns, logarithm(before.pose.rotation.T @ after.pose.rotation))
