@@ -13,7 +13,7 @@ MOST = 6
 COMPILED = {"kernel", "error_model"}
 INSTEAD_OF_KERNELS = {"solvers/r6p.py: solve_batch"}
 # Declarations, which are called with keywords.
-DECLARATIONS = {"config.py: setting", "solvers/minimal.py: solve_minimal"}
+DECLARATIONS = {"config/declared.py: setting", "solvers/minimal.py: solve_minimal"}
 # To be mended; nothing is added here.
 TOO_MANY = {
     "estimation/ransac.py: search",

@@ -1,21 +1,13 @@
-"""Every setting of the package and its default; nothing else in the package repeats one.
-
-The node declares its ROS parameters by walking these classes, so the names, descriptions and
-ranges here are what users see in ``ros2 param describe``.
-"""
+"""Settings of the nodes: the method's, and what surrounds it."""
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import StrEnum
-from numbers import Integral, Real
-from typing import Any
 
+from rs_localizer.config.declared import check, setting
+from rs_localizer.config.method import LocalizerConfig
 from rs_localizer.core.camera import ScanDirection
-from rs_localizer.solvers.table import SOLVERS
 
 
 class PoseTime(StrEnum):
@@ -31,136 +23,6 @@ class PublishTf(StrEnum):
     NONE = "none"
     MAP_TO_CAMERA = "map_to_camera"
     MAP_TO_ODOM = "map_to_odom"
-
-
-def setting(
-    default: Any,
-    description: str,
-    *,
-    minimum: float | None = None,
-    maximum: float | None = None,
-    choices: tuple[str, ...] = (),
-    read_only: bool = False,
-    fixed: bool = False,
-) -> Any:
-    """A dataclass field with what a user needs to know of it.
-
-    Args:
-        default: its value, which also says its type.
-        description: one line.
-        minimum, maximum: of a number; they belong to the range.
-        choices: of a text.
-        read_only: it cannot be set while the node runs.
-        fixed: it cannot be set after the node has been configured.
-    """
-    return field(
-        default=default,
-        metadata={
-            "description": description,
-            "minimum": minimum,
-            "maximum": maximum,
-            "choices": choices,
-            "read_only": read_only,
-            "fixed": fixed,
-        },
-    )
-
-
-def _check(config: Any, prefix: str = "") -> None:
-    """Raise ``ValueError`` for the first setting whose type, range or choice is wrong."""
-    for item in fields(config):
-        if not item.metadata:
-            continue
-        name, value, default = prefix + item.name, getattr(config, item.name), item.default
-        if isinstance(default, bool):
-            valid = isinstance(value, bool)
-        elif isinstance(default, int):
-            valid = isinstance(value, Integral) and not isinstance(value, bool)
-        elif isinstance(default, float):
-            valid = isinstance(value, Real) and not isinstance(value, bool)
-        elif isinstance(default, tuple):
-            valid = _are_numbers(value, len(default))
-        else:
-            valid = isinstance(value, str)
-        if not valid:
-            raise ValueError(f"{name} must be {type_of(default)}, got {value!r}")
-        choices = item.metadata["choices"]
-        if choices and value not in choices:
-            raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}")
-        low, high = item.metadata["minimum"], item.metadata["maximum"]
-        if low is not None and not (low <= value <= high):
-            raise ValueError(f"{name} must lie between {low} and {high}, got {value!r}")
-
-
-def type_of(default: Any) -> str:
-    """In words, what a setting with this default is."""
-    if isinstance(default, tuple):
-        return f"{len(default)} numbers, as {list(default)}"
-    return f"of type {type(default).__name__}"
-
-
-def _are_numbers(value: Any, count: int) -> bool:
-    return (
-        isinstance(value, Sequence)
-        and len(value) == count
-        and all(isinstance(item, Real) and math.isfinite(item) for item in value)
-    )
-
-
-# Of a velocity prior; anything less would hold the camera still with infinite force.
-_LEAST_DEVIATION = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class VelocityPrior:
-    """How fast cameras move: standard deviations of the zero-mean velocity prior.
-
-    Robots, drones and hands; what moves slower is told by the points.
-    """
-
-    angular: float = setting(
-        6.0,
-        "Standard deviation of the camera's angular velocity, in rad/s; 0: no prior",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    linear: float = setting(
-        3.0,
-        "Standard deviation of the camera's linear velocity, in m/s; 0: no prior",
-        minimum=0.0,
-        maximum=10000.0,
-    )
-
-    def __post_init__(self) -> None:
-        _check(self, "velocity_prior.")
-        for name in ("angular", "linear"):
-            deviation = getattr(self, name)
-            if 0.0 < deviation < _LEAST_DEVIATION:
-                raise ValueError(
-                    f"velocity_prior.{name} must be 0 (no prior) or at least {_LEAST_DEVIATION:g}, "
-                    f"got {deviation!r}"
-                )
-
-
-@dataclass(frozen=True, slots=True)
-class Acceleration:
-    """How fast cameras change their velocities, within a readout and from frame to frame."""
-
-    angular: float = setting(
-        10.0,
-        "Standard deviation of the camera's angular acceleration, in rad/s^2",
-        minimum=0.001,
-        maximum=10000.0,
-    )
-    linear: float = setting(
-        4.0,
-        "Standard deviation of the camera's linear acceleration, in m/s^2",
-        minimum=0.001,
-        maximum=10000.0,
-    )
-
-    def __post_init__(self) -> None:
-        _check(self, "acceleration.")
 
 
 class MatchBy(StrEnum):
@@ -207,7 +69,7 @@ class Matching:
     )
 
     def __post_init__(self) -> None:
-        _check(self, "matching.")
+        check(self, "matching.")
 
 
 class ImuUse(StrEnum):
@@ -261,78 +123,7 @@ class Imu:
     )
 
     def __post_init__(self) -> None:
-        _check(self, "imu.")
-
-
-@dataclass(frozen=True, slots=True)
-class LocalizerConfig:
-    """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
-
-    solver: str = setting(
-        "r6p_vcwt",
-        "Minimal solver that generates the hypotheses",
-        choices=tuple(SOLVERS),
-    )
-    solver_iterations: int = setting(
-        5, "Iterations of the iterative linear solvers", minimum=1, maximum=100
-    )
-    inlier_threshold: float = setting(
-        2.0,
-        "Largest reprojection error of an inlier, in raw image pixels",
-        minimum=0.01,
-        maximum=1000.0,
-    )
-    max_iterations: int = setting(
-        1000,
-        "Most minimal samples of a frame, for its global-shutter start and again for its motion",
-        minimum=1,
-        maximum=1_000_000,
-    )
-    confidence: float = setting(
-        0.99,
-        "Probability of having drawn an all-inlier sample at which the search stops",
-        minimum=0.0,
-        maximum=0.999999,
-    )
-    min_inliers: int = setting(
-        12, "Fewest inliers of a pose that is accepted", minimum=7, maximum=1_000_000
-    )
-    seed: int = setting(
-        0, "Seed of the random samples; every frame starts from it", minimum=0, maximum=2**31 - 1
-    )
-    velocity_prior: VelocityPrior = field(default_factory=VelocityPrior)
-    acceleration: Acceleration = field(default_factory=Acceleration)
-    map_deviation: float = setting(
-        0.0,
-        "How well the points of the map are known, in m (one standard deviation; neighbours are "
-        "assumed to be off together)",
-        minimum=0.0,
-        maximum=1000.0,
-    )
-
-    def __post_init__(self) -> None:
-        _check(self)
-        for name, kind in (("velocity_prior", VelocityPrior), ("acceleration", Acceleration)):
-            if not isinstance(getattr(self, name), kind):
-                raise ValueError(
-                    f"{name} must be of type {kind.__name__}, got {getattr(self, name)!r}"
-                )
-
-
-def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
-    """The settings of a localizer by keyword.
-
-    Raises:
-        ValueError: for a value out of range, or a name that is no setting; then with the one that
-            may have been meant.
-    """
-    known = [item.name for item in fields(LocalizerConfig)]
-    for name in settings:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
-            raise ValueError(f"{name!r} is no setting of the localizer; {hint}")
-    return LocalizerConfig(**settings)
+        check(self, "imu.")
 
 
 LONGEST_READOUT_TIME = 0.2
@@ -484,4 +275,4 @@ class DetectorConfig:
     autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
 
     def __post_init__(self) -> None:
-        _check(self)
+        check(self)

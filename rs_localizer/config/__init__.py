@@ -1,0 +1,45 @@
+"""Every setting of the package and its default; nothing else in the package repeats one.
+
+The node declares its ROS parameters by walking these classes, so the names, descriptions and
+ranges here are what users see in ``ros2 param describe``.
+"""
+
+from rs_localizer.config.declared import (
+    type_of,
+)
+from rs_localizer.config.method import (
+    Acceleration,
+    LocalizerConfig,
+    VelocityPrior,
+    localizer_config,
+)
+from rs_localizer.config.nodes import (
+    LONGEST_READOUT_TIME,
+    DetectorConfig,
+    ImageTransport,
+    Imu,
+    ImuUse,
+    MatchBy,
+    Matching,
+    NodeConfig,
+    PoseTime,
+    PublishTf,
+)
+
+__all__ = [
+    "LONGEST_READOUT_TIME",
+    "Acceleration",
+    "DetectorConfig",
+    "ImageTransport",
+    "Imu",
+    "ImuUse",
+    "LocalizerConfig",
+    "MatchBy",
+    "Matching",
+    "NodeConfig",
+    "PoseTime",
+    "PublishTf",
+    "VelocityPrior",
+    "localizer_config",
+    "type_of",
+]
