@@ -17,7 +17,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.so3 import exp
+from rs_localizer.core.so3 import exp, exp_many
 
 # Gauss' rule on the readout; the sum of the weights is its length.
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(5))
@@ -71,16 +71,27 @@ class KnownTurn:
         return rotations[0], rates[0]
 
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
-        """Rotations (n,3,3) and body rates (n,3) at row times (n,)."""
+        """Rotations (n,3,3) and body rates (n,3) at row times (n,).
+
+        Beyond the samples, where cubics would run away, the camera turns on at the mean rate.
+        """
         times = np.ascontiguousarray(tau, dtype=np.float64)
-        found: tuple[Array, Array] = turns_at(times, self.tau, self.rates, self.rotations)
-        return found
+        known = np.clip(times, self.tau[0], self.tau[-1])
+        rotations, rates = turns_at(known, self.tau, self.rates, self.rotations)
+        beyond = np.flatnonzero(times != known)
+        if len(beyond):
+            mean = self.parabola[0] + self.parabola[2] / 12.0
+            on = exp_many((known - times)[beyond, None] * mean)
+            rotations[beyond] = on @ rotations[beyond]
+            rates[beyond] = mean
+        return rotations, rates
 
     def late(self, tau: float) -> tuple[Array, Array]:
         """Turn (3,) and rate (3,) at ``tau`` that a delay of one readout would leave.
 
         What a motion under constant acceleration follows is told by the points and left out.
         """
+        tau = min(max(tau, float(self.tau[0])), float(self.tau[-1]))
         _, rate = self.at(tau)
         powers = np.array([1.0, tau, tau * tau])
         slopes = np.array([0.0, 1.0, 2.0 * tau])

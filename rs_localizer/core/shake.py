@@ -62,6 +62,11 @@ def shake_at(tau: Array, coefficients: Array) -> Array:
     return shake
 
 
+def within_rows(tau: float) -> float:
+    """The row time itself, or that of the first or last row before or after them."""
+    return min(max(tau, -0.5), 0.5)
+
+
 def basis_sizes(degrees: int) -> Array:
     """Sizes (degrees - 1,) of the polynomials of :func:`shake_basis`."""
     sizes: Array = (_WHOLE_SIZE / np.arange(FIRST_DEGREE, degrees + 1)) ** 2

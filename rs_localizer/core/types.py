@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.shake import shake_at
+from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS
 
@@ -66,9 +66,13 @@ class Estimate(Motion):
         return self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
 
     def shake_at(self, tau: float) -> tuple[Array, Array]:
-        """Turn (3,) of the camera beside the motion, and its rate (3,), at row time ``tau``."""
-        turn = shake_at(np.array([tau]), self.shake)[0]
-        return turn[:3], turn[3:]
+        """Turn (3,) of the camera beside the motion, and its rate (3,), at row time ``tau``.
+
+        The rows say nothing of the time before the first and after the last one, where polynomials
+        would run away: there the turn stays as it was.
+        """
+        turn = shake_at(np.array([within_rows(tau)]), self.shake)[0]
+        return turn[:3], turn[3:] if tau == within_rows(tau) else np.zeros(3)
 
     def turned(self, turn: KnownTurn, delay: tuple[float, float]) -> Estimate:
         """The same with a known turn, beside which its motion was estimated."""
@@ -108,7 +112,7 @@ class Estimate(Motion):
     def at_rows(self, tau: Array) -> tuple[Array, Array]:
         """Rotations (n,3,3) and translations (n,3) camera_from_map at row times (n,)."""
         rotations, translations = Motion.at_rows(self.beside_turn(), tau)
-        turns = shake_at(np.asarray(tau, float), self.shake)
+        turns = shake_at(np.clip(np.asarray(tau, float), -0.5, 0.5), self.shake)
         turned = so3.exp_many(-turns[:, :3])
         if self.turn is not None:
             turned = self.turn.at_rows(tau)[0] @ turned

@@ -27,6 +27,8 @@ _LONGEST_PERIOD_NS = 16_000_000
 # Readings farther apart than so many periods are a gap: one that is missing can be told from its
 # neighbours, as far as a vibration goes that they can show, two cannot.
 _MOST_PERIODS = 2.5
+# Between readings that are closer than this the noise would make the spline swing: one counts.
+_CLOSEST_NS = 250_000
 # A gyroscope that shows its greatest value so many times in a row, and at least this (rad/s; the
 # smallest range there is), shows the end of its range.
 _SATURATED_COUNT, _SATURATED_RATE = 4, 2.0
@@ -178,6 +180,9 @@ class ReadingBuffer:
             end = int(known.searchsorted(until_ns)) + 1
             stamps = known[begin:end].copy()
             values = self._values[self._first + begin : self._first + end].copy()
+        if len(stamps) > 1 and np.diff(stamps).min() < _CLOSEST_NS:
+            kept = _apart(stamps)
+            stamps, values = stamps[kept], values[kept]
         first = int(stamps.searchsorted(start_ns, "right")) - 1
         last = int(stamps.searchsorted(end_ns)) + 1
         steps = stamps[1:] - stamps[:-1]
@@ -232,6 +237,15 @@ def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:
             Lack.NOT_YET, f"the last reading is {_span(end_ns - newest)} older than the last row"
         )
     return None
+
+
+def _apart(stamps: IntArray) -> IntArray:
+    """Which of the readings (n,) are kept, so that none is too close to the one before."""
+    kept = [0]
+    for i in range(1, len(stamps)):
+        if stamps[i] - stamps[kept[-1]] >= _CLOSEST_NS:
+            kept.append(i)
+    return np.array(kept)
 
 
 def _period(stamps: IntArray) -> float:

@@ -16,7 +16,6 @@ _FASTEST = 100.0  # rad/s
 _HARDEST = 5000.0  # m/s^2
 # What a covariance says in its first element where the message holds no such measurement.
 _ABSENT = -1.0
-_DIAGONAL = (0, 4, 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,15 +26,13 @@ class ImuReading:
     frame: str
     angular_velocity: Vector  # rad/s
     linear_acceleration: Vector | None  # m/s^2, specific force: +g upwards at rest
-    gyroscope_deviation: float | None  # rad/s, of one axis of one message; None: not told
-    accelerometer_deviation: float | None  # m/s^2, likewise
 
 
 def read_imu(message: Any) -> ImuReading:
     """Read a sensor_msgs/Imu; its orientation, which others have estimated, is not used.
 
-    A covariance of zeros tells nothing; one that begins with -1 says that there is no such
-    measurement, as does an acceleration of exactly zero: no accelerometer shows that.
+    Covariances, which drivers often make up, are not used, but for one that begins with -1: there
+    is no such measurement. Nor is there one where an acceleration is exactly zero, or NaN.
 
     Raises:
         MessageError: without an angular velocity, and for numbers that no IMU measures, saying
@@ -51,7 +48,7 @@ def read_imu(message: Any) -> ImuReading:
     forces = message.linear_acceleration_covariance
     turn = _vector(message.angular_velocity, "angular_velocity", "rad/s", _FASTEST)
     force = None
-    if float(forces[0]) != _ABSENT:
+    if float(forces[0]) != _ABSENT and _is_finite(message.linear_acceleration):
         found = _vector(message.linear_acceleration, "linear_acceleration", "m/s^2", _HARDEST)
         force = found if any(found) else None
     return ImuReading(
@@ -59,11 +56,12 @@ def read_imu(message: Any) -> ImuReading:
         frame=frame,
         angular_velocity=turn,
         linear_acceleration=force,
-        gyroscope_deviation=_deviation(rates, "angular_velocity_covariance"),
-        accelerometer_deviation=(
-            None if force is None else _deviation(forces, "linear_acceleration_covariance")
-        ),
     )
+
+
+def _is_finite(vector: Any) -> bool:
+    """Whether there is a measurement; drivers of gyroscopes alone may send NaN for the rest."""
+    return all(math.isfinite(float(value)) for value in (vector.x, vector.y, vector.z))
 
 
 def _vector(vector: Any, name: str, unit: str, most: float) -> Vector:
@@ -75,12 +73,3 @@ def _vector(vector: Any, name: str, unit: str, most: float) -> Vector:
             f"{name} is {found} {unit}, more than any IMU measures ({most:g}); is it in {unit}?"
         )
     return found
-
-
-def _deviation(covariance: Any, name: str) -> float | None:
-    """Standard deviation of an axis, by the mean of the variances."""
-    variances = [float(covariance[i]) for i in _DIAGONAL]
-    if not all(math.isfinite(v) and v >= 0.0 for v in variances):
-        raise MessageError(f"the diagonal of {name} is {variances}: no variances")
-    mean = sum(variances) / len(variances)
-    return math.sqrt(mean) if mean > 0.0 else None

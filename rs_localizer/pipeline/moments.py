@@ -32,7 +32,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.shake import shake_basis
+from rs_localizer.core.shake import shake_at, shake_basis, within_rows
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,
@@ -47,6 +47,8 @@ from rs_localizer.io.outputs import Pose, Twist
 
 # Blocks of the published covariances.
 _LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
+# Where the shaking is asked how fast it is.
+_ROWS = np.linspace(-0.5, 0.5, 17)
 
 
 def pose_at(estimate: Estimate, tau: float) -> Pose:
@@ -71,6 +73,7 @@ def pose_at(estimate: Estimate, tau: float) -> Pose:
     if estimate.turn is not None:
         late = estimate.turn.delay * rotation.T @ estimate.turn.late(tau)[0]
         covariance[_ANGULAR, _ANGULAR] += np.outer(late, late)
+    covariance[_ANGULAR, _ANGULAR] += _beyond_rows(estimate, tau)[0] * np.eye(3)
     return Pose(position=-rotation.T @ translation, rotation=rotation.T, covariance=covariance)
 
 
@@ -101,7 +104,10 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     by_shake = np.kron(values, so3.hat(angular - rate) @ known)
     jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, known) + by_shake
     covariance = _propagate(jacobian / readout_time, estimate.joint_covariance)
+    turned, changed = _beyond_rows(estimate, tau)
+    own = own + changed * np.eye(3)
     covariance[_ANGULAR, _ANGULAR] += own / readout_time**2
+    covariance[_LINEAR, _LINEAR] += turned / readout_time**2 * so3.hat(linear) @ so3.hat(linear).T
     return Twist(
         linear=linear / readout_time, angular=angular / readout_time, covariance=covariance
     )
@@ -128,8 +134,34 @@ def _shaking(estimate: Estimate, tau: float) -> tuple[Array, Array]:
     count = (len(estimate.joint_covariance) - PARAMETERS) // 3
     values, rates = np.empty(count), np.empty(count)
     if count:
-        shake_basis(tau, count + 1, values, rates)
+        shake_basis(within_rows(tau), count + 1, values, rates)
+    if tau != within_rows(tau):  # it stays as it was
+        rates[:] = 0.0
     return values[None], rates[None]
+
+
+def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
+    """Variances of the turn (rad^2) and of its rate, per readout, that no row has seen.
+
+    A camera that shakes within the rows shakes outside, too, in a phase that nobody knows: it is
+    taken to go on at one of the rates that it had. What gyroscopes have seen, is known.
+    """
+    beyond = abs(tau - within_rows(tau))
+    if beyond == 0.0:
+        return 0.0, 0.0
+    rates = shake_at(_ROWS, estimate.shake)[:, 3:]
+    variance = float(np.mean(rates**2))
+    turn, rate = variance * beyond**2, variance
+    if estimate.turn is not None:
+        first, last = float(estimate.turn.tau[0]), float(estimate.turn.tau[-1])
+        unknown = abs(tau - min(max(tau, first), last))
+        if unknown > 0.0:
+            known = estimate.turn.at_rows(_ROWS)[1]
+            # Of a rate that goes on as it changes, the distance from the mean at this row.
+            variance = float(np.mean((known - known.mean(axis=0)) ** 2))
+            variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
+            turn, rate = turn + variance * unknown**2, rate + variance
+    return turn, rate
 
 
 def _propagate(jacobian: Array, covariance: Array) -> Array:

@@ -82,6 +82,15 @@ def test_order_and_repetition_do_not_matter() -> None:
     assert pair[0].angular_velocities.tolist() == pair[1].angular_velocities.tolist()
 
 
+def test_readings_that_nearly_coincide_count_once() -> None:
+    # Two drivers on one topic: between noisy readings microseconds apart a spline would swing.
+    times = stamps(400)
+    doubled = filled(sorted(times + [time + 1_000 for time in times]))
+    found = doubled.between(START + 501 * MS, START + 531 * MS)
+    assert isinstance(found, Readings)
+    assert np.diff(found.stamps_ns).min() > 0.9 * PERIOD
+
+
 def test_what_is_missing_is_told() -> None:
     assert lack(ReadingBuffer().between(START, START + 30 * MS)) == Lack.NEVER
     buffer = filled(stamps(400))  # until 997.5 ms

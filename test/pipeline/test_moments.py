@@ -11,6 +11,7 @@ from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.types import Estimate
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 
@@ -66,6 +67,8 @@ def disturbed(motion: Estimate, error: Array) -> Estimate:
 
 def shake(motion: Estimate, tau: float) -> Array:
     """Legendre polynomials of 2 tau, the smaller the higher, less value and slope at 0."""
+    if abs(tau) > 0.51:  # beyond the rows it stays as it was; differences reach a little beyond
+        tau = 0.5 if tau > 0.0 else -0.5
     turn = np.zeros(3)
     for degree, coefficients in enumerate(motion.shake, start=2):
         series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
@@ -229,3 +232,27 @@ def test_an_uncertain_readout_time_enters_both_covariances():
         doubted_pose.covariance - pose.covariance,
         (0.5 * deviation) ** 2 * np.outer(way, way), rtol=1e-3, atol=1e-9,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("tau", [-0.67, -2.5, 0.7])
+def test_nothing_runs_away_beyond_the_rows(tau: float) -> None:
+    # A stamp outside the exposure, as of cameras that stamp its start; shaking of high degrees, and
+    # a gyroscope whose samples end with the rows.
+    rng = np.random.default_rng(0)
+    shaking = 0.002 * rng.normal(size=(12, 3))
+    samples = np.linspace(-0.6, 0.6, 25)
+    rates = 0.02 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]))
+    motion = replace(estimate(0.1), shake=shaking, joint_covariance=1e-8 * np.eye(18 + 36))
+    for seen in (motion, motion.turned(KnownTurn.of(samples, rates), (0.0, np.inf))):
+        edge = 0.5 if tau > 0.0 else -0.5
+        before, after = pose_at(seen, edge), pose_at(seen, tau)
+        turn = Rotation.from_matrix(before.rotation.T @ after.rotation).magnitude()
+        assert turn < (0.1 + 0.05) * abs(tau - edge)
+        # Beyond the rows nobody knows where the shaking is.
+        deviations = [np.sqrt(np.linalg.eigvalsh(p.covariance[3:, 3:])) for p in (before, after)]
+        fastest = np.sqrt(np.mean(seen.shake_at(0.45)[1] ** 2))
+        assert deviations[1].min() > deviations[0].max()
+        assert deviations[1].min() > 0.1 * fastest * abs(tau - edge)
+        found = twist_at(seen, tau, READOUT_TIME)
+        assert np.abs(found.angular).max() < 0.5 / READOUT_TIME
+        assert np.linalg.eigvalsh(found.covariance).min() > 0.0
