@@ -51,6 +51,10 @@ setup(
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
         "evo": ["evo"],
+        "fleet": ["dask", "distributed"],
+        "hloc": ["h5py"],
+        "mapping": ["pycolmap"],
+        "view": ["rerun-sdk"],
         "test": [
             "catkin_pkg",
             "codespell==2.4.*",

@@ -27,11 +27,17 @@ MAY_IMPORT: dict[str, set[str]] = {
     "readout": {"data"},
     "matching": {"core", "config", "estimation", "io"},
     "markers": {"core", "io"},
-    "pipeline": {*METHOD, "io", "markers", "matching", "trajectory"},
-    "offline": {*METHOD, "io", "markers", "matching", "trajectory", "pipeline", "settings"},
+    "features": {"core", "config", "io"},
+    "pipeline": {*METHOD, "io", "features", "markers", "matching", "trajectory"},
+    "mapping": {
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+    },
+    "offline": {
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+    },
     "lab": {
-        *(*METHOD, "trajectory", "io", "markers", "matching", "pipeline", "settings"),
-        *("data", "process"),
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *("mapping", "data", "process"),
     },
 }
 EVERYTHING = {*MAY_IMPORT, "__init__"}
