@@ -6,8 +6,8 @@ import argparse
 import importlib
 from types import ModuleType
 
-# Each module offers ``add_arguments(parser)`` and ``run(arguments)``. All are imported for the help:
-# what only its work needs is imported late.
+# Each module offers ``add_arguments(parser)`` and ``run(arguments)``. All are imported for the
+# help: what only its work needs is imported late.
 ACTIONS = {
     "info": "say what a map holds",
     "convert": "write a map to another file",

@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 
-from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, IMU
+from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES, IMU, POSE
 from rs_localizer.ros.bench.load.frames import READOUT_TIME, Frames
+from rs_localizer.settings import NODE_NAME
 
-_DISCOVERY_TIMEOUT = 60.0  # s
+# Until one of them is answered, frames before the first are sent so far apart, in s.
+_PROBES, _PROBE_INTERVAL = 240, 0.25
 # From the last row to the correspondences, as long as a driver and a detector take, in s. An IMU
 # tells of a row at once.
 _PROCESSING = 0.015
@@ -26,24 +29,37 @@ class Camera:
     """Publishes frames to one node."""
 
     def __init__(self, node: Node, namespace: str, frames: Frames) -> None:
-        self._frames = frames
+        self._node, self._frames = node, frames
+        self._pose_topic = f"{namespace}/{NODE_NAME}/{POSE}"
         self._infos = node.create_publisher(
             CameraInfo, f"{namespace}/{CAMERA_INFO}", qos_profile_sensor_data
         )
         self._clouds = node.create_publisher(
             PointCloud2, f"{namespace}/{CORRESPONDENCES}", qos_profile_sensor_data
         )
-
         self._imus = node.create_publisher(Imu, f"{namespace}/{IMU}", qos_profile_sensor_data)
 
     def wait(self) -> None:
-        """Until somebody listens."""
-        deadline = time.monotonic() + _DISCOVERY_TIMEOUT
-        while not (self._infos.get_subscription_count() and self._clouds.get_subscription_count()):
-            if time.monotonic() > deadline:
-                raise TimeoutError("the node was not found")
-            time.sleep(0.05)
-        time.sleep(0.5)  # the other side has to find this one, too
+        """Until a frame is answered: both sides have found each other.
+
+        Raises:
+            TimeoutError: when none is.
+        """
+        heard: list[bytes] = []
+        listener = self._node.create_subscription(
+            PoseStamped, self._pose_topic, heard.append, qos_profile_sensor_data, raw=True
+        )
+        try:
+            for index in range(-_PROBES, 0):
+                self.send(index)
+                due = time.monotonic() + _PROBE_INTERVAL
+                while (left := due - time.monotonic()) > 0.0:
+                    rclpy.spin_once(self._node, timeout_sec=left)
+                if heard:
+                    return
+        finally:
+            self._node.destroy_subscription(listener)
+        raise TimeoutError("the node was not found")
 
     def send(self, index: int) -> float:
         """Publish a frame and its camera_info: time.monotonic() between the two."""

@@ -30,7 +30,8 @@ _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 _D = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
 # After these the motion starts over: a jump to which the tracker has to find again.
 _DIFFERENT = 500
-_FIRST_NS = 1_000_000_000
+# Late enough for frames before the first one.
+_FIRST_NS = 1_000_000_000_000
 # A serialized message begins with four bytes of CDR, then with the stamp of its header.
 _STAMP = slice(4, 12)
 
