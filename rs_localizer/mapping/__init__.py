@@ -1,0 +1,1 @@
+"""Maps of landmarks from images."""
