@@ -25,6 +25,8 @@ class Observations:
     frames: IntArray  # (n,) number of the image, rising
     trusted: BoolArray  # (n,) inliers of their frame alone
     gyro: GyroSamples | None = None
+    # (p,) number of the free rigid body that each landmark is part of, from 0 on; -1: known.
+    bodies: IntArray | None = None
 
     def subset(self, chosen: BoolArray) -> Observations:
         """The chosen keypoints (n,), with all landmarks."""
