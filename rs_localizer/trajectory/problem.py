@@ -1,13 +1,14 @@
-"""The cost of a trajectory, its normal equations and its minimum.
-
-Gauss and Newton with Levenberg's damping on the whitened errors of
+"""The cost of a trajectory and its normal equations, on the whitened errors of
 :mod:`rs_localizer.trajectory.sight_kernels`.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from rs_localizer.trajectory.gyro_terms import GyroTerms
 from rs_localizer.trajectory.lens import lens_values, project
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.normal_kernels import Normal, accumulate
-from rs_localizer.trajectory.prior_kernels import add_smoothness, eliminate_stamps
+from rs_localizer.trajectory.prior_kernels import add_rest, add_smoothness, eliminate_stamps
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, look, squared_errors
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
@@ -31,17 +32,18 @@ _SCALE_LIMIT = 4.0
 # Median of a squared error in two dimensions, in variances.
 _MEDIAN = 2.0 * np.log(2.0)
 _LEAST_DEVIATION = 1e-4  # px; recordings without noise are simulated
-_STEPS, _MOST_DAMPINGS = 20, 6
-_LEAST_GAIN = 0.02  # of the cost; a step that brings less is the last one
-_FIRST_DAMPING = 1e-8
 # Kernels and OpenCV leave the interpreter free for each other.
 _PARTS = 2
 # What parts of a recording add to the normal equations.
 _SUMS = tuple(name for name in Normal._fields if name != "image_first")
 
+_Done = TypeVar("_Done")
+Step = tuple[Array, Array]
+"""Of the controls (6 n,) and of the border (b,)."""
+
 
 class Problem:
-    """The cost of a state, its normal equations and its minimum."""
+    """The cost of a state and its normal equations."""
 
     def __init__(
         self, camera: Camera, observations: Observations, start: State, freedom: Freedom
@@ -77,9 +79,13 @@ class Problem:
                 spline.rotations, spline.positions, *spline.steps(), float(spline.layout.spacing)
             )
             arms = self.pieces.arms(state.landmarks)
-            parts = self._workers.map(lambda p: self._part(state, curve, arms, p), self._parts)
-            self._last = state, curve, list(parts)
+            parts = self.each(lambda part: self._part(state, curve, arms, part), self._parts)
+            self._last = state, curve, parts
         return self._last[1:]
+
+    def each(self, work: Callable[..., _Done], *parts: list[Any]) -> list[_Done]:
+        """What comes of work on the parts of the recording, which threads share."""
+        return list(self._workers.map(work, *parts))
 
     def _part(self, state: State, curve: Curve, arms: Array, part: slice) -> Sights:
         seen = self.observations
@@ -129,7 +135,7 @@ class Problem:
         curve, parts = self.look(state)
         terms = self.terms(state, deviation)
         normals = self._empty(len(state.spline.positions), parts, len(state.delays))
-        costs = self._workers.map(
+        costs = self.each(
             lambda sights, normal: accumulate(curve, sights, terms, normal), parts, normals
         )
         cost, normal = sum(costs), normals[0]
@@ -140,6 +146,12 @@ class Problem:
             curve, state.spline.layout.firsts, float(self.freedom.angular_acceleration),
             float(self.freedom.linear_acceleration), normal,
         )  # fmt: skip
+        alone = state.spline.layout.alone()
+        if len(alone) and self.freedom.angular_velocity < math.inf:
+            cost += add_rest(
+                curve, alone, float(self.freedom.angular_velocity),
+                float(self.freedom.linear_velocity), normal,
+            )  # fmt: skip
         cost += self._add_priors(state, normal)
         if self.gyro is not None:
             cost += self.gyro.add(state, normal)
@@ -194,8 +206,9 @@ class Problem:
             cost += float(np.sum((state.delays / self.freedom.stamps) ** 2))
         return cost
 
-    def moved(self, state: State, normal: Normal, controls: Array, border: Array) -> State:
+    def moved(self, state: State, normal: Normal, step: Step) -> State:
         """The state after a step that these normal equations led to."""
+        controls, border = step
         readout_time, lens, landmarks = state.readout_time, state.lens, state.landmarks
         if self.freedom.readout_time:
             readout_time = readout_time + float(border[0])
@@ -213,27 +226,13 @@ class Problem:
             delays = delays - (normal.image_slope + pull) / normal.image_information
         return State(state.spline.moved(controls), readout_time, lens, landmarks, delays, mount)
 
-    def minimise(self, state: State, deviation: float, steps: int = _STEPS) -> State:
-        """The state of least cost near to this one, after at most so many steps."""
-        cost, normal = self.normal(state, deviation)
-        damping = _FIRST_DAMPING
-        for _ in range(steps):
-            for _ in range(_MOST_DAMPINGS):
-                try:
-                    trial = self.moved(state, normal, *Factored(normal, damping).step())
-                    trial_cost, trial_normal = self.normal(trial, deviation)
-                except Undetermined:  # far from the minimum, rounding may cost definiteness
-                    trial_cost = np.inf
-                if trial_cost < cost + _LEAST_GAIN:  # NaN compares false
-                    break
-                damping = max(100.0 * damping, 1e-4)
-            else:
-                return state
-            gain = cost - trial_cost
-            state, cost, normal, damping = trial, trial_cost, trial_normal, 0.1 * damping
-            if gain < _LEAST_GAIN:
-                break
-        return state
+    def step(self, normal: Normal, damping: float) -> Step:
+        """Of controls and border, Levenberg's.
+
+        Raises:
+            Undetermined: when the normal equations are not positive definite.
+        """
+        return Factored(normal, damping).step()
 
 
 def _pieces(observations: Observations, freedom: Freedom) -> Pieces:
