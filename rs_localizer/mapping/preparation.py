@@ -27,6 +27,8 @@ _MARGIN = 0.025
 _LOOSE = 1.0
 # So many landmarks of known place hold the map's frame and size.
 _LEAST_ANCHORS = 3
+# Images in a row that may tell the readout time.
+_LEAST_STRETCH = 20
 
 
 class Preparation:
@@ -44,6 +46,8 @@ class Preparation:
         self.deviations, self.floating = self._known()
         self.used = self._usable()
         self.spline = self._spline()
+        if freedom.readout_time:
+            self._check_stretches()
         held = CONTROL * len(self.spline.positions)
         if held > _MOST_UNKNOWNS:
             raise ValueError(
@@ -87,6 +91,17 @@ class Preparation:
             parts, self.times[own], self.start.rotations[own], self.start.positions[own], spacing,
             margin,
         )  # fmt: skip
+
+    def _check_stretches(self) -> None:
+        """Images on their own tell turn and way per readout only, and not how long it takes."""
+        own = self.times[np.unique(self.seen.images[self.used])]
+        stretches = self.spline.layout.stretches(own)
+        longest = int(np.bincount(stretches).max())
+        if longest < _LEAST_STRETCH:
+            raise ValueError(
+                f"the readout time is found from at least {_LEAST_STRETCH} images that follow each "
+                f"other within {LONGEST_GAP} s, found {longest}: give it, or more of the recording"
+            )
 
     def observations(self) -> Observations:
         images, pixels = self.seen.images[self.used], self.seen.pixels[self.used]
