@@ -1,1 +1,1 @@
-"""Maps of landmarks from images."""
+"""Maps from images: landmarks and markers refined together with the motion that saw them."""

@@ -11,6 +11,7 @@ from types import ModuleType
 ACTIONS = {
     "info": "say what a map holds",
     "convert": "write a map to another file",
+    "refine": "adjust a map with the rolling shutter that saw it",
 }
 
 
