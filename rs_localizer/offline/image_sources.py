@@ -18,7 +18,7 @@ from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.video import read_video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
-from rs_localizer.pipeline.images import read
+from rs_localizer.pipeline.image_messages import read
 from rs_localizer.pipeline.refusal import Refusal
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")

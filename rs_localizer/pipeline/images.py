@@ -15,12 +15,13 @@ import numpy as np
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.images import Image, read_compressed_image, read_image
-from rs_localizer.io.messages import Make, MessageError
+from rs_localizer.io.images import Image
+from rs_localizer.io.messages import Make
 from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
 from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
+from rs_localizer.pipeline.image_messages import read
 from rs_localizer.pipeline.refusal import Refusal
 
 # Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
@@ -43,16 +44,6 @@ class Detected:
 
     def __bool__(self) -> Literal[True]:
         return True
-
-
-def read(message: Any) -> Image | Refusal:
-    """A sensor_msgs/Image or CompressedImage; ``bad_image`` if it cannot be read."""
-    try:
-        if hasattr(message, "format"):
-            return read_compressed_image(message)
-        return read_image(message)
-    except MessageError as error:
-        return Refusal("bad_image", str(error))
 
 
 def correspondences(detected: Detected, make: Make) -> Any:
