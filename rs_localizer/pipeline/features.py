@@ -14,10 +14,9 @@ import numpy as np
 from rs_localizer.config import FeatureConfig
 from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.images import Image
+from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import Make
-from rs_localizer.pipeline.image_messages import read
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import BAD_IMAGE, Refusal, read_or_refuse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +60,7 @@ class FrameExtractor:
 
     def take(self, message: Any) -> Extracted | Refusal:
         """Look for keypoints in a sensor_msgs/Image or CompressedImage."""
-        image = read(message)
+        image = read_or_refuse(read_any_image, message, BAD_IMAGE)
         return image if isinstance(image, Refusal) else self.extract(image)
 
     def extract(self, image: Image) -> Extracted:
