@@ -14,7 +14,7 @@ from tqdm import tqdm
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
-from rs_localizer.cli.detect import add_board_arguments, find_map
+from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera

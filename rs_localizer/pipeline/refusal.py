@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+from rs_localizer.io.messages import MessageError
+
+Read = TypeVar("Read")
+
+BAD_IMAGE = "bad_image"
+"""Of an image that cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,3 +40,11 @@ class Waiting(Refusal):
 
     again: Callable[[], Any]  # the result or another refusal
     patience: float  # s, for which this makes sense
+
+
+def read_or_refuse(read: Callable[[Any], Read], message: Any, reason: str) -> Read | Refusal:
+    """What is read of a message; refused for this reason if it cannot be."""
+    try:
+        return read(message)
+    except MessageError as error:
+        return Refusal(reason, str(error))

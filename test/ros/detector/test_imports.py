@@ -11,7 +11,7 @@ MOST = 52
 
 def test_the_detector_does_not_import_the_estimator() -> None:
     code = (
-        "import sys, rs_localizer.ros.detector.node\n"
+        "import sys, rs_localizer.ros.detector.markers\n"
         "print(*(n for n, m in sys.modules.items() if n.startswith('rs_localizer.')"
         " and not hasattr(m, '__path__')))"
     )
