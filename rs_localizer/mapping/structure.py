@@ -11,8 +11,10 @@ the first pixel at 0.5, 0.5.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,6 +35,8 @@ _MOST_ERROR = 6.0
 _PAIRS_AT_ONCE = 100
 # Errors of COLMAP's log that say what raised the exception anyway are left out.
 _ONLY_FATAL = 3
+
+Stage = Callable[[str, int], AbstractContextManager[Callable[[int], object]]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,13 +70,18 @@ class Effort:
     seed: int = 0
 
 
+def require() -> None:
+    """Raise ImportError where pycolmap is not installed, before any work is done."""
+    import pycolmap  # noqa: F401
+
+
 def build_structure(
     views: Sequence[View],
     keyframes: IntArray,
     camera: Camera,
     folder: Path,
     effort: Effort,
-    progress: Callable[[str, int], Callable[[int], object]],
+    stage: Stage,
 ) -> Structure:
     """Match the keyframes, and reconstruct the largest part that hangs together.
 
@@ -82,8 +91,8 @@ def build_structure(
         camera: of all views; its lens is believed.
         folder: for COLMAP's database and model; it stays.
         effort: threads and seed.
-        progress: called with the name and the length of each stage, returns what to call with the
-            number of steps that were done.
+        stage: a context for each part of the work: its name and number of steps in, what counts
+            them out.
 
     Raises:
         ImportError: without pycolmap.
@@ -96,30 +105,23 @@ def build_structure(
     database = folder / DATABASE
     names = _write_database(pycolmap, database, views, keyframes, camera)
     pairs = choose_pairs([views[row].features for row in keyframes.tolist()])
-    step = progress("match", len(pairs))
-    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
-        some = pairs[start : start + _PAIRS_AT_ONCE]
-        _match(pycolmap, database, [(names[i], names[j]) for i, j in some], effort)
-        step(len(some))
-    step = progress("map", len(keyframes))
-    models = pycolmap.incremental_mapping(
-        database,
-        folder,
-        folder,
-        _pipeline(pycolmap, effort),
-        next_image_callback=lambda: step(1),
-    )
+    with stage("match", len(pairs)) as step:
+        for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+            some = pairs[start : start + _PAIRS_AT_ONCE]
+            _match(pycolmap, database, [(names[i], names[j]) for i, j in some], effort)
+            step(len(some))
+    options = _pipeline(pycolmap, effort)
+    # What COLMAP writes on its own, a folder for each part, is not kept.
+    with stage("map", len(keyframes)) as step, TemporaryDirectory(dir=folder) as parts:
+        models = pycolmap.incremental_mapping(
+            database, folder, parts, options, next_image_callback=lambda: step(1)
+        )
     if not models:
         raise MappingError(_nothing(pycolmap, database, len(keyframes)))
     ordered = sorted(models.values(), key=lambda model: -model.num_reg_images())
-    best = ordered[0]
-    for path in [item for item in folder.iterdir() if item.is_dir()]:
-        for file in path.iterdir():
-            file.unlink()
-        path.rmdir()
     (folder / SPARSE).mkdir()
-    best.write(folder / SPARSE)
-    return _structure(best, tuple(model.num_reg_images() for model in ordered))
+    ordered[0].write(folder / SPARSE)
+    return _structure(ordered[0], tuple(model.num_reg_images() for model in ordered))
 
 
 def _write_database(

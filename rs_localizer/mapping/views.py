@@ -7,9 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from rs_localizer.config import FeatureKind
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.features.extraction import Features
-from rs_localizer.io.images import Gray
+from rs_localizer.features.extraction import FeatureExtractor, Features
+from rs_localizer.io.images import Gray, Image
+from rs_localizer.markers.detection import MarkerDetector
+from rs_localizer.markers.maps import MarkerMap
 
 # Corners that are followed from image to image, their least distance (px) and quality; an image
 # this wide (px) shows enough of them.
@@ -75,3 +78,32 @@ def _similarity(before: Gray, after: Gray) -> Array:
 def sharpness(image: Gray) -> float:
     """How much of the picture is fine detail: grey levels (rms) of the Laplacian."""
     return float(cv2.Laplacian(image, cv2.CV_32F, ksize=3).std())
+
+
+class Looker:
+    """Looks at the images of a recording, in their order.
+
+    Args:
+        most: features of an image.
+        marker_map: markers to look for, too.
+    """
+
+    def __init__(self, most: int, marker_map: MarkerMap | None = None) -> None:
+        self._extractor = FeatureExtractor(FeatureKind.SIFT, most)
+        self._follower = Follower()
+        self._detector = None if marker_map is None else MarkerDetector(marker_map)
+
+    def look(self, image: Image) -> View:
+        """What is needed of an image."""
+        corners, ids = np.zeros((0, 2)), np.zeros(0, np.int64)
+        if self._detector is not None:
+            found = self._detector.detect(image.pixels, image.stamp_ns)
+            corners, ids = found.pixels, found.ids
+        return View(
+            image.stamp_ns,
+            self._extractor.extract(image.pixels),
+            sharpness(image.pixels),
+            self._follower.follow(image.pixels),
+            corners,
+            ids,
+        )

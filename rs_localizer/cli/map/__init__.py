@@ -9,6 +9,7 @@ from types import ModuleType
 # Each module offers ``add_arguments(parser)`` and ``run(arguments)``. All are imported for the
 # help: what only its work needs is imported late.
 ACTIONS = {
+    "build": "make a map from images",
     "info": "say what a map holds",
     "convert": "write a map to another file",
     "refine": "adjust a map with the rolling shutter that saw it",

@@ -88,7 +88,7 @@ def _descriptors(model: Model, database: Path) -> tuple[NDArray[np.generic], NDA
         start, end = end, end + count
         rows = found[start:end][known[start:end]]
         if len(rows):
-            medoids[point], usable[point] = rows[_medoid(rows)], True
+            medoids[point], usable[point] = rows[medoid(rows)], True
     if not usable.any():
         raise MapError("no point of the model has a descriptor in it; is it of another model?")
     return (medoids.astype(np.float32) if _numeric(found) else medoids)[usable], usable
@@ -167,7 +167,7 @@ def _of_image(
     return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, columns // 4)
 
 
-def _medoid(rows: NDArray[np.generic]) -> int:
+def medoid(rows: NDArray[np.generic]) -> int:
     """The row with the least sum of distances to the others."""
     if len(rows) < 3:
         return 0

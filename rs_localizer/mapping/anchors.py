@@ -1,0 +1,174 @@
+"""What gives a map its scale and its place: markers of known places, points a known distance apart.
+
+Both are seen in images beside the landmarks, and triangulated with the refined motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.mapping.errors import MappingError
+from rs_localizer.mapping.similarity import Similarity, through, upright
+from rs_localizer.mapping.triangulation import Triangulated
+from rs_localizer.mapping.views import View
+from rs_localizer.markers.maps import MarkerMap
+
+# Corners of markers are where their map says to this part of their extent, or one of both is wrong.
+_MOST_MISFIT = 0.02
+# Distances contradict each other when the scales that they ask for differ by more than this part.
+_MOST_CONTRADICTION = 0.03
+_LEAST_CORNERS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class PointSight:
+    """A named point in an image."""
+
+    name: str
+    view: int  # row of the views
+    pixel: tuple[float, float]  # raw
+
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    """What was measured between two named points."""
+
+    one: str
+    other: str
+    metres: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchors:
+    """Points that are seen beside the landmarks."""
+
+    marker_map: MarkerMap | None = None
+    sights: tuple[PointSight, ...] = ()
+    distances: tuple[Distance, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        return sorted({sight.name for sight in self.sights})
+
+    @property
+    def corners(self) -> int:
+        """Number of the marker map's points, which come first."""
+        return 0 if self.marker_map is None else len(self.marker_map.points)
+
+    @property
+    def count(self) -> int:
+        return self.corners + len(self.names)
+
+    def seen(self, views: Sequence[View]) -> tuple[IntArray, IntArray, Array]:
+        """Views (n,), anchors (n,) and pixels (n,2) of all sights."""
+        rows, anchors, pixels = [], [], []
+        for row, view in enumerate(views):
+            for corner, pixel in zip(view.corner_ids.tolist(), view.corners, strict=True):
+                rows.append(row)
+                anchors.append(corner)
+                pixels.append(pixel)
+        names = self.names
+        for sight in self.sights:
+            rows.append(sight.view)
+            anchors.append(self.corners + names.index(sight.name))
+            pixels.append(np.array(sight.pixel))
+        return np.array(rows, np.int64), np.array(anchors, np.int64), np.reshape(pixels, (-1, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """Where a map lies, and what says so."""
+
+    similarity: Similarity  # to metres
+    scaled: bool
+    levelled: bool  # z is up by what was measured, and not only by how the camera was held
+    told: str
+
+
+def place(anchors: Anchors, found: Triangulated, rotations: Array, positions: Array) -> Placement:
+    """The frame of the map in metres.
+
+    Args:
+        anchors: what is known.
+        found: where they are in the map.
+        rotations, positions: (g,3,3), (g,3) map_from_camera of all views, as they were held.
+
+    Raises:
+        MappingError: when what is known contradicts itself or was not seen.
+    """
+    if anchors.marker_map is not None:
+        return _by_markers(anchors.marker_map, found)
+    turn = upright(_down(rotations))
+    if not anchors.distances:
+        return Placement(
+            Similarity(1.0, turn, -turn @ positions[0]), False, False, "nothing tells the scale"
+        )
+    factors = []
+    for distance in anchors.distances:
+        one, other = (found.points[_row(anchors, name)] for name in (distance.one, distance.other))
+        apart = float(np.linalg.norm(one - other))
+        if not apart > 0.0:  # NaN: one of them is seen by one image only, or far away
+            raise MappingError(
+                f"the distance {distance.one} {distance.other} gives no scale: each point must be "
+                "given in two images or more that see it from different places"
+            )
+        factors.append(distance.metres / apart)
+    scale = float(np.median(factors))
+    spread = max(factors) / min(factors) - 1.0
+    if spread > _MOST_CONTRADICTION:
+        raise MappingError(
+            f"the distances contradict each other by {100 * spread:.1f} %: check the points' pixels "
+            "and the metres"
+        )
+    return Placement(
+        Similarity(scale, turn, -scale * turn @ positions[0]), True, False,
+        f"{len(factors)} measured distances (which agree within {100 * spread:.1f} %)",
+    )  # fmt: skip
+
+
+def _row(anchors: Anchors, name: str) -> int:
+    if name not in anchors.names:
+        raise MappingError(
+            f"no point is called {name}; there are {', '.join(anchors.names) or 'none'}"
+        )
+    return anchors.corners + anchors.names.index(name)
+
+
+def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
+    truth = marker_map.points
+    places = found.points[: len(truth)]
+    known: BoolArray = np.isfinite(places).all(axis=1) & (found.counts[: len(truth)] > 2)
+    if np.count_nonzero(known) < _LEAST_CORNERS:
+        raise MappingError(
+            f"{np.count_nonzero(known)} corners of the marker map are seen by three images or more, "
+            f"{_LEAST_CORNERS} are needed: show the markers from several places"
+        )
+    similarity = through(places[known], truth[known])
+    errors = np.linalg.norm(similarity(places[known]) - truth[known], axis=1)
+    extent = float(np.linalg.norm(np.ptp(truth[known], axis=0)))
+    misfit = float(np.sqrt(np.mean(errors**2)))
+    if misfit > _MOST_MISFIT * extent:
+        raise MappingError(
+            f"the markers do not lie where their map says: corners are off by {1e3 * misfit:.0f} mm "
+            f"(rms) over {extent:.2f} m; check sizes and places in the marker map"
+        )
+    corners = int(np.count_nonzero(known))
+    return Placement(
+        similarity, True, True,
+        f"{corners} corners of markers, within {1e3 * misfit:.1f} mm (rms) of their map",
+    )  # fmt: skip
+
+
+def _down(rotations: Array) -> Array:
+    """The direction that is most often at right angles to the images' rows: people hold cameras
+    level. Its sign is that of the images' mean downward direction.
+    """
+    across = rotations[:, :, 0]
+    _, vectors = np.linalg.eigh(across.T @ across)
+    down = rotations[:, :, 1].mean(axis=0)
+    axis: Array = vectors[:, 0]
+    return axis if axis @ down >= 0.0 else -axis

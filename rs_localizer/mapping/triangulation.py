@@ -1,0 +1,129 @@
+"""Points from keypoints of cameras whose motion is known, each point by itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+
+_STEPS = 8
+# Tukey's limit in standard deviations, and the errors (px) that are noise in any case.
+_LIMIT, _LEAST_DEVIATION = 4.7, 0.1
+# Median of a squared error in two dimensions, in variances.
+_MEDIAN = 2.0 * np.log(2.0)
+# Rays that meet at a smaller angle than 0.5 degrees determine no depth: squared sine of half of it.
+_LEAST_SPREAD = np.sin(np.radians(0.25)) ** 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sights:
+    """Keypoints, each with the camera's pose at the time of its row."""
+
+    rotations: Array  # (n,3,3) map_from_camera
+    positions: Array  # (n,3)
+    pixels: Array  # (n,2) raw
+    points: IntArray  # (n,) which point each shows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangulated:
+    """Points with their covariances."""
+
+    points: Array  # (p,3); NaN: not determined
+    covariances: Array  # (p,3,3), of the keypoints' noise alone
+    counts: IntArray  # (p,) keypoints that fit
+    deviation: float  # px, of the noise of u and of v
+
+
+def triangulate(camera: Camera, seen: Sights, count: int) -> Triangulated:
+    """The most likely places of points, robustly.
+
+    Args:
+        camera: its lens.
+        seen: of what is given; the order does not matter.
+        count: of the points.
+    """
+    if len(seen.points) == 0:
+        empty = np.full((count, 3), np.nan)
+        return Triangulated(empty, np.full((count, 3, 3), np.nan), np.zeros(count, int), np.nan)
+    points = _nearest_to_rays(camera, seen, count)
+    deviation = np.inf
+    for _ in range(_STEPS):
+        errors, jacobians = _errors(camera, seen, points)
+        squared = np.sum(errors**2, axis=1)
+        usable = np.isfinite(squared)
+        noise = np.sqrt(np.median(squared[usable]) / _MEDIAN) if usable.any() else np.inf
+        deviation = max(float(noise), _LEAST_DEVIATION)
+        weights = np.maximum(1.0 - squared / (_LIMIT * deviation) ** 2, 0.0) ** 2
+        weights = np.where(usable, weights, 0.0)
+        errors, jacobians = np.nan_to_num(errors), np.nan_to_num(jacobians)
+        weighted = weights[:, None, None] * jacobians
+        normal = _sums(np.swapaxes(weighted, 1, 2) @ jacobians, seen.points, count)
+        slope = _sums(np.einsum("nij,ni->nj", weighted, errors), seen.points, count)
+        points = points - np.einsum("pij,pj->pi", _inverses(normal), slope)
+    counts = np.bincount(seen.points[weights > 0.0], minlength=count)
+    determined = (counts > 1) & np.isfinite(points).all(axis=1)
+    covariances = np.where(determined[:, None, None], deviation**2 * _inverses(normal), np.nan)
+    return Triangulated(
+        np.where(determined[:, None], points, np.nan), covariances, counts, deviation
+    )
+
+
+def _nearest_to_rays(camera: Camera, seen: Sights, count: int) -> Array:
+    """Points (p,3) with the least squared distances to the rays; NaN: parallel rays."""
+    rays = camera.rays(seen.pixels)
+    directions = np.einsum(
+        "nij,nj->ni", seen.rotations, np.column_stack([rays, np.ones(len(rays))])
+    )
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    usable = np.isfinite(directions).all(axis=1)
+    directions = np.nan_to_num(directions)
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    across[~usable] = 0.0
+    sums = _sums(across, seen.points, count)
+    places = _sums(np.einsum("nij,nj->ni", across, seen.positions), seen.points, count)
+    least = np.linalg.eigvalsh(sums)[:, 0] / np.maximum(
+        np.bincount(seen.points[usable], minlength=count), 1
+    )
+    found = np.einsum("pij,pj->pi", _inverses(sums), places)
+    found[least < _LEAST_SPREAD] = np.nan
+    return found
+
+
+def _errors(camera: Camera, seen: Sights, points: Array) -> tuple[Array, Array]:
+    """Errors (n,2) px and their derivatives (n,2,3) by the points; NaN behind the camera."""
+    inverse = np.swapaxes(seen.rotations, 1, 2)
+    local = np.einsum("nij,nj->ni", inverse, points[seen.points] - seen.positions)
+    depth = np.where(local[:, 2] > 0.0, local[:, 2], np.nan)
+    rays = local[:, :2] / depth[:, None]
+    by_ray = camera.pixel_jacobian(rays)
+    by_local = np.zeros((len(rays), 2, 3))
+    by_local[:, 0, 0] = by_local[:, 1, 1] = 1.0
+    by_local[:, :, 2] = -rays
+    by_point = by_ray @ (by_local / depth[:, None, None]) @ inverse
+    return camera.project(local) - seen.pixels, by_point
+
+
+def _sums(values: Array, groups: IntArray, count: int) -> Array:
+    """Sums (p,...) of values (n,...) by group."""
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
+    sums = [np.bincount(groups, weights=column, minlength=count) for column in flat.T]
+    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
+
+
+def _inverses(matrices: Array) -> Array:
+    """Inverses (p,3,3) of symmetric matrices; NaN where there is none."""
+    good = _regular(matrices)
+    inverses = np.full_like(matrices, np.nan)
+    inverses[good] = np.linalg.inv(matrices[good])
+    return inverses
+
+
+def _regular(matrices: Array) -> BoolArray:
+    values = np.linalg.eigvalsh(np.nan_to_num(matrices))
+    regular: BoolArray = values[:, 0] > 1e-10 * np.maximum(values[:, 2], 1e-300)
+    return regular
