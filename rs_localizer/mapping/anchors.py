@@ -121,8 +121,8 @@ def place(anchors: Anchors, found: Triangulated, rotations: Array, positions: Ar
     spread = max(factors) / min(factors) - 1.0
     if spread > _MOST_CONTRADICTION:
         raise MappingError(
-            f"the distances contradict each other by {100 * spread:.1f} %: check the points' pixels "
-            "and the metres"
+            f"the distances contradict each other by {100 * spread:.1f} %: check the points' "
+            "pixels and the metres"
         )
     return Placement(
         Similarity(scale, turn, -scale * turn @ positions[0]), True, False,
@@ -144,8 +144,8 @@ def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
     known: BoolArray = np.isfinite(places).all(axis=1) & (found.counts[: len(truth)] > 2)
     if np.count_nonzero(known) < _LEAST_CORNERS:
         raise MappingError(
-            f"{np.count_nonzero(known)} corners of the marker map are seen by three images or more, "
-            f"{_LEAST_CORNERS} are needed: show the markers from several places"
+            f"{np.count_nonzero(known)} corners of the marker map are seen by three images or "
+            f"more, {_LEAST_CORNERS} are needed: show the markers from several places"
         )
     similarity = through(places[known], truth[known])
     errors = np.linalg.norm(similarity(places[known]) - truth[known], axis=1)
@@ -153,8 +153,8 @@ def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
     misfit = float(np.sqrt(np.mean(errors**2)))
     if misfit > _MOST_MISFIT * extent:
         raise MappingError(
-            f"the markers do not lie where their map says: corners are off by {1e3 * misfit:.0f} mm "
-            f"(rms) over {extent:.2f} m; check sizes and places in the marker map"
+            f"the markers do not lie where their map says: corners are off by {1e3 * misfit:.0f} "
+            f"mm (rms) over {extent:.2f} m; check sizes and places in the marker map"
         )
     corners = int(np.count_nonzero(known))
     return Placement(

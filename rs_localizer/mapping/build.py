@@ -41,6 +41,7 @@ _LEAST_PART = 0.5
 # A landmark counts when so many views agree, and it is known to this part of its usual distance.
 _LEAST_SIGHTS, _MOST_DEVIATION = 3, 0.03
 
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
     """What a map is built from."""

@@ -53,9 +53,7 @@ def choose_keyframes(motions: Array, sharpness: Array, size: tuple[int, int]) ->
     return Keyframes(np.array(chosen, np.int64), blurred, breaks)
 
 
-def _of_stretch(
-    motions: Array, quality: Array, size: tuple[int, int], start: int
-) -> Iterator[int]:
+def _of_stretch(motions: Array, quality: Array, size: tuple[int, int], start: int) -> Iterator[int]:
     """Rows of the keyframes of views that follow from each other."""
     key = 0
     yield start
@@ -100,6 +98,4 @@ def _speeds(motions: Array, size: tuple[int, int]) -> Array:
 
 def _running_median(values: Array) -> Array:
     rows = np.arange(len(values))
-    return np.array(
-        [np.median(values[max(0, row - _AROUND) : row + _AROUND + 1]) for row in rows]
-    )
+    return np.array([np.median(values[max(0, row - _AROUND) : row + _AROUND + 1]) for row in rows])

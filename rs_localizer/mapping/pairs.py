@@ -32,7 +32,7 @@ def choose_pairs(features: Sequence[Features]) -> list[Pair]:
     some = [_best(each) for each in features]
     for i in range(count):
         others = [j for j in range(count) if abs(i - j) > reach]
-        likely = sorted(((-_common(some[i], some[j]), j) for j in others))[:_OTHERS]
+        likely = sorted((-_common(some[i], some[j]), j) for j in others)[:_OTHERS]
         chosen |= {(min(i, j), max(i, j)) for less, j in likely if -less >= _LEAST_COMMON}
     return sorted(chosen)
 

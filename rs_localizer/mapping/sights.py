@@ -39,7 +39,9 @@ def all_seen(views: Sequence[View], structure: Structure, followed: Followed) ->
     new = ~np.isin(structure.seen_views * count + structure.seen_points, known)
     new &= row[structure.seen_views] >= 0
     at, features = structure.seen_views[new], structure.seen_features[new]
-    pixels = [views[v].features.pixels[f] for v, f in zip(at.tolist(), features.tolist())]
+    pixels = [
+        views[v].features.pixels[f] for v, f in zip(at.tolist(), features.tolist(), strict=True)
+    ]
     images = np.concatenate([row[followed.seen_views], row[at]])
     order = np.argsort(images, kind="stable")
     return Seen(
@@ -64,9 +66,7 @@ def for_adjustment(
     kept = chosen[seen.landmarks]
     used, images = np.unique(seen.images[kept], return_inverse=True)
     return (
-        Sightings(
-            stamps_ns[followed.views[used]], images, seen.landmarks[kept], seen.pixels[kept]
-        ),
+        Sightings(stamps_ns[followed.views[used]], images, seen.landmarks[kept], seen.pixels[kept]),
         Start(points, followed.rotations[used], followed.positions[used]),
         used,
     )

@@ -111,10 +111,14 @@ def build_structure(
             _match(pycolmap, database, [(names[i], names[j]) for i, j in some], effort)
             step(len(some))
     options = _pipeline(pycolmap, effort)
+
+    def advance() -> None:
+        step(1)
+
     # What COLMAP writes on its own, a folder for each part, is not kept.
     with stage("map", len(keyframes)) as step, TemporaryDirectory(dir=folder) as parts:
         models = pycolmap.incremental_mapping(
-            database, folder, parts, options, next_image_callback=lambda: step(1)
+            database, folder, parts, options, next_image_callback=advance
         )
     if not models:
         raise MappingError(_nothing(pycolmap, database, len(keyframes)))

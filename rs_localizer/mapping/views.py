@@ -31,7 +31,7 @@ class View:
     stamp_ns: int
     features: Features
     sharpness: float  # the higher the sharper; comparable between views of the same scene
-    motion: Array  # (3,3) pixels here from pixels of the view before; NaN where nothing was followed
+    motion: Array  # (3,3) pixels here from those of the view before; NaN: nothing was followed
     corners: Array  # (m,2) raw, of the markers
     corner_ids: IntArray  # (m,) rows of the marker map's points
 

@@ -137,9 +137,7 @@ def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
 
 def _write(out: Path, built: Built, looked: Looked) -> None:
     write_npz(out / MAP, built.landmarks)
-    write_parameters(
-        out / PARAMETERS, built.camera.readout_time, str(built.camera.scan_direction)
-    )
+    write_parameters(out / PARAMETERS, built.camera.readout_time, str(built.camera.scan_direction))
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     save_pictures(built, looked.views, out)
@@ -155,10 +153,10 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
             "warning: nothing tells the scale: poses and velocities are in units of the map; give "
             "--markers, or --point and --distance"
         )
-    out, images = shlex.quote(str(args.out)), shlex.quote(str(args.images))
+    out = shlex.quote(str(args.out))
     print(
-        f"next: rs_localizer detect {images} --features sift --out seen && rs_localizer replay seen "
-        f"--params {out}/{PARAMETERS} --map {out}/{MAP} --out poses"
+        "next, for images of another walk: rs_localizer detect IMAGES --features sift --out seen "
+        f"&& rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out poses"
     )
 
 

@@ -60,7 +60,8 @@ def look_at_images(args: argparse.Namespace, looker: Looker, scan_direction: str
     wanted = sorted({seconds for _, seconds, _, _ in args.point})
     cameras, camera = Cameras(scan_direction), None
     views: list[View] = []
-    images, refused, stamps, named = 0, {}, [], {}
+    images, stamps = 0, list[int]()
+    refused, named = dict[str, str](), dict[float, int]()
     with opened(args) as source, tqdm(
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
@@ -83,7 +84,8 @@ def look_at_images(args: argparse.Namespace, looker: Looker, scan_direction: str
             if asked or _due(image, views, args.images_per_second):
                 views.append(looker.look(image))
     if camera is None:
-        raise ValueError(f"{args.images} has no image that can be read; {'; '.join(refused.values())}")
+        why = "; ".join(refused.values())
+        raise ValueError(f"{args.images} has no image that can be read; {why}")
     tell_left_out(refused, {})
     period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.nan
     for fault in time_faults(args, source.clock, period):

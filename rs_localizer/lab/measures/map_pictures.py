@@ -1,4 +1,4 @@
-"""Pictures of a map that was built: landmarks and cameras from above, residuals of both shutters."""
+"""Pictures of a map that was built: landmarks and cameras, residuals before and after."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def save_pictures(built: Built, views: Sequence[View], directory: Path) -> None:
 def _scene(axes: Axes, built: Built, pair: tuple[int, int], title: str) -> None:
     a, b = pair
     points, cameras = built.landmarks.points, built.positions
-    axes.scatter(points[:, a], points[:, b], s=1.0, color="#8a8a8a", linewidths=0, label="landmarks")
+    axes.scatter(
+        points[:, a], points[:, b], s=1.0, color="#8a8a8a", linewidths=0, label="landmarks"
+    )
     axes.plot(cameras[:, a], cameras[:, b], ".", markersize=3, color=BLUE, label="camera")
     low, high = np.percentile(np.vstack([points, cameras]), [_RARE, 100.0 - _RARE], axis=0)
     size = float(np.max(high - low))
@@ -68,7 +70,7 @@ def _residuals(axes: Axes, built: Built, views: Sequence[View]) -> None:
     ):
         shares = np.full(len(values), 100.0 / len(values))
         label = f"{name}, median {np.median(values):.2f} px"
-        axes.hist(values, edges, weights=shares, color=color, alpha=0.65, label=label)
+        axes.hist(values, edges.tolist(), weights=shares, color=color, alpha=0.65, label=label)
     axes.set(xlabel="residual of a keypoint (px)", ylabel="keypoints (%)")
     axes.legend(frameon=False)
 

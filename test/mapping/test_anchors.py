@@ -1,0 +1,91 @@
+"""Scale and place of a map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.mapping.anchors import Anchors, Distance, PointSight, place
+from rs_localizer.mapping.errors import MappingError
+from rs_localizer.mapping.similarity import Similarity
+from rs_localizer.mapping.triangulation import Triangulated
+from rs_localizer.markers.maps import MarkerMap, wall
+
+WALL = MarkerMap(wall("4x4_50", (3, 2), 0.2, 0.1))
+TO_MAP = Similarity(0.4, Rotation.from_euler("xyz", [30, 40, 50], degrees=True).as_matrix(), np.ones(3))
+# A camera that is held level, and nods and turns about the vertical of its own frame (y down).
+HELD = Rotation.from_euler("YX", [[a, b] for a in (0, 50, 200) for b in (-20, 5)], degrees=True)
+
+
+def found(points: np.ndarray, counts: int = 9) -> Triangulated:
+    count = len(points)
+    return Triangulated(points, np.tile(np.eye(3), (count, 1, 1)), np.full(count, counts), 0.1)
+
+
+def back(points: np.ndarray) -> np.ndarray:
+    """Where points of the map are before it is placed."""
+    return (points - TO_MAP.translation) @ TO_MAP.rotation / TO_MAP.scale
+
+
+def placed(anchors: Anchors, points: np.ndarray, counts: int = 9):
+    return place(anchors, found(points, counts), HELD.as_matrix(), np.zeros((6, 3)))
+
+
+def test_markers_give_frame_and_scale() -> None:
+    placement = placed(Anchors(WALL), back(WALL.points))
+    assert placement.scaled
+    assert placement.levelled
+    assert np.allclose(placement.similarity(back(WALL.points)), WALL.points)
+
+
+def test_corners_that_are_not_seen_do_not_count() -> None:
+    points = back(WALL.points)
+    points[8:] = np.nan
+    assert placed(Anchors(WALL), points).similarity.scale == pytest.approx(TO_MAP.scale)
+    points[3:] = np.nan
+    with pytest.raises(MappingError, match="3 corners"):
+        placed(Anchors(WALL), points)
+
+
+def test_a_wrong_marker_map_is_refused() -> None:
+    points = back(WALL.points)
+    points[:4] += 0.5
+    with pytest.raises(MappingError, match="do not lie where their map says"):
+        placed(Anchors(WALL), points)
+
+
+def sights(*names: str) -> tuple[PointSight, ...]:
+    return tuple(PointSight(name, view, (1.0, 2.0)) for name in names for view in (0, 1))
+
+
+def test_a_distance_gives_the_scale() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    placement = placed(Anchors(None, sights("a", "b"), (Distance("a", "b", 3.0),)), points)
+    assert placement.scaled
+    assert not placement.levelled
+    assert placement.similarity.scale == pytest.approx(1.5)
+    # Without anything better, the picture's rows are level: y of the camera's frame is down.
+    assert np.allclose(placement.similarity.rotation @ [0.0, 1.0, 0.0], [0.0, 0.0, -1.0])
+
+
+def test_distances_that_contradict_each_other_are_refused() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [1.0, 0.0, 0.0]])
+    given = (Distance("a", "b", 3.0), Distance("a", "c", 1.7))
+    with pytest.raises(MappingError, match=r"contradict each other by 13\.3 %"):
+        placed(Anchors(None, sights("a", "b", "c"), given), points)
+
+
+def test_points_that_are_missing_are_named() -> None:
+    anchors = Anchors(None, sights("a", "b"), (Distance("a", "door", 3.0),))
+    with pytest.raises(MappingError, match="no point is called door; there are a, b"):
+        placed(anchors, np.zeros((2, 3)))
+    anchors = Anchors(None, sights("a", "b"), (Distance("a", "b", 3.0),))
+    with pytest.raises(MappingError, match="two images or more"):
+        placed(anchors, np.full((2, 3), np.nan))
+
+
+def test_nothing_known_leaves_the_scale() -> None:
+    placement = placed(Anchors(), np.zeros((0, 3)))
+    assert not placement.scaled
+    assert placement.similarity.scale == 1.0
