@@ -13,7 +13,9 @@ from rs_localizer.mapping.triangulation import Triangulated
 from rs_localizer.markers.maps import MarkerMap, wall
 
 WALL = MarkerMap(wall("4x4_50", (3, 2), 0.2, 0.1))
-TO_MAP = Similarity(0.4, Rotation.from_euler("xyz", [30, 40, 50], degrees=True).as_matrix(), np.ones(3))
+TO_MAP = Similarity(
+    0.4, Rotation.from_euler("xyz", [30, 40, 50], degrees=True).as_matrix(), np.ones(3)
+)
 # A camera that is held level, and nods and turns about the vertical of its own frame (y down).
 HELD = Rotation.from_euler("YX", [[a, b] for a in (0, 50, 200) for b in (-20, 5)], degrees=True)
 

@@ -59,9 +59,7 @@ def test_what_is_not_determined_is_not_told() -> None:
     once = rows[(seen.points[rows] == 0)][:1]
     there = rows[seen.points[rows] == 1]
     kept = np.concatenate([once, np.repeat(there[:1], 5)])
-    part = Sights(
-        seen.rotations[kept], seen.positions[kept], seen.pixels[kept], seen.points[kept]
-    )
+    part = Sights(seen.rotations[kept], seen.positions[kept], seen.pixels[kept], seen.points[kept])
     assert np.isnan(triangulate(CAMERA, part, 3).points).all()
     nothing = Sights(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, int))
     assert triangulate(CAMERA, nothing, 2).points.shape == (2, 3)

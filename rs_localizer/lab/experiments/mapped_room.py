@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.write(f"{name:32} {text}\n")
     write_npz(options.out / "map.npz", built.landmarks)
     save_pictures(built, views, options.out)
-    ours, theirs = built.landmarks, without_refinement(built, views, room)
+    ours, theirs = built.landmarks, without_refinement(built)
     kept = True
     for name, piece in _FLIGHTS.items():
         with _bar(name, len(room.stamps(piece))) as step:

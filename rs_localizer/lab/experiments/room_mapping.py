@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,10 @@ from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
 from rs_localizer.lab.rendering.rooms import marked_room
 from rs_localizer.lab.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
-from rs_localizer.mapping.anchors import Anchors, place
+from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
-from rs_localizer.mapping.structure import Effort
-from rs_localizer.mapping.triangulation import Sights, triangulate
+from rs_localizer.mapping.similarity import through
+from rs_localizer.mapping.structure import Effort, Stage
 from rs_localizer.mapping.views import Looker, View
 from rs_localizer.pipeline.features import FrameExtractor, keypoints
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -67,6 +67,7 @@ class Room:
         scene = marked_room(sampled_way(self.motion))
         assert scene.marker_map is not None
         self.marker_map = scene.marker_map
+        self.planes = scene.planes
         self._renderer = Renderer(camera, scene.planes, sensor)
 
     def stamps(self, piece: Piece) -> list[int]:
@@ -94,11 +95,10 @@ class Room:
             done()
         return views
 
-    def build(self, views: Sequence[View], folder: Path, workshop_stage: Any = None) -> Built:
+    def build(self, views: Sequence[View], folder: Path, stage: Stage | None = None) -> Built:
         """The map, with its metres from the markers."""
-        stage = _silent if workshop_stage is None else workshop_stage
         given = Given(views, self.camera, Anchors(self.marker_map))
-        return build_map(given, Workshop(folder, Effort(), stage))
+        return build_map(given, Workshop(folder, Effort(), stage or _silent))
 
     def clouds(self, piece: Piece, done: Callable[[], object] = lambda: None) -> list[Any]:
         """The keypoints of a piece, as the node ``feature_detector`` sends them."""
@@ -142,19 +142,12 @@ class Room:
         return Errors(len(answers), np.array(positions), np.array(angles))
 
 
-def without_refinement(built: Built, views: Sequence[View], room: Room) -> Map:
-    """The map as a global shutter makes it: COLMAP's, laid onto the markers by its own poses."""
-    structure, anchors = built.structure, Anchors(room.marker_map)
-    rows, corners, pixels = anchors.seen(views)
-    place_of = np.minimum(np.searchsorted(structure.views, rows), len(structure.views) - 1)
-    known = structure.views[place_of] == rows
-    at = place_of[known]
-    sights = Sights(structure.rotations[at], structure.positions[at], pixels[known], corners[known])
-    still = replace(room.camera, readout_time=0.0)
-    found = triangulate(still, sights, anchors.count)
-    placement = place(anchors, found, structure.rotations, structure.positions)
-    points = placement.similarity(structure.points[built.kept])
-    return Map(points, built.landmarks.ids, built.landmarks.descriptors, built.landmarks.frame)
+def without_refinement(built: Built) -> Map:
+    """The map as a global shutter makes it: COLMAP's, laid onto the refined one as a whole."""
+    landmarks = built.landmarks
+    points = built.structure.points[built.kept]
+    laid = through(points, landmarks.points)(points)
+    return Map(laid, landmarks.ids, landmarks.descriptors, landmarks.frame)
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.measures.palette import BLUE, ORANGE
 from rs_localizer.mapping.build import Built
 from rs_localizer.mapping.views import View
@@ -91,3 +92,40 @@ def _global_errors(built: Built, views: Sequence[View]) -> Array:
     )
     errors: Array = np.linalg.norm(built.camera.project(local) - pixels, axis=1)
     return errors[np.isfinite(errors)]
+
+
+def localized_picture(
+    landmarks: Array, truth: Trajectory, estimates: Mapping[str, Trajectory]
+) -> Figure:
+    """From above: landmarks (n,3), the way of the camera and what several methods say of it.
+
+    The first method is drawn above the others.
+    """
+    figure = Figure(figsize=(10.0, 5.2), dpi=_DPI, layout="constrained")
+    for axes, near in zip(figure.subplots(1, 2), (False, True), strict=True):
+        axes.plot(
+            truth.positions[:, 0], truth.positions[:, 1], color="#c9c9c9", linewidth=5.0,
+            label="truth",
+        )  # fmt: skip
+        styles = (("x", ORANGE), (".", BLUE))[-len(estimates) :]
+        for (name, found), (marker, color) in zip(reversed(estimates.items()), styles, strict=True):
+            axes.plot(
+                found.positions[:, 0], found.positions[:, 1], marker, markersize=4.0, color=color,
+                label=name,
+            )  # fmt: skip
+        shown = truth.positions if near else np.vstack([landmarks, truth.positions])
+        low, high = np.percentile(
+            shown, [0.0 if near else _RARE, 100.0 - _RARE * (not near)], axis=0
+        )
+        if not near:
+            axes.scatter(
+                *landmarks[:, :2].T, s=2.0, color="#8a8a8a", linewidths=0, label="landmarks"
+            )
+        half, middle = 0.55 * float(np.max((high - low)[:2])), 0.5 * (low + high)
+        axes.set(
+            xlabel="x (m)", ylabel="y (m)", aspect="equal",
+            xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half),
+        )  # fmt: skip
+        axes.set_title("its way" if near else "the room from above")
+    figure.axes[0].legend(frameon=False, loc="upper right", markerscale=2.0)
+    return figure

@@ -44,9 +44,7 @@ def marked_room(way: TrueState) -> Scene:
     return Scene(tuple(planes), MarkerMap(tuple(markers)))
 
 
-def _hang(
-    texture: Image, plane: TexturedPlane, share: float, number: int, viewer: Array
-) -> Marker:
+def _hang(texture: Image, plane: TexturedPlane, share: float, number: int, viewer: Array) -> Marker:
     """Draw a marker into the picture of a plane; the marker."""
     drawn = family(_FAMILY)
     side = drawn.cells * _CELL_TEXELS

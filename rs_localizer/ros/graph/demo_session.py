@@ -75,6 +75,7 @@ class Session:
         methods: Mapping[str, Mapping[str, Any]],
         progress: Callable[[], None],
         lossless: Collection[str] = (),
+        topic: str = CORRESPONDENCES,
     ) -> dict[str, dict[int, Answer]]:
         """Every frame to every node, as fast as the slowest of them answers.
 
@@ -88,6 +89,7 @@ class Session:
             progress: called after each frame.
             lossless: methods whose nodes get the next frame only after they have answered the last
                 one, or said in their diagnostics that they will not.
+            topic: of the nodes, on which they take the recording's clouds.
 
         Returns:
             for each method its answers by the stamp of the frame.
@@ -107,8 +109,8 @@ class Session:
                 for name, parameters in methods.items():
                     listeners[name].subscribe(node, f"{self.namespace}/{name}/{NODE_NAME}")
                     given = {**shutter, **parameters}
-                    starter.submit(self._start, name, given, processes).result()
-            player = _Player(node, executor, listeners, lossless)
+                    starter.submit(self._start, name, given, topic, processes).result()
+            player = _Player(node, executor, listeners, lossless, topic)
             player.wait_for_nodes(recording, lambda: self._check(processes))
             for index in range(len(recording.clouds)):
                 if not player.play(recording, index):
@@ -126,12 +128,11 @@ class Session:
         self,
         name: str,
         parameters: Mapping[str, Any],
+        topic: str,
         processes: dict[str, subprocess.Popen[bytes]],
     ) -> None:
         remappings = [f"__ns:={self.namespace}/{name}"]
-        remappings += [
-            f"{topic}:={self.namespace}/{topic}" for topic in (CORRESPONDENCES, CAMERA_INFO)
-        ]
+        remappings += [f"{taken}:={self.namespace}/{taken}" for taken in (topic, CAMERA_INFO)]
         words = [word for remapping in remappings for word in ("-r", remapping)]
         for key, value in parameters.items():
             words += ["-p", f"{key}:={value}"]
@@ -164,17 +165,18 @@ class _Player:
         executor: SingleThreadedExecutor,
         listeners: Mapping[str, Listener],
         lossless: Collection[str],
+        topic: str,
     ) -> None:
         self._executor = executor
         self._listeners = listeners
         self._lossless = [listeners[name] for name in lossless]
         self._camera_info = node.create_publisher(CameraInfo, CAMERA_INFO, _QOS)
-        self._correspondences = node.create_publisher(PointCloud2, CORRESPONDENCES, _QOS)
+        self._clouds = node.create_publisher(PointCloud2, topic, _QOS)
 
     def wait_for_nodes(self, recording: Recording, check: Callable[[], None]) -> None:
         """Until all nodes listen, and their answers to a first frame arrive."""
         deadline = time.monotonic() + _START_TIMEOUT
-        publishers = (self._camera_info, self._correspondences)
+        publishers = (self._camera_info, self._clouds)
         while min(p.get_subscription_count() for p in publishers) < len(self._listeners):
             check()
             if time.monotonic() > deadline:
@@ -221,7 +223,7 @@ class _Player:
         self._camera_info.publish(info)
         for listener in self._listeners.values():
             listener.expect(stamp)
-        self._correspondences.publish(cloud)
+        self._clouds.publish(cloud)
         everybody = self._listeners.values()
         return self._spin_until(lambda: all(item.has(stamp) for item in everybody), self._timeout())
 

@@ -1,0 +1,141 @@
+"""A small rendered room, mapped from a few images and used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rs_localizer import data
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.lab.experiments.room_mapping import Errors, Piece, Room, without_refinement
+from rs_localizer.lab.rendering.renderer import ImageSettings
+from rs_localizer.mapping.build import Built
+from rs_localizer.mapping.report import written
+from rs_localizer.mapping.similarity import through
+from rs_localizer.mapping.structure import DATABASE, SPARSE
+from rs_localizer.mapping.views import View
+
+pytest.importorskip("pycolmap")
+
+K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(320, 240, K, readout_time=0.03)
+WALK = Piece(37.4, 2.2, 12.0)
+# Between the images of the walk, and faster ones.
+OTHERS = Piece(37.55, 1.9, 5.0)
+
+
+@pytest.fixture(scope="module")
+def room() -> Room:
+    trajectory = read_tum(data.path(data.HAND_MOTION))
+    return Room(trajectory, CAMERA, ImageSettings(noise=2.0), keypoints=300)
+
+
+@pytest.fixture(scope="module")
+def views(room: Room) -> list[View]:
+    return room.look(WALK)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("colmap")
+
+
+@pytest.fixture(scope="module")
+def stages() -> dict[str, int]:
+    return {}
+
+
+@pytest.fixture(scope="module")
+def built(room: Room, views: list[View], folder: Path, stages: dict[str, int]) -> Built:
+    @contextmanager
+    def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
+        stages[name] = 0
+
+        def step(count: int) -> None:
+            stages[name] += count
+
+        yield step
+        assert stages[name] <= total
+
+    return room.build(views, folder, stage)
+
+
+def test_the_map_is_where_the_room_is(room: Room, built: Built) -> None:
+    """In metres, in the markers' frame: landmarks lie on the walls."""
+    distances = np.min(
+        [np.abs((built.landmarks.points - p.corner) @ p.normal) for p in room.planes], axis=0
+    )
+    assert len(built.landmarks) > 100
+    assert np.median(distances) < 0.02
+    covariances = built.landmarks.covariances
+    assert covariances is not None
+    assert np.all(np.linalg.eigvalsh(covariances) > 0.0)
+
+
+def truth(room: Room, views: list[View], built: Built) -> tuple[Array, Array]:
+    """Where the camera was in the map and in the room (g,3), at the middle rows."""
+    times, positions, _ = built.middle_rows([view.stamp_ns for view in views])
+    true = [room.motion.state(int(time), np.zeros(1)).positions[0] for time in times]
+    return positions, np.array(true)
+
+
+def test_the_way_of_the_camera_has_the_right_shape_and_size(
+    room: Room, views: list[View], built: Built
+) -> None:
+    positions, true = truth(room, views, built)
+    assert len(positions) > 0.9 * len(views)
+    to_room = through(positions, true)
+    assert to_room.scale == pytest.approx(1.0, abs=0.02)
+    assert np.median(np.linalg.norm(to_room(positions) - true, axis=1)) < 0.01
+
+
+def test_other_images_are_localized(room: Room, views: list[View], built: Built) -> None:
+    """Without markers; better than with a global shutter all the way.
+
+    The two markers that are seen hang on one wall: the map is laid onto the room by its camera.
+    """
+    to_room = through(*truth(room, views, built))
+    clouds = room.clouds(OTHERS)
+
+    def errors(landmarks: Map, solver: str) -> Errors:
+        laid = Map(to_room(landmarks.points), None, landmarks.descriptors, "map")
+        return room.errors(room.localized(clouds, laid, solver))
+
+    ours = errors(built.landmarks, "r6p_vcwt")
+    theirs = errors(without_refinement(built), "p3p")
+    assert ours.share > 0.9
+    assert np.median(ours.positions) < 0.01
+    assert np.median(ours.angles) < 0.2
+    assert np.median(theirs.positions) > 2.0 * np.median(ours.positions)
+
+
+def test_the_refinement_lowers_the_noise(built: Built) -> None:
+    assert built.refined.after < 0.6 * built.refined.before
+
+
+def test_each_stage_tells_how_far_it_is(built: Built, stages: dict[str, int]) -> None:
+    assert set(stages) == {"match", "map", "follow", "refine"}
+    assert min(stages.values()) > 0
+
+
+def test_the_report_says_it(built: Built) -> None:
+    page = written(built, 60, 27)
+    assert "| scale | " in page
+    assert "corners of markers" in page
+    assert "![map.png](map.png)" in page
+
+
+def test_the_model_of_colmap_can_be_read(built: Built, folder: Path) -> None:
+    """With its descriptors; nothing else is left behind."""
+    assert sorted(item.name for item in folder.iterdir()) == [DATABASE, SPARSE]
+    read = read_map_file(folder / SPARSE, "map")
+    assert len(read) == len(built.structure.points)
+    assert read.descriptors is not None
