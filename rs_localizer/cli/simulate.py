@@ -26,7 +26,7 @@ from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
 from rs_localizer.io.whole import whole
 from rs_localizer.lab.rendering.image_sequence import FORMATS, Encoding, rendered_frames
 from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
-from rs_localizer.lab.rendering.walls import SCENES
+from rs_localizer.lab.rendering.rooms import SCENES
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.lab.simulation.landmarks import described, keypoint_rows
 from rs_localizer.lab.simulation.recording import write_rendered, write_simulated
@@ -66,7 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=list(SCENES),
         default=next(iter(SCENES)),
         help="three: walls of markers at right angles, with their map; "
-        "poster, room: generated pictures (default: %(default)s)",
+        "poster, room: generated pictures; marked_room: with a few markers on its walls (default: "
+        "%(default)s)",
     )
     option(images, "--exposure", number(0.0), pictures.exposure, "S", "of a row: motion blur")
     option(images, "--grey-noise", number(0.0), pictures.noise, "GREY", "deviation, of 255")
@@ -163,7 +164,7 @@ def _write_images(args: argparse.Namespace) -> None:
     if scene.marker_map is None:
         print(said)
         return
-    print(f"{said}, {len(scene.marker_map.markers)} markers on three walls")
+    print(f"{said}, {len(scene.marker_map.markers)} markers on the walls")
     out = shlex.quote(str(args.out))
     found = shlex.quote(f"{args.out}_markers")
     print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {found}")

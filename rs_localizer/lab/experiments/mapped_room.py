@@ -79,8 +79,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _table(found: dict[str, Errors]) -> str:
-    lines = [f"  {'map, solver':26}{'localized':>11}{'position, median':>18}{'95 %':>10}"
-             f"{'orientation':>14}{'95 %':>10}"]  # fmt: skip
+    title = f"  {'map, solver':26}{'localized':>11}{'position, median':>18}{'95 %':>10}"
+    lines = [f"{title}{'orientation':>14}{'95 %':>10}"]
     for name, errors in found.items():
         position = 1e3 * np.percentile(errors.positions, [50.0, 95.0])
         angle = np.percentile(errors.angles, [50.0, 95.0])

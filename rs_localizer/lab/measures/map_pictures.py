@@ -108,7 +108,9 @@ def localized_picture(
             label="truth",
         )  # fmt: skip
         styles = (("x", ORANGE), (".", BLUE))[-len(estimates) :]
-        for (name, found), (marker, color) in zip(reversed(estimates.items()), styles, strict=True):
+        for (name, found), (marker, color) in zip(
+            reversed(list(estimates.items())), styles, strict=True
+        ):
             axes.plot(
                 found.positions[:, 0], found.positions[:, 1], marker, markersize=4.0, color=color,
                 label=name,

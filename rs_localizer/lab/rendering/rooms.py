@@ -9,7 +9,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.video import Image
 from rs_localizer.lab.rendering.planes import TexturedPlane
-from rs_localizer.lab.rendering.walls import Scene, room
+from rs_localizer.lab.rendering.walls import Scene, poster, room, three_walls
 from rs_localizer.lab.simulation.true_motion import TrueState
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import family
@@ -42,6 +42,10 @@ def marked_room(way: TrueState) -> Scene:
             markers.append(_hang(texture, plane, share, len(markers), middle))
         planes.append(replace(plane, texture=texture))
     return Scene(tuple(planes), MarkerMap(tuple(markers)))
+
+
+SCENES = {"three": three_walls, "poster": poster, "room": room, "marked_room": marked_room}
+"""All scenes by name, the first one unless another is wanted."""
 
 
 def _hang(texture: Image, plane: TexturedPlane, share: float, number: int, viewer: Array) -> Marker:

@@ -115,9 +115,6 @@ def room(way: TrueState) -> Scene:
     return Scene(tuple(planes))
 
 
-SCENES = {"three": three_walls, "poster": poster, "room": room}
-
-
 def _box(way: TrueState, turned: float) -> _Box:
     """The camera's way in axes that its mean horizontal gaze makes, turned about the vertical."""
     gaze = way.rotations[:, :2, 2].mean(axis=0)

@@ -10,7 +10,8 @@ from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.rendering.renderer import Renderer
-from rs_localizer.lab.rendering.walls import SCENES, three_walls
+from rs_localizer.lab.rendering.rooms import SCENES
+from rs_localizer.lab.rendering.walls import three_walls
 from rs_localizer.lab.simulation.true_motion import (
     ConstantVelocity,
     RecordedMotion,
