@@ -9,12 +9,13 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from rs_localizer.solvers.table import SOLVERS
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
 D = np.array([-0.1, 0.02, 0.001, 0.001, 0.0])
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 READOUT = 0.03
-ROLLING = ["r6p", "r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p", "joint"]
+ROLLING = [name for name, row in SOLVERS.items() if row.rolling_shutter]
 
 
 def camera(**changes):

@@ -54,7 +54,7 @@ class Input:
     read: Callable[[Any], Any] = _as_it_is
     said: str = ""  # what a user is told that is missing
     necessary: bool = False  # without it no frame can be localized
-    only_with: str = ""  # the input without which this one is of no use
+    needs: str = ""  # of frames: the input that has to come first, and that only they use
     latched: bool = False  # who comes late wants the last message, too
     lasting: bool = False  # one message is enough
     # Of what comes with every image, and only its stamp is new: what the localizer has of it.
@@ -96,7 +96,6 @@ _ROWS = (
         use=lambda localizer, landmarks: localizer.use_map(landmarks),
         refused="bad_map",
         said="a map",
-        only_with=topics.KEYPOINTS,
         latched=True,
         lasting=True,
         help="the map of the keypoints",
@@ -123,6 +122,7 @@ _ROWS = (
         Role.FRAMES,
         use=lambda localizer, message: localizer.localize_keypoints(message),
         refused="bad_keypoints",
+        needs=topics.MAP_POINTS,
         help="instead of correspondences",
     ),
 )
