@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.types import Failure, Reason
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Failure
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior
 

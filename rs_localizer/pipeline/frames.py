@@ -6,10 +6,10 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from rs_localizer.config import MatchBy, NodeConfig
+from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration
@@ -26,9 +26,9 @@ from rs_localizer.pipeline.landmarks import Landmarks
 from rs_localizer.pipeline.maps import read_landmarks
 from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
 from rs_localizer.pipeline.oddities import oddities
-from rs_localizer.pipeline.published import NO_TRANSFORM, of_body, of_camera
+from rs_localizer.pipeline.published import of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.succession import Succession
 
 
@@ -41,12 +41,7 @@ class FrameLocalizer:
 
     Args:
         config: settings; assigning :attr:`config` changes them from the next frame on.
-        notice: told of what is odd but no refusal, by a name and one sentence: ``time_went_back``
-            (a recording that starts over), ``map_changed`` (another frame of the points),
-            ``map_replaced``, ``map_incomplete``, ``camera_changed``, ``too_many_keypoints``,
-            ``readout_time`` (the motion contradicts it, or it was estimated), a
-            :class:`rs_localizer.pipeline.reasons.ImuReason` and those of
-            :func:`rs_localizer.pipeline.oddities.oddities`. Frames are localized all the same.
+        notice: told of what is odd but no refusal.
         transforms: where the camera is on ``base_frame``; asked once a frame, so that a mounting
             may change and move. Without it there is none.
 
@@ -57,7 +52,7 @@ class FrameLocalizer:
     def __init__(
         self,
         config: NodeConfig,
-        notice: Callable[[str, str], None] = lambda name, text: None,
+        notice: Notify = unheard,
         transforms: Transforms | None = None,
     ) -> None:
         self._notice = notice
@@ -131,7 +126,7 @@ class FrameLocalizer:
         before, self._calibration = self._calibration, calibration
         if before is not None:
             self._notice(
-                "camera_changed",
+                Notice.CAMERA_CHANGED,
                 f"camera_info changed from {before.frame!r}, {before.width} x {before.height}, "
                 f"to {calibration.frame!r}, {calibration.width} x {calibration.height}; the "
                 "previous frames are forgotten (if it goes to and fro, two cameras publish it)",
@@ -165,9 +160,9 @@ class FrameLocalizer:
         try:
             cloud = read_correspondences(message)
         except EmptyCloudError as error:
-            return Refusal("empty_cloud", str(error))
+            return Refusal(Reason.EMPTY_CLOUD, str(error))
         except MessageError as error:
-            return Refusal("bad_cloud", str(error))
+            return Refusal(Reason.BAD_CLOUD, str(error))
         self._follow(cloud.stamp_ns, cloud.frame)
         result = self._localize(cloud)
         if result:
@@ -183,9 +178,9 @@ class FrameLocalizer:
         try:
             keypoints = read_keypoints(message)
         except EmptyCloudError as error:
-            return Refusal("empty_cloud", str(error))
+            return Refusal(Reason.EMPTY_CLOUD, str(error))
         except MessageError as error:
-            return Refusal("bad_keypoints", str(error))
+            return Refusal(Reason.BAD_KEYPOINTS, str(error))
         if self.map is not None:
             self._follow(keypoints.stamp_ns, self.map.frame)
         by = self._landmarks.how(keypoints, self.config.matching)
@@ -196,7 +191,7 @@ class FrameLocalizer:
             prior = tracker.prediction(self._method.middle_row_ns(keypoints.stamp_ns))
             result = None if prior is None else self._localize_by_map(keypoints, prior)
             # Without its mounting a pose is none the worse.
-            if result or (result is not None and result.reason == NO_TRANSFORM):
+            if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
                 return result
         return self._localize_by_map(keypoints, None)
 
@@ -207,7 +202,7 @@ class FrameLocalizer:
 
     def _localize(self, cloud: Correspondences) -> Localized | Refusal:
         if self._calibration is None:
-            return Refusal("no_camera_info", "no usable camera_info has come yet")
+            return Refusal(Reason.NO_CAMERA_INFO, "no usable camera_info has come yet")
         method, frame = self._method, self._calibration.frame
         for name, text in oddities(cloud, method.camera, frame).items():
             self._notice(name, text)
@@ -221,7 +216,7 @@ class FrameLocalizer:
                 method.tracker, method.config, time_ns, frame, self.transforms, given
             )
         if not result:
-            return Refusal(str(result.reason), result.detail)
+            return Refusal(result.reason, result.detail)
         localized = of_camera(cloud, result, method.config, method.camera, frame)
         self._watch_readout(cloud, result)
         return self.mounted(localized)

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from rs_localizer import matching
 from rs_localizer.config import MatchBy, Matching
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.matching import Matcher, MatchError
 from rs_localizer.pipeline.maps import oddities_of_map
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Notify, Refusal
 
 
 class Landmarks:
     """The map that keypoints are matched with, as soon as there is one.
 
     Args:
-        notice: told, by a name and one sentence, what is odd: those of
-            :func:`rs_localizer.pipeline.maps.oddities_of_map`, and ``too_many_keypoints``.
+        notice: told what is odd.
     """
 
-    def __init__(self, notice: Callable[[str, str], None]) -> None:
+    def __init__(self, notice: Notify) -> None:
         self._notice = notice
         self._matcher: Matcher | None = None
         self.lacking = False
@@ -49,14 +47,16 @@ class Landmarks:
         """By what they can be matched."""
         if self._matcher is None:
             self.lacking = True
-            return Refusal("no_map", "no usable map has come yet, on map_points or as map_file")
+            return Refusal(
+                Reason.NO_MAP, "no usable map has come yet, on map_points or as map_file"
+            )
         try:
             by = self._matcher.choose(keypoints, settings)
         except MatchError as error:
-            return Refusal("bad_keypoints", str(error))
+            return Refusal(Reason.BAD_KEYPOINTS, str(error))
         if by == MatchBy.DESCRIPTOR and len(keypoints) > settings.max_keypoints:
             self._notice(
-                "too_many_keypoints",
+                Notice.TOO_MANY_KEYPOINTS,
                 f"{len(keypoints)} keypoints have come, matching.max_keypoints of them, "
                 f"{settings.max_keypoints}, are matched",
             )
@@ -70,7 +70,7 @@ class Landmarks:
         matches = self._matcher.match(keypoints, settings, camera, prior)
         if len(matches) == 0:
             return Refusal(
-                "no_matches",
+                Reason.NO_MATCHES,
                 f"none of {len(keypoints)} keypoints matches one of {len(self._matcher.map)} "
                 f"landmarks by {matches.by}",
             )

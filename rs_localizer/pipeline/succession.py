@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from rs_localizer.core.reasons import Notice
+
 
 class Succession:
     """Remembers the stamp of the last frame and the frame of its points."""
@@ -13,8 +15,8 @@ class Succession:
         """The next frame is the first."""
         self._last = None
 
-    def breaks(self, stamp_ns: int, frame: str) -> dict[str, str]:
-        """Why the next frame cannot follow, sentences by name; it is the last one now.
+    def breaks(self, stamp_ns: int, frame: str) -> dict[Notice, str]:
+        """Why the next frame cannot follow, a sentence each; it is the last one now.
 
         Args:
             stamp_ns: of its image.
@@ -24,14 +26,14 @@ class Succession:
         if last is None:
             return {}
         last_ns, last_frame = last
-        found = {}
+        found: dict[Notice, str] = {}
         if stamp_ns < last_ns:
-            found["time_went_back"] = (
+            found[Notice.TIME_WENT_BACK] = (
                 f"the stamp {stamp_ns * 1e-9:.3f} s lies {(last_ns - stamp_ns) * 1e-9:.3f} s "
                 "before the last one; the previous frames are forgotten"
             )
         if frame != last_frame:
-            found["map_changed"] = (
+            found[Notice.MAP_CHANGED] = (
                 f"the points are in frame {frame!r}, the last ones were in {last_frame!r}; "
                 "the previous frames are forgotten"
             )

@@ -14,8 +14,9 @@ import rs_localizer.pipeline.method
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info

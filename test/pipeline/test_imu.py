@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.config import Imu, NodeConfig
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.estimates import read_motions
@@ -26,7 +27,6 @@ from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.offline.imu_first import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
 from rs_localizer.pipeline.imu import ImuState
-from rs_localizer.pipeline.reasons import ImuReason
 
 READOUT_TIME = 0.03
 CONFIG = NodeConfig(readout_time=READOUT_TIME)
