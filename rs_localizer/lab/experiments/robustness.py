@@ -17,14 +17,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    Table,
-    judge,
-    judge_intervals,
-)
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.experiments.uncertainty import CONFIDENCE, Interval, share, together
 from rs_localizer.lab.experiments.views import (
     GROSS,
@@ -228,11 +221,12 @@ def _scores(case: Case, inliers: BoolArray, rng: np.random.Generator) -> Array |
 
 
 def _hard(found: Found) -> Claim:
-    return judge_intervals(
+    return Statement(
         "robustness.uniform_70",
         "this project",
         "70 % uniform outliers are borne",
         f"at least {_FOUND:.0%} of the frames localized correctly",
+    ).judged_by(
         f"{found.correct.share()}, median error {found.median:.2f} of the bound",
         [found.correct],
         (_FOUND, 1.0),
@@ -240,11 +234,12 @@ def _hard(found: Found) -> Claim:
 
 
 def _hard_time(found: Found) -> Claim:
-    return judge(
+    return Statement(
         "robustness.uniform_70_time",
         "this project",
         "70 % uniform outliers do not take long",
         f"median at most {_MOST_MS:g} ms",
+    ).judged(
         f"{found.milliseconds:.1f} ms",
         found.milliseconds <= _MOST_MS,
         "the machine had other work, or is of another kind",
@@ -253,11 +248,12 @@ def _hard_time(found: Found) -> Claim:
 
 def _localized(found: Found) -> Claim:
     case = found.case
-    return judge_intervals(
+    return Statement(
         f"robustness.{case.name}",
         "this project",
         f"localized correctly: {case.label}",
         f"at least {case.at_least:.0%} of the frames",
+    ).judged_by(
         f"{found.correct.share()}, median error {found.median:.2f} of the bound",
         [found.correct],
         (case.at_least, 1.0),
@@ -268,11 +264,12 @@ def _none_wrong(found: Sequence[Found]) -> Claim:
     wrong = {one.case.name: one.wrong(together(len(found))) for one in found}
     some = {name: interval for name, interval in wrong.items() if interval.value > 0.0}
     listed = ", ".join(f"{name} {interval.value:.1%}" for name, interval in some.items())
-    return judge_intervals(
+    return Statement(
         "robustness.none_wrong",
         "this project",
         "where there is no good pose, none is published",
         f"at most {_MOST_WRONG:.0%} of the frames of each kind have a wrong one",
+    ).judged_by(
         listed or "none at all",
         list(wrong.values()),
         (0.0, _MOST_WRONG),

@@ -1,7 +1,7 @@
 """What a limited number of trials can say: intervals around shares, medians and ratios.
 
 Intervals hold the true figure with a stated confidence, and verdicts are read off them
-(:func:`rs_localizer.lab.experiments.results.judge_intervals`). Trials that share a recording are
+(:func:`rs_localizer.lab.experiments.results.Statement.judged_by`). Trials that share a recording are
 not independent: ``groups`` names the recording of each.
 """
 

@@ -19,7 +19,7 @@ from rs_localizer.lab.experiments.inertial.recordings import (
     follow,
     record,
 )
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.lab.independent.frames import MakeMotions
 from rs_localizer.lab.independent.gyroscopes import Imu
@@ -91,32 +91,45 @@ def _judge_vibration(noise: float, found: dict[str, Scores]) -> list[Claim]:
     localized, angular = percent(shaken.localized), shaken.median("angular")
     alone = found["shaken/alone"]
     return [
-        judge(
-            f"inertial.vibration-{noise:g}px-localized", _US,
-            f"Vibration leaves the frames localized ({noise:g} px)", "at least 97 %",
-            f"{localized:.1f} % (alone {percent(alone.localized):.1f} %)", localized >= 97.0,
+        Statement(
+            f"inertial.vibration-{noise:g}px-localized",
+            _US,
+            f"Vibration leaves the frames localized ({noise:g} px)",
+            "at least 97 %",
+        ).judged(
+            f"{localized:.1f} % (alone {percent(alone.localized):.1f} %)",
+            localized >= 97.0,
         ),
-        judge(
-            f"inertial.vibration-{noise:g}px-orientation", _US,
+        Statement(
+            f"inertial.vibration-{noise:g}px-orientation",
+            _US,
             f"Vibration hardly costs orientation ({noise:g} px)",
             "at most 1.3 times the error of the camera alone without vibration",
+        ).judged(
             f"{ratio:.2f} times {still.median('orientation'):.4f} deg (alone "
             f"{alone.median('orientation') / still.median('orientation'):.2f} times)",
             ratio <= 1.3,
         ),
-        judge(
-            f"inertial.vibration-{noise:g}px-rate", _US,
-            f"The angular velocity is that of the vibration ({noise:g} px)", "at most 3 deg/s",
-            f"{angular:.2f} deg/s (alone {alone.median('angular'):.1f} deg/s)", angular <= 3.0,
+        Statement(
+            f"inertial.vibration-{noise:g}px-rate",
+            _US,
+            f"The angular velocity is that of the vibration ({noise:g} px)",
+            "at most 3 deg/s",
+        ).judged(
+            f"{angular:.2f} deg/s (alone {alone.median('angular'):.1f} deg/s)",
+            angular <= 3.0,
         ),
-        judge(
-            f"inertial.vibration-{noise:g}px-coverage", _US,
-            f"Regions hold under vibration ({noise:g} px)", "at least 93 % of poses and twists",
+        Statement(
+            f"inertial.vibration-{noise:g}px-coverage",
+            _US,
+            f"Regions hold under vibration ({noise:g} px)",
+            "at least 93 % of poses and twists",
+        ).judged(
             f"poses {percent(shaken.inside('pose')):.1f} %, twists "
             f"{percent(shaken.inside('twist')):.1f} %",
             min(percent(shaken.inside(part)) for part in ("pose", "twist")) >= 93.0,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _offsets(context: Context) -> _Step:
@@ -130,11 +143,15 @@ def _offsets(context: Context) -> _Step:
         errors = 1e3 * (np.array(followed.time_offsets) - _OFFSET)
         worst = max(worst, float(np.abs(errors).max()))
         rows.append((name, float(np.abs(errors).max()), *_figures(followed.scores)))
-    claim = judge(
-        "inertial.offset", _US, "Stamps that are 5 ms early are found out within 10 s",
-        "to 0.5 ms in every recording, with and without vibration", f"to {worst:.3f} ms",
+    claim = Statement(
+        "inertial.offset",
+        _US,
+        "Stamps that are 5 ms early are found out within 10 s",
+        "to 0.5 ms in every recording, with and without vibration",
+    ).judged(
+        f"to {worst:.3f} ms",
         worst <= 0.5,
-    )  # fmt: skip
+    )
     return "offset", Table(("motion", "ms off", *_COLUMNS), rows), [claim]
 
 
@@ -158,19 +175,27 @@ def _planes(context: Context) -> _Step:
     }
     held = percent(hits[True])
     claims = [
-        judge(
-            "inertial.planes-coverage", _US, "Regions hold before small planes",
+        Statement(
+            "inertial.planes-coverage",
+            _US,
+            "Regions hold before small planes",
             "93 to 97 % of the poses of single frames",
-            f"{held:.1f} % (alone {percent(hits[False]):.1f} %)", 93.0 <= held <= 97.0,
+        ).judged(
+            f"{held:.1f} % (alone {percent(hits[False]):.1f} %)",
+            93.0 <= held <= 97.0,
             "the pose mirrored on the plane and the typical speed are averaged, and a prior that "
             "allows for a camera that walks is wide for one that rests",
         ),
-        judge(
-            "inertial.planes-error", _US, "A gyroscope makes poses before small planes better",
+        Statement(
+            "inertial.planes-error",
+            _US,
+            "A gyroscope makes poses before small planes better",
             "smaller errors of the orientation, mean of the medians",
-            f"{errors[True]:.3f} deg, alone {errors[False]:.3f} deg", errors[True] < errors[False],
+        ).judged(
+            f"{errors[True]:.3f} deg, alone {errors[False]:.3f} deg",
+            errors[True] < errors[False],
         ),
-    ]  # fmt: skip
+    ]
     return "planes", Table(("condition", *_COLUMNS), rows), claims
 
 
@@ -217,12 +242,13 @@ def _few_points(context: Context) -> _Step:
         ]
         share = percent(_right(aided))
         claims.append(
-            judge(
+            Statement(
                 f"inertial.few-{few}",
                 _US,
                 f"{few} right matches among as many wrong ones are enough for the solver that is "
                 "there (r6p_vcwt on steadied bearings)",
                 "at least 95 % of the frames within 1 deg",
+            ).judged(
                 f"{share:.0f} % (alone {percent(_right(alone)):.0f} %)",
                 share >= 95.0,
                 "a pose of so few points may be refused, as it should be, whoever proposes it",
@@ -240,13 +266,17 @@ def _cost(context: Context) -> _Step:
         (_who(which), 1e3 * float(np.median(f.seconds)), *_figures(f.scores))
         for which, f in ((False, alone), (True, aided))
     ]
-    claim = judge(
-        "inertial.cost", _US, "A gyroscope costs little time",
+    claim = Statement(
+        "inertial.cost",
+        _US,
+        "A gyroscope costs little time",
         f"a tracked frame of 80 points takes at most {_MOST_COST:g} times as long",
-        f"{ratio:.2f} times", ratio <= _MOST_COST,
+    ).judged(
+        f"{ratio:.2f} times",
+        ratio <= _MOST_COST,
         "integration, filter and steadied bearings are 0.5 ms beside a frame of 1.4 ms, whatever "
         "the number of points",
-    )  # fmt: skip
+    )
     return "cost", Table(("condition", "ms", *_COLUMNS), rows), [claim]
 
 
