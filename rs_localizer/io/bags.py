@@ -139,7 +139,7 @@ def _storage(path: Path) -> Path:
     if not path.is_dir():
         if path.suffix not in SUFFIXES:
             raise BagError(
-                f"{path} is no recording: expected a rosbag2 directory or a file ending in "
+                f"{path} is not a recording: expected a rosbag2 directory or a file ending in "
                 f"{', '.join(SUFFIXES)}"
             )
         if path.stat().st_size == 0:
@@ -151,7 +151,7 @@ def _storage(path: Path) -> Path:
     files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
     if len(files) != 1:
         raise BagError(
-            f"{path} is no recording: the directory has no metadata.yaml and "
+            f"{path} is not a recording: the directory has no metadata.yaml and "
             f"{len(files)} files ending in {', '.join(SUFFIXES)}"
         )
     return files[0]

@@ -102,7 +102,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def holds_images(path: Path) -> str:
-    """What a path that is no recording holds of images, as ``is a video``; empty: nothing."""
+    """What a path that is not a recording holds of images, as ``is a video``; empty: nothing."""
     if path.is_dir():
         found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
         return f"is a folder of {found} images" if found else ""

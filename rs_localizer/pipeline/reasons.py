@@ -54,7 +54,7 @@ REASONS: dict[str, Meaning] = {
     ),
     Reason.MODEL_ERROR: Meaning(
         "the errors of neighbouring points agree: vibration faster than the rows can tell, or a "
-        "map or calibration that is wrong by more than a pose could bear",
+        "map or calibration that is too far off for any pose",
         f"a stiffer mounting, the calibration, the map; {_TURNED}",
     ),
     Reason.NO_CAMERA_INFO: Meaning(
