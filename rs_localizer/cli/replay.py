@@ -12,6 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
+from rs_localizer.cli.replay_exports import add_export_arguments, write_exports
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -87,6 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="one motion through all images, from those before and after each; images without a "
         f"pose are bridged where their neighbours determine them, and listed in {BRIDGED}",
     )
+    add_export_arguments(offline)
     offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
     graph = parser.add_argument_group("through the ROS graph")
     graph.add_argument(
@@ -171,16 +173,18 @@ def _check_usage(args: argparse.Namespace) -> None:
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
     if not args.ros:
+        if args.rate is not None and args.nerfstudio:
+            raise UsageError("--nerfstudio is of images, --rate of samples between them")
         if args.rate is not None and not args.smooth:
             raise UsageError(
                 "--rate goes with --ros or --smooth; offline replay runs at full speed"
             )
         return
     given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
-    if any(given):
+    if any((*given, args.rows, args.nerfstudio)):
         raise UsageError(
-            "--out, --overwrite, --params, --map, --smooth and -p are for offline replay; with "
-            "--ros the running node has the settings and publishes the result"
+            "--out, --overwrite, --params, --map, --smooth, --row, --nerfstudio and -p are for "
+            "offline replay; with --ros the running node has the settings and publishes the result"
         )
 
 
@@ -241,6 +245,7 @@ def _replay(
     tally.seconds = time.perf_counter() - start
     tally.imu = localizer.imu.state
     tally.repeated = write_texts(out, tally.written, localizer.config)
+    write_exports(args, bag, localizer, tally.written, out)
     return tally
 
 
