@@ -4,21 +4,16 @@ ros2 launch rs_localizer features.launch.py camera:=v4l2_camera map_file:=$PWD/m
     features:=sift readout_time:=0.02 calibration:=file://$PWD/camera.yaml
 """
 
-from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchContext, LaunchDescription
 from rs_localizer.config import FeatureConfig
 from rs_localizer.ros.launching import (
-    argument,
-    camera_arguments,
     camera_driver,
-    common_arguments,
     detector,
+    from_camera,
     given,
     localizer,
-    setting_arguments,
-    share,
     views,
 )
 from rs_localizer.settings import FEATURES_NAME
@@ -26,21 +21,7 @@ from rs_localizer.settings import FEATURES_NAME
 
 def generate_launch_description() -> LaunchDescription:
     """The nodes share a namespace, in which they find each other."""
-    common = common_arguments()
-    known = {item.name for item in common}
-    return LaunchDescription(
-        [
-            *camera_arguments(),
-            argument(
-                "features_params_file",
-                share("config", "feature_detector.yaml"),
-                "parameters of feature_detector",
-            ),
-            *common,
-            *(item for item in setting_arguments(FeatureConfig) if item.name not in known),
-            OpaqueFunction(function=_nodes),
-        ]
-    )
+    return LaunchDescription(from_camera(FeatureConfig, "features_params_file", _nodes))
 
 
 def _nodes(context: LaunchContext) -> list:

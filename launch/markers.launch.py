@@ -8,21 +8,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchContext, LaunchDescription
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.ros.launching import (
-    argument,
-    camera_arguments,
     camera_driver,
-    common_arguments,
     detector,
+    from_camera,
     given,
     localizer,
-    setting_arguments,
-    share,
     views,
 )
 from rs_localizer.settings import DETECTOR_NAME, Kind, SettingsError, load_params_file, settings
@@ -30,21 +25,7 @@ from rs_localizer.settings import DETECTOR_NAME, Kind, SettingsError, load_param
 
 def generate_launch_description() -> LaunchDescription:
     """The nodes share a namespace, in which they find each other."""
-    common = common_arguments()
-    known = {item.name for item in common}
-    return LaunchDescription(
-        [
-            *camera_arguments(),
-            argument(
-                "detector_params_file",
-                share("config", "marker_detector.yaml"),
-                "parameters of marker_detector",
-            ),
-            *common,
-            *(item for item in setting_arguments(DetectorConfig) if item.name not in known),
-            OpaqueFunction(function=_nodes),
-        ]
-    )
+    return LaunchDescription(from_camera(DetectorConfig, "detector_params_file", _nodes))
 
 
 def _nodes(context: LaunchContext) -> list:

@@ -19,8 +19,7 @@ from rs_localizer.io.yaml_text import YamlError, load_yaml
 NODE_NAME = "rs_localizer"
 DETECTOR_NAME = "marker_detector"
 FEATURES_NAME = "feature_detector"
-# The settings of each node.
-_NODES: dict[Kind, str] = {
+NODES: dict[Kind, str] = {
     NodeConfig: NODE_NAME,
     DetectorConfig: DETECTOR_NAME,
     FeatureConfig: FEATURES_NAME,
@@ -125,7 +124,7 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
     except (YamlError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
     values: dict[str, Any] = {}
-    node = _NODES[kind]
+    node = NODES[kind]
     blocks = list(_blocks(tree, "", node))
     for name, parameters in blocks:
         if not isinstance(parameters, dict):

@@ -154,7 +154,8 @@ def _detect_command(path: Path) -> str:
     seen = shlex.quote(f"{path.resolve().with_suffix('').name}_seen")
     return (
         f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {seen} (or --board "
-        f"6x4 --square 0.03 instead of --map), then: rs_localizer replay {seen}"
+        "6x4 --square 0.03, or --features sift, instead of --map), then: rs_localizer replay "
+        f"{seen}"
     )
 
 

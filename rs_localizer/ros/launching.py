@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.settings import Kind, settings
+from rs_localizer.settings import NODES, Kind, settings
 
 PACKAGE = "rs_localizer"
 # Drivers by their package, and their executables; both publish image_raw and camera_info.
@@ -119,8 +119,17 @@ def common_arguments() -> list[DeclareLaunchArgument]:
     ]
 
 
-def camera_arguments() -> list[DeclareLaunchArgument]:
-    """Of every launch file that begins with images."""
+def from_camera(kind: Kind, params_argument: str, nodes: Callable[[Any], list[Node]]) -> list[Any]:
+    """From images to poses: arguments for a camera, a detector and the localizer, and their nodes.
+
+    Args:
+        kind: the detector's settings.
+        params_argument: the launch argument that names its params file.
+        nodes: to start, when the launch context knows the arguments.
+    """
+    common = common_arguments()
+    known = {item.name for item in common}
+    name = NODES[kind]
     return [
         argument(
             "camera",
@@ -130,6 +139,10 @@ def camera_arguments() -> list[DeclareLaunchArgument]:
         argument("calibration", "", "URL of the camera's calibration, for the driver"),
         argument("image", "image_raw", "topic of the raw images (never rectified ones)"),
         argument("camera_info", "camera_info", "topic of the calibration"),
+        argument(params_argument, share("config", f"{name}.yaml"), f"parameters of {name}"),
+        *common,
+        *(item for item in setting_arguments(kind) if item.name not in known),
+        OpaqueFunction(function=nodes),
     ]
 
 
