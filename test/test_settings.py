@@ -7,7 +7,13 @@ from typing import Any
 
 import pytest
 
-from rs_localizer.config import DetectorConfig, NodeConfig, VelocityPrior, localizer_config
+from rs_localizer.config import (
+    DetectorConfig,
+    FeatureConfig,
+    NodeConfig,
+    VelocityPrior,
+    localizer_config,
+)
 from rs_localizer.settings import (
     SettingsError,
     build,
@@ -44,12 +50,18 @@ def test_the_shipped_file_names_all_choices() -> None:
         assert all(choice in line for choice in setting.choices), name
 
 
-def test_the_detectors_file_holds_exactly_its_defaults_and_choices() -> None:
-    path = SHIPPED.with_name("marker_detector.yaml")
-    values = load_params_file(path, DetectorConfig)
-    known = settings(DetectorConfig)
+@pytest.mark.parametrize(
+    ("file", "kind"),
+    [("marker_detector.yaml", DetectorConfig), ("feature_detector.yaml", FeatureConfig)],
+)
+def test_the_detectors_files_hold_exactly_their_defaults_and_choices(
+    file: str, kind: type[DetectorConfig] | type[FeatureConfig]
+) -> None:
+    path = SHIPPED.with_name(file)
+    values = load_params_file(path, kind)
+    known = settings(kind)
     assert values == {name: setting.default for name, setting in known.items()}
-    assert build(values, DetectorConfig) == DetectorConfig()
+    assert build(values, kind) == kind()
     lines = [line.strip() for line in path.read_text().splitlines()]
     for name, setting in known.items():
         line = next(line for line in lines if line.startswith(f"{name}:"))
@@ -106,14 +118,14 @@ other_node:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is no setting; did you mean 'seed'"),
-        ("/**:\n  ros__parameters:\n    colour: 5\n", "is no setting; there are solver, "),
-        ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is no setting"),
+        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is not a setting; did you mean 'seed'"),
+        ("/**:\n  ros__parameters:\n    colour: 5\n", "is not a setting; there are solver, "),
+        ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is not a setting"),
         ("/**:\n  ros__parameters: 5\n", "ros__parameters of /.* must be a mapping"),
         ("other:\n  ros__parameters:\n    seed: 5\n", "has no ros__parameters for /rs_localizer"),
         ("seed: 5\n", "has no ros__parameters"),
         ("", "has no ros__parameters"),
-        ("a: [", "is no YAML file"),
+        ("a: [", "is not a YAML file"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path: Path, text: str, fault: str) -> None:
@@ -125,7 +137,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"none\.yaml cannot be read: No such file"):
         load_params_file(tmp_path / "none.yaml")
     (tmp_path / "binary").write_bytes(b"\xff\xfe\xfa")
-    with pytest.raises(SettingsError, match="is no YAML file"):
+    with pytest.raises(SettingsError, match="is not a YAML file"):
         load_params_file(tmp_path / "binary")
 
 
@@ -171,9 +183,11 @@ def test_wrong_values(values: dict[str, Any], fault: str) -> None:
 
 def test_a_misspelled_keyword_names_the_one_that_was_meant() -> None:
     assert localizer_config({"seed": 3}).seed == 3
-    with pytest.raises(ValueError, match=r"'inlier_treshold' is no .*did you mean 'inlier_t"):
+    with pytest.raises(ValueError, match=r"'inlier_treshold' is not .*did you mean 'inlier_t"):
         localizer_config({"inlier_treshold": 2.0})
-    with pytest.raises(ValueError, match="'colour' is no setting of the localizer; there are sol"):
+    with pytest.raises(
+        ValueError, match="'colour' is not a setting of the localizer; there are sol"
+    ):
         localizer_config({"colour": 1})
     with pytest.raises(ValueError, match="solver must be one of p3p"):
         localizer_config({"solver": "p4p"})

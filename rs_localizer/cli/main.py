@@ -67,7 +67,7 @@ COMMANDS = {
     "calibrate": Command(
         "rs_localizer.cli.calibrate",
         "readout time, scan direction and lens of a camera, from a recording in which it moves",
-        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --rate 30 --out camera.yaml",
+        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --rate 30 --out shutter.yaml",
     ),
     "readout": Command(
         "rs_localizer.cli.readout",
@@ -83,6 +83,13 @@ COMMANDS = {
         "rs_localizer.cli.map",
         "what a map of landmarks holds; one file from another: COLMAP, PLY, NPZ",
         "rs_localizer map convert sparse/0 map.npz",
+    ),
+    "localize-hloc": Command(
+        "rs_localizer.cli.localize_hloc",
+        "poses and velocities of what hloc has matched, with the rolling shutter",
+        "rs_localizer localize-hloc --reference-sfm sfm --queries queries.txt "
+        "--retrieval pairs.txt --features features.h5 --matches matches.h5 --results poses.txt "
+        "-p readout_time:=0.03",
     ),
     "warm": Command(
         "rs_localizer.cli.warm",

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image, read_any_image
@@ -18,7 +19,7 @@ from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.video import read_video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
-from rs_localizer.pipeline.refusal import BAD_IMAGE, Refusal, read_or_refuse
+from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -62,7 +63,7 @@ def from_video(path: Path, camera: Camera, clock: ImageClock) -> Iterator[Shot]:
     for jpeg, gray, seconds in read_video(path):
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:
-            lost = Refusal("no_time", "OpenCV does not tell its presentation time")
+            lost = Refusal(Reason.NO_TIME, "OpenCV does not tell its presentation time")
             yield Shot(lost, make_camera_info(camera, 0), None, 0)
         else:
             yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")
@@ -80,7 +81,7 @@ def from_files(files: list[Path], camera: Camera, clock: ImageClock) -> Iterator
         stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
         header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
         message = SimpleNamespace(header=header, format=name, data=data)
-        found = read_or_refuse(read_any_image, message, BAD_IMAGE)
+        found = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
         if isinstance(found, Refusal):
             found = Refusal(found.reason, f"{file.name}: {found.detail}")
         yield _shot(found, camera, data, name, now)
@@ -101,7 +102,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def holds_images(path: Path) -> str:
-    """What a path that is no recording holds of images, as ``is a video``; empty: nothing."""
+    """What a path that is not a recording holds of images, as ``is a video``; empty: nothing."""
     if path.is_dir():
         found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
         return f"is a folder of {found} images" if found else ""
@@ -161,7 +162,7 @@ def from_bag(
         elif topic in carried:
             yield Carried(topic, recorded_ns, as_tf2(message))
         else:
-            image = read_or_refuse(read_any_image, message, BAD_IMAGE)
+            image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
             compressed = message if hasattr(message, "format") else None
             info = latest
             if camera is not None:  # the image knows its frame, on which transforms hang

@@ -12,11 +12,12 @@ from typing import Any, Literal
 import numpy as np
 
 from rs_localizer.config import FeatureConfig
+from rs_localizer.core.reasons import Reason
 from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import Make
-from rs_localizer.pipeline.refusal import BAD_IMAGE, Refusal, read_or_refuse
+from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +61,7 @@ class FrameExtractor:
 
     def take(self, message: Any) -> Extracted | Refusal:
         """Look for keypoints in a sensor_msgs/Image or CompressedImage."""
-        image = read_or_refuse(read_any_image, message, BAD_IMAGE)
+        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
         return image if isinstance(image, Refusal) else self.extract(image)
 
     def extract(self, image: Image) -> Extracted:

@@ -1,4 +1,4 @@
-"""A message without a result, and why."""
+"""A message without a result, and why; who is told what is odd."""
 
 from __future__ import annotations
 
@@ -6,25 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
+from rs_localizer.core.reasons import ImuReason, Notice, Reason
 from rs_localizer.io.messages import MessageError
 
 Read = TypeVar("Read")
 
-BAD_IMAGE = "bad_image"
-"""Of an image that cannot be read."""
-
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A message without a result; false in a condition.
+    """A message without a result; false in a condition. What its reason means: :mod:`.reasons`."""
 
-    Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud``, ``bad_cloud``
-    (a message that cannot be read) and ``no_transform`` (from the camera to ``base_frame``); of
-    keypoints ``no_map``, ``bad_keypoints`` (that cannot be read, or not be compared with the map)
-    and ``no_matches``; of images ``bad_image``. What they mean: :mod:`.reasons`.
-    """
-
-    reason: str
+    reason: Reason
     detail: str  # one sentence that says what was found
 
     def __bool__(self) -> Literal[False]:
@@ -42,7 +34,15 @@ class Waiting(Refusal):
     patience: float  # s, for which this makes sense
 
 
-def read_or_refuse(read: Callable[[Any], Read], message: Any, reason: str) -> Read | Refusal:
+Notify = Callable[[Notice | ImuReason, str], None]
+"""Told of what is odd, with one sentence. Frames are localized all the same."""
+
+
+def unheard(notice: Notice | ImuReason, text: str) -> None:
+    """Tell nobody."""
+
+
+def read_or_refuse(read: Callable[[Any], Read], message: Any, reason: Reason) -> Read | Refusal:
     """What is read of a message; refused for this reason if it cannot be."""
     try:
         return read(message)

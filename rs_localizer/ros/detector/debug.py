@@ -13,6 +13,7 @@ from sensor_msgs.msg import CameraInfo
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import MessageError, stamp_ns
@@ -78,7 +79,7 @@ class DebugPictures:
         """A nav_msgs/Odometry, of the camera in the map: show the image that it belongs to."""
         if self._calibration is not None and message.child_frame_id != self._calibration.frame:
             self._notice(
-                "other_body",
+                Notice.OTHER_BODY,
                 f"the odometry is of {message.child_frame_id}, not of the camera "
                 f"({self._calibration.frame}): no cubes are drawn",
             )
@@ -117,7 +118,7 @@ class DebugPictures:
         try:
             return self._calibration.camera(config.readout_time, config.scan_direction)
         except MessageError as error:
-            self._notice("bad_camera_info", str(error))
+            self._notice(Reason.BAD_CAMERA_INFO, str(error))
             return None
 
 
@@ -146,7 +147,7 @@ def picture_topics(
         try:
             calibration = read_camera_info(message)
         except MessageError as error:
-            refusals.notice("bad_camera_info", str(error))
+            refusals.notice(Reason.BAD_CAMERA_INFO, str(error))
             return
         worker.update(CAMERA_INFO, lambda _: pictures.take_camera_info(calibration))
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rs_localizer.config import DetectorConfig
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
@@ -61,7 +62,7 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
 
     task = DETECTOR_NAME
     output = CORRESPONDENCES
-    odd = ("wrong_map", "repeated_markers")
+    odd = (Notice.WRONG_MAP, Notice.REPEATED_MARKERS)
     checked_at_start = False  # the map may come later: on_configure tells
 
     def __init__(self, **options: Any) -> None:

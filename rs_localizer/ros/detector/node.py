@@ -14,6 +14,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import CompressedImage, Image
 
 from rs_localizer.config import DetectorConfig, FeatureConfig, ImageTransport
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.pipeline.refusal import Refusal
@@ -65,9 +66,9 @@ class ImageNode(
     :meth:`drawing` and :meth:`describe`, and :meth:`picture_topics` where it needs any.
     """
 
-    lack = "no_images"
+    lack = Notice.NO_IMAGES
     output: ClassVar[str]  # topic of the clouds
-    odd: ClassVar[tuple[str, ...]] = ()  # notices that the diagnostics repeat
+    odd: ClassVar[tuple[Notice, ...]] = ()  # notices that the diagnostics repeat
 
     def __init__(
         self,
