@@ -30,6 +30,8 @@ _SAME_PLACE, _SAME_TURN = 0.3, 0.15
 _ALIKE = 3.0
 # Errors of a corner beyond this (of the focal length) all count the same.
 _GROSS = 0.02
+# What a rolling shutter leaves of a square's pose (px).
+_SHUTTER = 0.5
 # Until then (s) an image is near the one before.
 _NEAR = 0.25
 
@@ -50,7 +52,8 @@ class _View:
 
     stamp_ns: int
     rays: dict[int, Array]  # (4,2)
-    poses: dict[int, list[Transform]]  # camera_from_marker
+    # camera_from_marker, and how far it fits, of 1.
+    poses: dict[int, list[tuple[Transform, float]]]
 
 
 def chain(
@@ -80,25 +83,26 @@ def _view(camera: Camera, spotted: Spotted, markers: Sequence[Marker]) -> _View:
     rays, poses = {}, {}
     for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
         own = camera.rays(quad)
-        found = _square_poses(markers[marker].corners, own)
+        found = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
         if np.isfinite(own).all() and found:
             rays[marker], poses[marker] = own, found
     return _View(spotted.stamp_ns, rays, poses)
 
 
-def _square_poses(corners: Array, rays: Array) -> list[Transform]:
-    """Poses camera_from_marker that fit rays (4,2), the better one first."""
+def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Transform, float]]:
+    """Poses camera_from_marker that fit rays (4,2), and how far they do, of 1."""
     try:
-        count, turns, places, _ = cv2.solvePnPGeneric(
+        count, turns, places, errors = cv2.solvePnPGeneric(
             corners, np.ascontiguousarray(rays), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
         )
     except cv2.error:
         return []
+    fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt)
     found = [
-        Transform(np.asarray(cv2.Rodrigues(turns[k])[0]), np.asarray(places[k]).ravel())
+        (Transform(np.asarray(cv2.Rodrigues(turns[k])[0]), np.asarray(places[k]).ravel()), fits[k])
         for k in range(count)
     ]
-    return [pose for pose in found if pose.translation[2] > 0.0]
+    return [(pose, float(fit)) for pose, fit in found if pose.translation[2] > 0.0]
 
 
 def _between(
@@ -113,27 +117,30 @@ def _between(
     for (a, b), among in images.items():
         step = -(-len(among) // _MOST_IMAGES)
         said = [
-            (k, first.inverse() @ second)
+            (k, first.inverse() @ second, fit * other)
             for k, view in enumerate(among[::step])
-            for first in view.poses[a]
-            for second in view.poses[b]
+            for first, fit in view.poses[a]
+            for second, other in view.poses[b]
         ]
         size = max(markers[a].size, markers[b].size)
         between[a, b], scores[a, b] = _agreed(said, size)
     return between, scores
 
 
-def _agreed(said: list[tuple[int, Transform]], size: float) -> tuple[Transform, float]:
-    """What most images say, each of which says several things, and by how many it is said."""
-    image = np.array([k for k, _ in said])
-    turns = np.array([of.rotation for _, of in said])
-    places = np.array([of.translation for _, of in said])
+def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Transform, float]:
+    """What most images say, each of which says several things that fit more or less; and by how
+    many it is said.
+    """
+    image = np.array([k for k, _, _ in said])
+    turns = np.array([of.rotation for _, of, _ in said])
+    places = np.array([of.translation for _, of, _ in said])
+    fits = np.array([fit for _, _, fit in said])
     cosines = 0.5 * (np.einsum("nij,mij->nm", turns, turns) - 1.0)
     angles = np.arccos(np.clip(cosines, -1.0, 1.0))
     # What is far from both is known less well.
     reach = _SAME_PLACE * size + 0.1 * np.linalg.norm(places, axis=1)
     apart = np.linalg.norm(places[:, None] - places, axis=2) / reach[:, None]
-    agree = np.exp(-((angles / _SAME_TURN) ** 2) - apart**2)
+    agree = np.exp(-((angles / _SAME_TURN) ** 2) - apart**2) * fits
     # Of each image only what agrees best counts.
     per_image = np.zeros((len(said), image.max() + 1))
     np.maximum.at(per_image, (slice(None), image), agree)
@@ -193,7 +200,7 @@ def _image_poses(
         )
         rays = np.concatenate([view.rays[marker] for marker in own])
         options = [
-            pose @ placed[marker].inverse() for marker in own for pose in view.poses[marker]
+            pose @ placed[marker].inverse() for marker in own for pose, _ in view.poses[marker]
         ]
         costs = np.array([_cost(option, points, rays) for option in options])
         alike = [option for option, cost in zip(options, costs, strict=True)

@@ -44,6 +44,7 @@ class Survey:
     covariances: Array  # (m,6,6) place (m) and turn (rad) along the map's axes; 0 of the origin
     sights: tuple[int, ...]  # images of each
     apart: tuple[tuple[Marker, ...], ...]  # not connected with these, part by part
+    rare: tuple[Marker, ...]  # connected, but too few images show them
     images: int  # with a pose
     fit: Fit
 
@@ -124,12 +125,14 @@ def _adjusted(
         at = slice(shared + BODY * k, shared + BODY * (k + 1))
         covariances[k + 1] = found.border_covariance[at, at]
     counts = np.bincount(seen.points[found.inliers] // 4, minlength=len(own)) // 4
-    order = [0, *sorted(range(1, len(own)), key=lambda k: own[k])]
+    known = [k for k in range(1, len(own)) if counts[k] >= _LEAST_SIGHTS]
+    order = [0, *sorted(known, key=lambda k: own[k])]
     return Survey(
         tuple(placed[k] for k in order),
         covariances[order],
         tuple(int(counts[k]) for k in order),
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
+        tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
         len(chained.images),
         found,
     )
