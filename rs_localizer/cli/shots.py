@@ -1,4 +1,4 @@
-"""The images that a command is given: a video, a folder, or a bag, with the camera that took them."""
+"""The images that a command is given, and their camera: a video, a folder, or a bag."""
 
 from __future__ import annotations
 

@@ -99,7 +99,13 @@ def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Trans
         return []
     fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt)
     found = [
-        (Transform(np.asarray(cv2.Rodrigues(turns[k])[0]), np.asarray(places[k]).ravel()), fits[k])
+        (
+            Transform(
+                np.asarray(cv2.Rodrigues(turns[k])[0], np.float64),
+                np.asarray(places[k], np.float64).ravel(),
+            ),
+            fits[k],
+        )
         for k in range(count)
     ]
     return [(pose, float(fit)) for pose, fit in found if pose.translation[2] > 0.0]
@@ -142,12 +148,14 @@ def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Tran
     apart = np.linalg.norm(places[:, None] - places, axis=2) / reach[:, None]
     agree = np.exp(-((angles / _SAME_TURN) ** 2) - apart**2) * fits
     # Of each image only what agrees best counts.
-    per_image = np.zeros((len(said), image.max() + 1))
-    np.maximum.at(per_image, (slice(None), image), agree)
+    firsts = np.flatnonzero(np.diff(image, prepend=-1))
+    per_image = np.maximum.reduceat(agree, firsts, axis=1)
     support = per_image.sum(axis=1)
     best = int(np.argmax(support))
     # The mean of what agrees with it, of each image one.
-    weights = np.where(agree[best] == per_image[best][image], agree[best], 0.0)
+    weights = np.where(
+        agree[best] == per_image[best][np.searchsorted(image[firsts], image)], agree[best], 0.0
+    )
     u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, turns))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return Transform(turn, weights @ places / weights.sum()), float(support[best])
@@ -195,9 +203,7 @@ def _image_poses(
         own = [marker for marker in view.poses if marker in placed]
         if not own:
             continue
-        points = np.concatenate(
-            [_corners(markers[marker], placed[marker]) for marker in own]
-        )
+        points = np.concatenate([_corners(markers[marker], placed[marker]) for marker in own])
         rays = np.concatenate([view.rays[marker] for marker in own])
         options = [
             pose @ placed[marker].inverse() for marker in own for pose, _ in view.poses[marker]

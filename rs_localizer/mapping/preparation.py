@@ -40,7 +40,7 @@ class Preparation:
         self.camera, self.seen, self.start, self.freedom = camera, seen, start, freedom
         self.start_ns = int(seen.stamps_ns[0])
         delay = stamp_offset - camera.readout_time * camera.first_row_time
-        self.times = (seen.stamps_ns - self.start_ns) * 1e-9 + delay
+        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delay, np.float64)
         self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
         self.deviations, self.floating = self._known()
         self.used = self._usable()

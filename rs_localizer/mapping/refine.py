@@ -23,7 +23,7 @@ from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over
 from rs_localizer.trajectory.lens import with_lens
-from rs_localizer.trajectory.model import Freedom, State, start_state
+from rs_localizer.trajectory.model import Freedom, start_state
 from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
@@ -138,7 +138,7 @@ class _Refinement:
         squared = problem.errors(state)
         inliers = squared < (LIMIT * deviation) ** 2
         sights, images = sights_of(seen, inliers)
-        used = _freedoms(state.spline, seen.frames) + 3 * np.count_nonzero(images)
+        used = _freedoms(state.spline, seen.frames) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.motion.border)
         placed = place(problem, state, deviation, images > 1)
         covariances = inflation * placed.covariances

@@ -62,6 +62,4 @@ class Spotter:
         found = self._detector.detect(image, stamp_ns)
         whole = whole_markers(found, self._end)
         quads = [found.pixels[rows] for rows in whole.values()]
-        return Spotted(
-            stamp_ns, np.array(list(whole), np.int64), np.array(quads).reshape(-1, 4, 2)
-        )
+        return Spotted(stamp_ns, np.array(list(whole), np.int64), np.array(quads).reshape(-1, 4, 2))

@@ -5,9 +5,8 @@ shows several of them closes loops.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -98,7 +97,7 @@ def _adjusted(
     stamp_offset: float,
 ) -> Survey:  # fmt: skip
     own = _often(images, chained)
-    seen, times, start_ns = _observations(camera, images, markers, chained, own, stamp_offset)
+    seen, times = _observations(camera, images, markers, chained, own, stamp_offset)
     rotations = np.array([pose.rotation for pose in chained.poses])
     positions = np.array([pose.translation for pose in chained.poses])
     spline = first_motion(times[chained.images], rotations, positions, camera.readout_time)
@@ -152,8 +151,8 @@ def _often(images: list[Spotted], chained: Chained) -> list[int]:
 def _observations(
     camera: Camera, images: list[Spotted], markers: Sequence[Marker], chained: Chained,
     own: list[int], stamp_offset: float,
-) -> tuple[Observations, Array, int]:  # fmt: skip
-    """All corners, the times (g,) of the images' middle rows, and time 0."""
+) -> tuple[Observations, Array]:  # fmt: skip
+    """All corners, and the times (g,) of the images' middle rows since the first stamp."""
     start_ns = images[0].stamp_ns
     delay = stamp_offset - camera.readout_time * camera.first_row_time
     times = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in images]) + delay
@@ -170,7 +169,7 @@ def _observations(
         for m in own
     ])  # fmt: skip
     all_pixels, all_frames = np.concatenate(pixels), np.concatenate(frames)
-    return Observations(
+    seen = Observations(
         times=times[all_frames],
         row_times=camera.row_time(all_pixels),
         pixels=all_pixels,
@@ -179,4 +178,5 @@ def _observations(
         frames=all_frames,
         trusted=np.ones(len(all_frames), np.bool_),
         bodies=np.repeat(np.arange(len(own)) - 1, 4),
-    ), times, start_ns
+    )
+    return seen, times

@@ -1,4 +1,4 @@
-"""The minimum of a cost: Gauss and Newton with Levenberg's damping, the noise measured on the way."""
+"""The minimum of a cost, by Gauss and Newton with Levenberg's damping; and of the noise with it."""
 
 from __future__ import annotations
 

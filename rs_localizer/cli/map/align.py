@@ -29,7 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     level = parser.add_argument_group("gravity: z of the new map")
     level = level.add_mutually_exclusive_group()
     level.add_argument(
-        "--up", nargs=3, type=number(), metavar=("X", "Y", "Z"), help="direction in the map as it is"
+        "--up",
+        nargs=3,
+        type=number(),
+        metavar=("X", "Y", "Z"),
+        help="direction in the map as it is",
     )
     level.add_argument(
         "--floor", nargs="+", type=int, metavar="ID", help="three or more in a level plane, at the "

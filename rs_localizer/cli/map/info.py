@@ -57,7 +57,9 @@ def _of_markers(marker_map: MarkerMap, kind: str) -> list[tuple[str, str]]:
     known = [m.deviations for m in marker_map.markers if m.deviations is not None]
     if known:
         spread = np.linalg.norm(np.array(known)[:, :3], axis=1)
-        rows.append(("deviations known", f"{len(known)}, {1e3 * np.median(spread):.2f} mm (median)"))
+        rows.append(
+            ("deviations known", f"{len(known)}, {1e3 * np.median(spread):.2f} mm (median)")
+        )
     if marker_map.boards:
         rows.append(("boards", ", ".join(board.name for board in marker_map.boards)))
     return rows

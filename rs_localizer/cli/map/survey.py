@@ -183,7 +183,9 @@ def _tell(found: Survey, images: int) -> None:
     deviation = fit.readout_time_deviation
     spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
     print(f"readout time             {1e3 * fit.state.readout_time:.3f}{spread} ms")
-    print(f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}")
+    print(
+        f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
+    )
     for marker, sights, deviations in zip(
         found.markers, found.sights, found.deviations, strict=True
     ):

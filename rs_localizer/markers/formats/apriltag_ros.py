@@ -73,4 +73,4 @@ def write(marker_map: MarkerMap) -> str:
         "standalone_tags": [],
         "tag_bundles": [{"name": marker_map.map_frame, "layout": layout}],
     }
-    return yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=160)
+    return str(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=160))

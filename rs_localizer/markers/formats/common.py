@@ -10,7 +10,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.entries import Entry
-from rs_localizer.markers.families import Family, family
+from rs_localizer.markers.families import FAMILIES, Family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.prints import Marker
 
@@ -19,7 +19,7 @@ from rs_localizer.markers.prints import Marker
 class Unsaid:
     """What a file does not say of its markers."""
 
-    family: Family = family("apriltag_36h11")
+    family: Family = FAMILIES["apriltag_36h11"]
     size: float | None = None  # m
     map_frame: str = "map"
     part: str = ""  # name of the bundle or body to take

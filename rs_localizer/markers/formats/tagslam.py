@@ -38,6 +38,8 @@ from rs_localizer.markers.prints import Marker
 
 # What is written for a tag whose errors are not known: m, rad.
 _POSITION_NOISE, _ROTATION_NOISE = 0.001, 0.001
+# Of the body itself, which is the map.
+_AT_REST = 1e-6
 
 
 def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
@@ -58,9 +60,7 @@ def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
 
 def _named(item: Entry) -> list[tuple[str, Entry]]:
     """The bodies of an entry of the list: one, under its name."""
-    return [
-        (name, Entry(item.take(name, dict), f"body {name}")) for name in item.names()
-    ]
+    return [(name, Entry(item.take(name, dict), f"body {name}")) for name in item.names()]
 
 
 def _markers(body: Entry, unsaid: Unsaid) -> list[Marker]:
@@ -102,23 +102,12 @@ def write(marker_map: MarkerMap) -> str:
             "rotation_noise": _xyz(known[3:]),
         }
         tags.append({"id": marker.id, "size": rounded([marker.size])[0], "pose": pose})
-    nothing = _xyz(np.zeros(3))
-    at_rest = {
-        "position": nothing,
-        "rotation": nothing,
-        "position_noise": _xyz(np.full(3, 1e-6)),
-        "rotation_noise": _xyz(np.full(3, 1e-6)),
-    }
+    # Each of its own: YAML would refer from one to the other.
+    at_rest = {"position": _xyz(np.zeros(3)), "rotation": _xyz(np.zeros(3))}
+    at_rest |= {f"{name}_noise": _xyz(np.full(3, _AT_REST)) for name in ("position", "rotation")}
     body = {"is_static": True, "type": "simple", "pose": at_rest, "tags": tags}
     tree = {"default_body": marker_map.map_frame, "bodies": [{marker_map.map_frame: body}]}
-    return yaml.dump(tree, Dumper=_Plain, sort_keys=False, default_flow_style=None, width=160)
-
-
-class _Plain(yaml.SafeDumper):
-    """Without references from one place to another: their readers are many."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
+    return str(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=160))
 
 
 def _xyz(values: Array) -> dict[str, float]:
