@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.mapping.elimination import Rows, record
 from rs_localizer.mapping.gauge import Floating
@@ -103,7 +103,7 @@ class MapProblem:
         return replace(moved, landmarks=state.landmarks + step.landmarks)
 
 
-def sights_of(observations: Observations, inliers: BoolArray) -> tuple[Array, Array]:
+def sights_of(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
     """How many keypoints (p,) and how many images (p,) show each landmark."""
     count = len(observations.landmarks)
     sights = np.bincount(observations.points[inliers], minlength=count)

@@ -36,8 +36,10 @@ class Scratch(NamedTuple):
 
     place: IntArray  # (controls,) of a control among those that see the landmark; -1: does not
     touched: IntArray  # (controls,) these, rising
-    columns: IntArray  # (6 controls + s,) of the reduced system that the landmark touches, rising
-    coupled: Array  # (6 controls + s, 3) W: its rows at these columns
+    # (3, controls + 1) runs of columns of the reduced system that the landmark touches: where in
+    # ``coupled`` a run begins and where the next one does, and its first column.
+    runs: IntArray
+    coupled: Array  # (3, 6 controls + s) W^T at these columns
     inverse: Array  # (3,3) V^-1
     slope: Array  # (3,)
 
@@ -47,8 +49,9 @@ def make_scratch(rows: Rows) -> Scratch:
     """Room for one landmark."""
     most = CONTROL * rows.controls + rows.values.shape[2] - LOCAL - 4
     return Scratch(
-        np.full(rows.controls, -1), np.empty(rows.controls, np.int64), np.empty(most, np.int64),
-        np.zeros((most, 3)), np.empty((3, 3)), np.empty(3),
+        np.full(rows.controls, -1), np.empty(rows.controls, np.int64),
+        np.empty((3, rows.controls + 1), np.int64), np.zeros((3, most)), np.empty((3, 3)),
+        np.empty(3),
     )  # fmt: skip
 
 
@@ -91,10 +94,10 @@ def _invert(a: Array, out: Array) -> None:
 
 @kernel
 def gather(rows: Rows, landmark: int, scratch: Scratch) -> int:
-    """Fill the blocks of one landmark; returns how many columns it touches."""
+    """Fill the blocks of one landmark; returns the number of runs of columns that it touches."""
     shared = rows.values.shape[2] - LOCAL - 4
     own, information, slope = LOCAL + shared, np.zeros((3, 3)), scratch.slope
-    count = _touch(rows, landmark, scratch)
+    count, runs = _touch(rows, landmark, scratch, shared)
     end = CONTROL * count
     for i in range(3):
         information[i, i] = rows.precisions[landmark]
@@ -105,40 +108,47 @@ def gather(rows: Rows, landmark: int, scratch: Scratch) -> int:
         for r in range(2):
             row = rows.values[n, r]
             for i in range(3):
-                x = row[own + i]
+                x, coupled = row[own + i], scratch.coupled[i]
                 slope[i] += x * row[own + 3]
                 for j in range(i, 3):
                     information[i, j] += x * row[own + j]
                 for a in range(LOCAL):  # the four controls follow each other
-                    scratch.coupled[base + a, i] += x * row[a]
+                    coupled[base + a] += x * row[a]
                 for a in range(shared):
-                    scratch.coupled[end + a, i] += x * row[LOCAL + a]
+                    coupled[end + a] += x * row[LOCAL + a]
     for i in range(3):
         information[i, i] *= 1.0 + rows.damping
     _invert(information, scratch.inverse)
     for k in range(count):
         scratch.place[scratch.touched[k]] = -1
-    return end + shared
+    return runs
 
 
 @kernel
-def _touch(rows: Rows, landmark: int, scratch: Scratch) -> int:
-    """List the controls that see a landmark, and clear their rows; returns their number."""
-    count = 0
+def _touch(rows: Rows, landmark: int, scratch: Scratch, shared: int) -> tuple[int, int]:
+    """List the controls that see a landmark, and clear what couples it with them; returns their
+    number, and that of their runs and of the shared numbers' one.
+    """
+    count = runs = 0
+    starts, ends, columns = scratch.runs
     for k in range(rows.starts[landmark], rows.starts[landmark + 1]):
         first = rows.first[rows.order[k]]
         for c in range(first, first + ORDER):
-            if scratch.place[c] < 0:
-                scratch.place[c] = count
-                scratch.touched[count] = c
-                for b in range(CONTROL):
-                    scratch.columns[CONTROL * count + b] = CONTROL * c + b
-                count += 1
-    shared = rows.values.shape[2] - LOCAL - 4
-    for a in range(shared):
-        scratch.columns[CONTROL * count + a] = CONTROL * rows.controls + a
-    scratch.coupled[: CONTROL * count + shared] = 0.0
-    return count
+            if scratch.place[c] >= 0:
+                continue
+            if count == 0 or scratch.touched[count - 1] != c - 1:
+                starts[runs], columns[runs] = CONTROL * count, CONTROL * c
+                runs += 1
+            scratch.place[c] = count
+            scratch.touched[count] = c
+            count += 1
+            ends[runs - 1] = CONTROL * count
+    if count and shared:
+        starts[runs], ends[runs] = CONTROL * count, CONTROL * count + shared
+        columns[runs] = CONTROL * rows.controls
+        runs += 1
+    scratch.coupled[:, : CONTROL * count + shared] = 0.0
+    return count, runs
 
 
 @kernel
@@ -148,36 +158,45 @@ def eliminate(rows: Rows, part: int, parts: int, system: Array) -> None:
     """
     scratch = make_scratch(rows)
     inverse, coupled = scratch.inverse, scratch.coupled
+    starts, ends, columns = scratch.runs
     for landmark in range(len(rows.starts) - 1):
-        used = gather(rows, landmark, scratch)
-        for a in range(used):
-            to = scratch.columns[a]
-            if (to // CONTROL) % parts != part:
-                continue
-            x = y = z = 0.0
-            for i in range(3):
-                w = coupled[a, i]
-                x += w * inverse[i, 0]
-                y += w * inverse[i, 1]
-                z += w * inverse[i, 2]
-            row = system[to]
-            for b in range(a + 1):
-                row[scratch.columns[b]] -= x * coupled[b, 0] + y * coupled[b, 1] + z * coupled[b, 2]
+        runs = gather(rows, landmark, scratch)
+        for mine in range(runs):
+            for a in range(starts[mine], ends[mine]):
+                to = columns[mine] + a - starts[mine]
+                if (to // CONTROL) % parts != part:
+                    continue
+                x = y = z = 0.0
+                for i in range(3):
+                    x += coupled[i, a] * inverse[i, 0]
+                    y += coupled[i, a] * inverse[i, 1]
+                    z += coupled[i, a] * inverse[i, 2]
+                for other in range(mine + 1):
+                    start, end = starts[other], min(ends[other], a + 1)
+                    row = system[to, columns[other] : columns[other] + end - start]
+                    u, v, w = coupled[0, start:end], coupled[1, start:end], coupled[2, start:end]
+                    for b in range(end - start):
+                        row[b] -= x * u[b] + y * v[b] + z * w[b]
 
 
 @kernel
 def lift(rows: Rows, right: Array, out: Array) -> None:
     """Add ``W V^-1 r`` of right sides (p,3,m) to (N,m)."""
     scratch = make_scratch(rows)
+    starts, ends, columns = scratch.runs
+    share = np.empty(3)
     for landmark in range(len(rows.starts) - 1):
-        used, r = gather(rows, landmark, scratch), right[landmark]
-        for a in range(used):
+        runs, r = gather(rows, landmark, scratch), right[landmark]
+        for m in range(r.shape[1]):
             for i in range(3):
-                share = 0.0
+                share[i] = 0.0
                 for j in range(3):
-                    share += scratch.coupled[a, j] * scratch.inverse[j, i]
-                for m in range(r.shape[1]):
-                    out[scratch.columns[a], m] += share * r[i, m]
+                    share[i] += scratch.inverse[i, j] * r[j, m]
+            for run in range(runs):
+                for a in range(starts[run], ends[run]):
+                    to = columns[run] + a - starts[run]
+                    for i in range(3):
+                        out[to, m] += scratch.coupled[i, a] * share[i]
 
 
 @kernel
@@ -186,14 +205,18 @@ def lower(rows: Rows, reduced: Array, right: Array) -> None:
     where ``x`` (N,m) solves the reduced system.
     """
     scratch = make_scratch(rows)
+    starts, ends, columns = scratch.runs
     left = np.empty(3)
     for landmark in range(len(rows.starts) - 1):
-        used, r = gather(rows, landmark, scratch), right[landmark]
+        runs, r = gather(rows, landmark, scratch), right[landmark]
         for m in range(r.shape[1]):
             for i in range(3):
                 left[i] = r[i, m]
-                for a in range(used):
-                    left[i] -= scratch.coupled[a, i] * reduced[scratch.columns[a], m]
+            for run in range(runs):
+                for a in range(starts[run], ends[run]):
+                    x = reduced[columns[run] + a - starts[run], m]
+                    for i in range(3):
+                        left[i] -= scratch.coupled[i, a] * x
             for i in range(3):
                 r[i, m] = 0.0
                 for j in range(3):
@@ -210,36 +233,49 @@ def slopes(rows: Rows, out: Array) -> None:
 
 
 @kernel
+def _within(scratch: Scratch, runs: int, inverse: Array, out: Array) -> None:
+    """``W^T S^-1 W`` (3,3), by the lower triangle of ``S^-1``: what lies beside its diagonal
+    counts twice.
+    """
+    coupled = scratch.coupled
+    starts, ends, columns = scratch.runs
+    half = np.zeros((3, 3))
+    for mine in range(runs):
+        for a in range(starts[mine], ends[mine]):
+            x = y = z = 0.0
+            line = inverse[columns[mine] + a - starts[mine]]
+            for other in range(mine + 1):
+                start, end = starts[other], min(ends[other], a + 1)
+                row = line[columns[other] : columns[other] + end - start]
+                u, v, w = coupled[0, start:end], coupled[1, start:end], coupled[2, start:end]
+                for b in range(end - start):
+                    x += row[b] * u[b]
+                    y += row[b] * v[b]
+                    z += row[b] * w[b]
+            own = 0.5 * line[columns[mine] + a - starts[mine]]
+            for i in range(3):
+                half[i, 0] += coupled[i, a] * (x - own * coupled[0, a])
+                half[i, 1] += coupled[i, a] * (y - own * coupled[1, a])
+                half[i, 2] += coupled[i, a] * (z - own * coupled[2, a])
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = half[i, j] + half[j, i]
+
+
+@kernel
 def covariances(rows: Rows, inverse: Array, part: int, parts: int, out: Array) -> None:
     """Covariances (p,3,3) of every ``parts``-th landmark, ``V^-1 + V^-1 W^T S^-1 W V^-1``, from
     the lower triangle of ``S^-1`` (N,N).
     """
     scratch = make_scratch(rows)
-    middle, half = np.empty((3, 3)), np.empty((3, 3))
-    coupled, own = scratch.coupled, scratch.inverse
+    middle, own = np.empty((3, 3)), scratch.inverse
     for landmark in range(part, len(rows.starts) - 1, parts):
-        used = gather(rows, landmark, scratch)
-        middle[:] = 0.0
-        for a in range(used):
-            x = y = z = 0.0
-            row = inverse[scratch.columns[a]]
-            for b in range(a + 1):
-                share = row[scratch.columns[b]] * (1.0 if b < a else 0.5)
-                x += share * coupled[b, 0]
-                y += share * coupled[b, 1]
-                z += share * coupled[b, 2]
-            for i in range(3):
-                middle[i, 0] += coupled[a, i] * x
-                middle[i, 1] += coupled[a, i] * y
-                middle[i, 2] += coupled[a, i] * z
-        for i in range(3):
-            for j in range(3):
-                half[i, j] = 0.0
-                for k in range(3):
-                    half[i, j] += own[i, k] * (middle[k, j] + middle[j, k])
+        runs = gather(rows, landmark, scratch)
+        _within(scratch, runs, inverse, middle)
         for i in range(3):
             for j in range(3):
                 total = own[i, j]
                 for k in range(3):
-                    total += half[i, k] * own[k, j]
+                    for m in range(3):
+                        total += own[i, k] * middle[k, m] * own[m, j]
                 out[landmark, i, j] = total

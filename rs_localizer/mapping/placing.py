@@ -46,4 +46,6 @@ def place(problem: MapProblem, state: State, deviation: float, usable: BoolArray
     spread = reduced.solve(np.zeros((reduced.size, 7)), of_kept)[1]
     covariances, shared = reduced.covariances()
     held = as_held(covariances, spread, every, of_kept)
-    return Placed(whole(state.landmarks), whole.covariances(held), shared, whole.moved(state.spline))
+    return Placed(
+        whole(state.landmarks), whole.covariances(held), shared, whole.moved(state.spline)
+    )

@@ -6,6 +6,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.mapping.first_motion import first_motion
 from rs_localizer.mapping.sightings import (
     LEAST_KEYPOINTS,
     MapFreedom,
@@ -16,12 +17,10 @@ from rs_localizer.mapping.sightings import (
 from rs_localizer.trajectory.model import Observations
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
-from rs_localizer.trajectory.start import LONGEST_GAP, LONGEST_SPACING, spline_through
+from rs_localizer.trajectory.start import LONGEST_GAP
 
 # Beyond so many unknowns of the motion its matrix takes more than 2 GB.
 _MOST_UNKNOWNS = 15000
-# A stretch reaches so far beyond its images (s), half as long as readouts take.
-_MARGIN = 0.025
 # Landmarks are held to where they were by the map's size, which says nothing, but for those that
 # hardly any image sees.
 _LOOSE = 1.0
@@ -41,7 +40,7 @@ class Preparation:
         self.camera, self.seen, self.start, self.freedom = camera, seen, start, freedom
         self.start_ns = int(seen.stamps_ns[0])
         delay = stamp_offset - camera.readout_time * camera.first_row_time
-        self.times = (seen.stamps_ns - self.start_ns) * 1e-9 + delay
+        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delay, np.float64)
         self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
         self.deviations, self.floating = self._known()
         self.used = self._usable()
@@ -82,14 +81,9 @@ class Preparation:
     def _spline(self) -> Spline:
         """Through the images with keypoints: stretches where they follow each other."""
         own = np.unique(self.seen.images[self.used])
-        steps = np.diff(self.times[own])
-        parts = np.split(np.arange(len(own)), np.flatnonzero(steps > LONGEST_GAP) + 1)
-        near = steps[steps <= LONGEST_GAP]
-        spacing = min(LONGEST_SPACING, float(np.median(near))) if len(near) else LONGEST_SPACING
-        margin = max(_MARGIN, 0.55 * abs(self.camera.readout_time))
-        return spline_through(
-            parts, self.times[own], self.start.rotations[own], self.start.positions[own], spacing,
-            margin,
+        return first_motion(
+            self.times[own], self.start.rotations[own], self.start.positions[own],
+            self.camera.readout_time,
         )  # fmt: skip
 
     def _check_stretches(self) -> None:

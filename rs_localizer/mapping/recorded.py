@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
@@ -88,7 +90,8 @@ def _rows_of(landmarks: Map, cloud: Correspondences) -> IntArray:
     """The landmarks (n,) that the rows of a cloud show: by their ids, else by their places."""
     names = cloud.table.dtype.names or ()
     if landmarks.ids is not None and "id" in names:
-        wanted, known = cloud.table["id"].astype(np.int64), landmarks.ids
+        wanted: NDArray[Any] = cloud.table["id"].astype(np.int64)
+        known: NDArray[Any] = landmarks.ids
     else:
         # A cloud may hold its points in single precision.
         wanted, known = _keys(cloud.points), _keys(landmarks.points)
@@ -104,7 +107,7 @@ def _rows_of(landmarks: Map, cloud: Correspondences) -> IntArray:
     return rows
 
 
-def _keys(points: Array) -> Array:
+def _keys(points: Array) -> NDArray[Any]:
     """Something that points (n,3) are the same by, (n,)."""
     single = np.ascontiguousarray(points, np.float32) + np.float32(0.0)
     return single.view([("", np.float32)] * 3).ravel()

@@ -15,6 +15,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.mapping.adjustment import MapProblem, sights_of
+from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
 from rs_localizer.mapping.placing import place
 from rs_localizer.mapping.preparation import Preparation
 from rs_localizer.mapping.sightings import MapFreedom, Sightings, Start, check
@@ -22,7 +23,7 @@ from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over
 from rs_localizer.trajectory.lens import with_lens
-from rs_localizer.trajectory.model import Freedom, State, start_state
+from rs_localizer.trajectory.model import Freedom, start_state
 from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
@@ -31,11 +32,6 @@ __all__ = ["MapFreedom", "RefinedMap", "Sightings", "Start", "refine"]
 
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
-# Images in a row of which the motion's own accelerations can be told.
-_LEAST_IMAGES = 10
-_LEAST_ACCELERATION = 0.5  # rad/s^2, m/s^2
-# Of images that stand alone: a hand that walks (rad/s, m/s).
-_ANGULAR_VELOCITY, _LINEAR_VELOCITY = 2.0, 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,8 +107,8 @@ class _Refinement:
             lens=given.lens,
             angular_acceleration=given.angular_acceleration,
             linear_acceleration=given.linear_acceleration,
-            angular_velocity=_ANGULAR_VELOCITY,
-            linear_velocity=_LINEAR_VELOCITY,
+            angular_velocity=ANGULAR_VELOCITY,
+            linear_velocity=LINEAR_VELOCITY,
         )
 
     def solved(self, done: Callable[[str], object]) -> RefinedMap:
@@ -124,9 +120,9 @@ class _Refinement:
         problem = self._problem(self.freedom)
         self.state, deviation = settle(problem, self.state, before)
         done("map")
-        calm = _calm(self.state, self.freedom)
-        if calm is not None:
-            self.freedom, problem = calm, self._problem(calm)
+        calmer = calm(self.state, self.freedom)
+        if calmer is not None:
+            self.freedom, problem = calmer, self._problem(calmer)
             self.state, deviation = settle(problem, self.state, deviation)
             done("accelerations")
         return self._result(problem, before, deviation)
@@ -142,7 +138,7 @@ class _Refinement:
         squared = problem.errors(state)
         inliers = squared < (LIMIT * deviation) ** 2
         sights, images = sights_of(seen, inliers)
-        used = _freedoms(state.spline, seen.frames) + 3 * np.count_nonzero(images)
+        used = _freedoms(state.spline, seen.frames) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.motion.border)
         placed = place(problem, state, deviation, images > 1)
         covariances = inflation * placed.covariances
@@ -174,20 +170,3 @@ def _freedoms(spline: Spline, frames: IntArray) -> int:
     """How many numbers of the motion the images determine: a pose each, and an end."""
     stretches = len(spline.layout.starts)
     return CONTROL * min(len(np.unique(frames)) + stretches, len(spline.positions))
-
-
-def _calm(state: State, freedom: Freedom) -> Freedom | None:
-    """With a prior of the accelerations as large as the motion's own, where stretches are long
-    enough to tell them.
-    """
-    layout = state.spline.layout
-    counts = np.diff(layout.firsts)
-    long = np.repeat(counts >= _LEAST_IMAGES, counts)
-    if not long.any():
-        return None
-    states = state.spline.states(layout.control_times()[long])
-    angular, linear = (
-        max(float(np.sqrt(np.mean(np.square(of)))), _LEAST_ACCELERATION)
-        for of in (states.angular_acceleration, states.linear_acceleration)
-    )
-    return replace(freedom, angular_acceleration=angular, linear_acceleration=linear)

@@ -195,7 +195,8 @@ def _pipeline(pycolmap: Any, effort: Effort) -> Any:
 def _nothing(pycolmap: Any, path: Path, keyframes: int) -> str:
     """Why there is no structure."""
     with pycolmap.Database.open(path) as database:
-        pairs = database.num_verified_image_pairs()
+        _, matches = database.read_two_view_geometry_num_inliers()
+        pairs = sum(count >= _LEAST_MATCHES for count in matches)
         features = database.num_keypoints() / keyframes
     return (
         f"no two of the {keyframes} keyframes determine a structure ({features:.0f} features each, "

@@ -1,4 +1,4 @@
-"""The minimum of a cost: Gauss and Newton with Levenberg's damping, the noise measured on the way."""
+"""The minimum of a cost, by Gauss and Newton with Levenberg's damping; and of the noise with it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.model import State
 
 _STEPS, _MOST_DAMPINGS = 20, 6
-_LEAST_GAIN = 0.02  # of the cost; a step that brings less is the last one
+# A step that brings less than this, or than this part of the cost, is the last one.
+_LEAST_GAIN, _LEAST_SHARE = 0.02, 1e-6
 _FIRST_DAMPING = 1e-8
 # The rounds end when the noise settles to this part of it.
 _ROUNDS, _SETTLED = 8, 0.01
@@ -55,7 +56,7 @@ def minimise(
             return state
         gain = cost - trial_cost
         state, cost, normal, damping = trial, trial_cost, trial_normal, 0.1 * damping
-        if gain < _LEAST_GAIN:
+        if gain < max(_LEAST_GAIN, _LEAST_SHARE * cost):
             break
     return state
 

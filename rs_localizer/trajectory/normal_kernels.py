@@ -44,7 +44,7 @@ def _border_of(sights: Sights, terms: Terms, n: int, row: Row, columns: IntArray
     """Fill the columns of the border that keypoint n touches, rising, and its derivatives
     (2,...) by them; returns their number.
     """
-    count = row.by_shared.shape[1]
+    count = len(row.by_shared[0])
     for k in range(count):
         columns[k] = k
         border[0, k], border[1, k] = row.by_shared[0, k], row.by_shared[1, k]

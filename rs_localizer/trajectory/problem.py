@@ -32,6 +32,7 @@ _SCALE_LIMIT = 4.0
 # Median of a squared error in two dimensions, in variances.
 _MEDIAN = 2.0 * np.log(2.0)
 _LEAST_DEVIATION = 1e-4  # px; recordings without noise are simulated
+_LOOSE_BODY = 100.0  # m, rad
 # Kernels and OpenCV leave the interpreter free for each other.
 _PARTS = 2
 # What parts of a recording add to the normal equations.
@@ -200,6 +201,9 @@ class Problem:
             normal.border_slope[at] += offset / self.freedom.landmarks
             normal.corner[diagonal[at], diagonal[at]] += self.freedom.landmarks**-2
             cost += float(offset @ offset)
+        if self.pieces.rigid:  # a body none of whose landmarks fits stays where it is
+            at = self.point_columns
+            normal.corner[diagonal[at], diagonal[at]] += _LOOSE_BODY**-2
         if self.freedom.stamps > 0.0:
             normal.image_information[:] += self.freedom.stamps**-2
             normal.image_slope[:] += state.delays * self.freedom.stamps**-2

@@ -57,7 +57,8 @@ class Layout:
 
     def alone(self) -> IntArray:
         """The second controls (k,) of stretches of one interval, which lies behind them."""
-        return 1 + self.firsts[:-1][np.diff(self.firsts) == ORDER]
+        seconds: IntArray = 1 + self.firsts[:-1][np.diff(self.firsts) == ORDER]
+        return seconds
 
     def control_times(self) -> Array:
         """Times (n,) at which the controls weigh most, s."""

@@ -73,8 +73,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME:=VALUE",
-        help="one setting: readout_time, scan_direction, stamp_offset, matching.*; map_deviation: how "
-        "well all landmarks are known",
+        help="one setting: readout_time, scan_direction, stamp_offset, matching.*; map_deviation: "
+        "how well all landmarks are known",
     )
     topics = parser.add_argument_group("topics of the bag (default: found by name and type)")
     add_topics(topics, but=(IMU,))
@@ -95,9 +95,7 @@ def run(args: argparse.Namespace) -> None:
     camera = recorded.calibration.camera(readout_time, config.scan_direction)
     if args.calibration is not None:
         given = read_calibration(args.calibration)
-        camera = replace(
-            given, readout_time=readout_time, scan_direction=config.scan_direction
-        )
+        camera = replace(given, readout_time=readout_time, scan_direction=config.scan_direction)
     known = _localized(camera, recorded, landmarks)
     deviations = _deviations(args, known.landmarks, config.map_deviation)
     freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
@@ -127,9 +125,7 @@ def _localized(camera: Camera, recorded: Recorded, landmarks: Map | None) -> Rec
         return from_recording(camera, recorded.clouds, landmarks, bar.update)
 
 
-def _deviations(
-    args: argparse.Namespace, landmarks: Map, map_deviation: float
-) -> Array | None:
+def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) -> Array | None:
     """How well each landmark is known, m; None: not at all."""
     every = map_deviation if map_deviation > 0.0 else np.inf
     if args.hold is None:
@@ -155,7 +151,10 @@ def _tell(known: RecordedMap, found: RefinedMap) -> None:
     ]
     if len(moved):
         rows += [
-            ("landmarks moved by", f"{1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} at most"),
+            (
+                "landmarks moved by",
+                f"{1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} at most",
+            ),
             ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"),
         ]
     deviation = found.readout_time_deviation
@@ -165,6 +164,10 @@ def _tell(known: RecordedMap, found: RefinedMap) -> None:
         print(f"{name:26} {text}")
     if found.readout_time < 0.0:
         print("the readout time is negative: the scan direction is the reverse of what was set")
+
+
+def _millimetres(lengths: Array) -> str:
+    return f"{1e3 * np.median(lengths):.1f} mm (median)"
 
 
 def _write(args: argparse.Namespace, landmarks: Map, found: RefinedMap) -> None:
