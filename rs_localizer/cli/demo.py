@@ -7,7 +7,7 @@ import importlib
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,11 +15,10 @@ from tqdm import tqdm
 
 from rs_localizer import data
 from rs_localizer.cli.demo_cube import CUBE, CubeScene
-from rs_localizer.cli.demo_room import ROOM, RoomScene, missing
+from rs_localizer.cli.demo_room import play_room
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.measures import figures
 from rs_localizer.lab.measures.comparison import Recording, Result, compare, load_recording
@@ -104,7 +103,7 @@ def run(args: argparse.Namespace) -> None:
             acts.append(Act(recording, readout_time, results))
             print(f"\n{table(title, recording, results)}", flush=True)
         if not args.quick:
-            _play_room(session, methods, names, args.out, Path(directory))
+            play_room(session, methods, names, args.out, Path(directory))
         by_us, by_p3p = names[_ROLLING], names[_GLOBAL]
         print(scene.draw(cube, acts[2].results, by_us, by_p3p, args.out / CUBE))
         print(f"\n{args.out / CUBE}")
@@ -113,33 +112,6 @@ def run(args: argparse.Namespace) -> None:
                 figures.save(figure, args.out / name)
                 print(args.out / name)
     print(f"done in {time.monotonic() - started:.0f} s")
-
-
-def _play_room(
-    session: Any,
-    methods: dict[str, dict[str, str]],
-    names: dict[str, str],
-    out: Path,
-    directory: Path,
-) -> None:
-    """A room without markers: mapped from one walk, another one localized in the map."""
-    if reason := missing():
-        print(f"\nA room without markers is left out: {reason}")
-        return
-    room = RoomScene(directory)
-    recording = room.record()
-    maps = {_ROLLING: room.map_file, _GLOBAL: room.global_map_file}
-    given = {name: {**methods[name], "map_file": str(maps[name])} for name in methods}
-    with tqdm(
-        total=len(recording.clouds), unit="frame", desc="Room without markers", disable=None
-    ) as bar:
-        answers = session.play(
-            recording, room.readout_time, given, bar.update, lossless=(_ROLLING,), topic=KEYPOINTS
-        )
-    results = {names[name]: compare(answers[name], recording.truth) for name in methods}
-    print(f"\n{table('A room mapped without markers', recording, results)}", flush=True)
-    plots.save(room.picture(recording, results), out / ROOM)
-    print(out / ROOM)
 
 
 def _webcam_readout_time() -> float:

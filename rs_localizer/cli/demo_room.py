@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,9 +17,12 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.estimates import Motions
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import make_camera_info
+from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.io.trajectories import Trajectory, Twists, read_tum
 from rs_localizer.lab.experiments.room_mapping import Piece, Room, without_refinement
-from rs_localizer.lab.measures.comparison import Recording, Result
+from rs_localizer.lab.measures import figures
+from rs_localizer.lab.measures.comparison import Recording, Result, compare
+from rs_localizer.lab.measures.comparison_table import table
 from rs_localizer.lab.measures.map_pictures import localized_picture
 from rs_localizer.lab.rendering.renderer import ImageSettings
 from rs_localizer.lab.simulation.frames import middle_stamp
@@ -36,7 +40,7 @@ _KEYPOINTS = 400
 _WALK, _FLIGHT = Piece(30.0, 9.8, 8.0), Piece(40.0, 8.0, 15.0)
 
 
-def missing() -> str:
+def _missing() -> str:
     """Why there can be no map; empty: there can."""
     try:
         require()
@@ -94,6 +98,49 @@ class RoomScene:
         assert recording.truth is not None
         poses = {name: result.poses for name, result in results.items()}
         return localized_picture(self._landmarks.points, recording.truth.poses, poses)
+
+
+def play_room(
+    session: Any,
+    methods: Mapping[str, Mapping[str, Any]],
+    names: Mapping[str, str],
+    out: Path,
+    directory: Path,
+) -> None:
+    """Let the nodes of several methods localize the second walk; print and draw what they said.
+
+    Args:
+        session: of the live nodes.
+        methods: their settings, by name: the rolling shutter's first, then the global one's.
+        names: what they are called in tables.
+        out: for the picture.
+        directory: for what is passing.
+    """
+    if reason := _missing():
+        print(f"\nA room without markers is left out: {reason}")
+        return
+    room = RoomScene(directory)
+    recording = room.record()
+    maps = (room.map_file, room.global_map_file)
+    given = {
+        name: {**settings, "map_file": str(file)}
+        for (name, settings), file in zip(methods.items(), maps, strict=True)
+    }
+    with tqdm(
+        total=len(recording.clouds), unit="frame", desc="Room without markers", disable=None
+    ) as bar:
+        answers = session.play(
+            recording,
+            room.readout_time,
+            given,
+            bar.update,
+            lossless=(next(iter(methods)),),
+            topic=KEYPOINTS,
+        )
+    results = {names[name]: compare(answers[name], recording.truth) for name in methods}
+    print(f"\n{table('A room mapped without markers', recording, results)}", flush=True)
+    figures.save(room.picture(recording, results), out / ROOM)
+    print(out / ROOM)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from rs_localizer.config import FeatureConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
@@ -123,7 +124,7 @@ class Room:
         found = {}
         for cloud in clouds:
             stamp = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec
-            localizer.take_camera_info(make_camera_info(self.camera, stamp))
+            localizer.calibrate(read_camera_info(make_camera_info(self.camera, stamp)))
             found[stamp] = localizer.localize_keypoints(cloud)
         return found
 
