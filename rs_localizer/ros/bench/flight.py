@@ -26,12 +26,13 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import (
     CAMERA_INFO_TOPIC,
     CORRESPONDENCES_TOPIC,
+    KEYPOINTS_TOPIC,
     MARKER_MAP,
     PARAMETERS,
     RAW_IMAGE_TOPIC,
 )
 from rs_localizer.ros.node.conversion import copy_message
-from rs_localizer.settings import DETECTOR_NAME, NODE_NAME
+from rs_localizer.settings import NODE_NAME
 
 POSE, TWIST = f"/{NODE_NAME}/{topics.POSE}", f"/{NODE_NAME}/{topics.TWIST}"
 KINDS = {POSE: PoseStamped, TWIST: TwistStamped}
@@ -47,13 +48,25 @@ _LAST_ANSWERS = 1.0
 
 
 @contextmanager
-def flying(images: Path, parameters: list[str]) -> Iterator[Flight]:
-    """Both nodes, started and ready, until the end."""
+def flying(images: Path, parameters: list[str], landmarks: Path | None = None) -> Iterator[Flight]:
+    """Both nodes, started and ready, until the end.
+
+    Args:
+        images: directory with the bag, the parameters and, for markers, their map.
+        parameters: further ones of the localizer.
+        landmarks: map file; the localizer gets keypoints of the feature detector and matches them
+            with it. None: markers are looked for.
+    """
     given = [word for parameter in parameters for word in ("-p", parameter)]
+    detector, topic = "marker_detector", CORRESPONDENCES_TOPIC
+    markers = ["-p", f"marker_map:={images / MARKER_MAP}"]
+    if landmarks is not None:
+        detector, topic, markers = "feature_detector", KEYPOINTS_TOPIC, []
+        given += ["-p", f"map_file:={landmarks}"]
     processes = {
-        DETECTOR_NAME: _start(
-            "marker_detector",
-            *("-p", f"marker_map:={images / MARKER_MAP}"),
+        detector: _start(
+            detector,
+            *markers,
             *("-r", f"{topics.IMAGE}:={RAW_IMAGE_TOPIC.removesuffix('/compressed')}"),
             *("-r", f"{topics.COMPRESSED_IMAGE}:={RAW_IMAGE_TOPIC}"),
             *("-p", _RELIABLE.format(RAW_IMAGE_TOPIC)),
@@ -61,7 +74,7 @@ def flying(images: Path, parameters: list[str]) -> Iterator[Flight]:
         "localizer": _start(
             "main",
             *("--params-file", str(images / PARAMETERS)),
-            *("-p", _RELIABLE.format(CORRESPONDENCES_TOPIC)),
+            *("-p", _RELIABLE.format(topic)),
             *("-p", _RELIABLE.format(CAMERA_INFO_TOPIC)),
             *given,
         ),
@@ -69,7 +82,7 @@ def flying(images: Path, parameters: list[str]) -> Iterator[Flight]:
     context = Context()
     rclpy.init(args=[], context=context)
     try:
-        flight = Flight(context, processes)
+        flight = Flight(context, processes, topic)
         flight.wait_for_nodes()
         yield flight
     finally:
@@ -88,7 +101,9 @@ def _start(function: str, *arguments: str) -> subprocess.Popen[bytes]:
 class Flight:
     """Publishes images and hears the answers."""
 
-    def __init__(self, context: Context, processes: Mapping[str, subprocess.Popen[bytes]]) -> None:
+    def __init__(
+        self, context: Context, processes: Mapping[str, subprocess.Popen[bytes]], topic: str
+    ) -> None:
         self._processes = processes
         self._node = rclpy.create_node("image_flight", context=context)
         self._executor = SingleThreadedExecutor(context=context)
@@ -101,7 +116,7 @@ class Flight:
         for topic, kind in KINDS.items():
             self._node.create_subscription(kind, topic, self._listener(self.heard[topic]), _QOS)
         self._node.create_subscription(
-            PointCloud2, CORRESPONDENCES_TOPIC, lambda m: self._detected.add(stamp_ns(m)), _QOS
+            PointCloud2, topic, lambda m: self._detected.add(stamp_ns(m)), _QOS
         )
 
     def _listener(self, heard: dict[int, Any]) -> Callable[[Any], None]:

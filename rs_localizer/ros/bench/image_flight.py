@@ -6,6 +6,11 @@
 the same parameters. Each image is sent when the one before has been answered, so that none is
 dropped: then the nodes have to say the same, bit for bit.
 
+    python -m rs_localizer.ros.bench.image_flight flight poses -p pose_time:=mid_frame --map map.npz
+
+does so by features and a map of landmarks, of which ``detect --features sift`` and ``replay --map``
+made ``poses``.
+
     python -m rs_localizer.ros.bench.image_flight flight --rate 30
 
 sends the images at a camera's pace instead, and tells how long the poses take.
@@ -44,19 +49,22 @@ class Agreement:
         return self.live == self.replayed == self.identical and self.live[POSE] > 0
 
 
-def fly(images: Path, replayed: Path, parameters: list[str]) -> Agreement:
+def fly(
+    images: Path, replayed: Path, parameters: list[str], landmarks: Path | None = None
+) -> Agreement:
     """Start both nodes, send them all images, and compare.
 
     Args:
         images: directory with the bag, the marker map and the parameters.
         replayed: directory that replay wrote.
         parameters: further ones of the localizer, ``name:=value``.
+        landmarks: map file of features; None: markers.
 
     Raises:
         ValueError: when a node ends or does not answer.
     """
     offline = _offline(replayed)
-    with flying(images, parameters) as flight:
+    with flying(images, parameters, landmarks) as flight:
         count = flight.send(images, offline)
         live = flight.heard
     return Agreement(
@@ -70,7 +78,9 @@ def fly(images: Path, replayed: Path, parameters: list[str]) -> Agreement:
     )
 
 
-def latencies(images: Path, rate: float, parameters: list[str]) -> tuple[int, list[float]]:
+def latencies(
+    images: Path, rate: float, parameters: list[str], landmarks: Path | None = None
+) -> tuple[int, list[float]]:
     """Start both nodes and send them the images at a steady rate, as a camera does.
 
     Args:
@@ -85,7 +95,7 @@ def latencies(images: Path, rate: float, parameters: list[str]) -> tuple[int, li
     Raises:
         ValueError: when a node ends.
     """
-    with flying(images, parameters) as flight:
+    with flying(images, parameters, landmarks) as flight:
         sent = flight.pace(images, rate)
         answered = flight.arrivals
     return len(sent), [answered[stamp] - sent[stamp] for stamp in answered.keys() & sent.keys()]
@@ -113,13 +123,14 @@ def main(arguments: list[str] | None = None) -> int:
         "-p", dest="parameters", action="append", default=[], metavar="NAME:=VALUE",
         help="parameter of the localizer, as for replay",
     )  # fmt: skip
+    parser.add_argument("--map", type=Path, metavar="FILE", help="of landmarks, for features")
     options = parser.parse_args(arguments)
     if (options.replayed is None) == (options.rate is None):
         parser.error("give either what replay wrote or --rate")
     # Nobody else's nodes shall hear these images.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     if options.rate is not None:
-        sent, taken = latencies(options.images, options.rate, options.parameters)
+        sent, taken = latencies(options.images, options.rate, options.parameters, options.map)
         if not taken:
             raise ValueError(f"none of {sent} images was answered")
         middle, most = 1e3 * np.quantile(taken, [0.5, 0.95])
@@ -128,7 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
             f"p50 {middle:.1f} ms, p95 {most:.1f} ms\n"
         )
         return 0
-    found = fly(options.images, options.replayed, options.parameters)
+    found = fly(options.images, options.replayed, options.parameters, options.map)
     sys.stdout.write(f"{found.images} images\n")
     for topic in KINDS:
         sys.stdout.write(
