@@ -26,7 +26,7 @@ from rs_localizer.lab.measures.comparison_table import table
 from rs_localizer.lab.measures.map_pictures import localized_picture
 from rs_localizer.lab.rendering.renderer import ImageSettings
 from rs_localizer.lab.simulation.frames import middle_stamp
-from rs_localizer.mapping.structure import require
+from rs_localizer.mapping.structure import Effort, require
 from rs_localizer.process.missing import explain
 
 ROOM = "room.png"
@@ -36,8 +36,9 @@ _CAMERA = Camera(
     readout_time=0.03,
 )  # fmt: skip
 _SENSOR = ImageSettings(exposure=0.005, noise=2.0)
-_KEYPOINTS = 400
-_WALK, _FLIGHT = Piece(30.0, 9.8, 8.0), Piece(40.0, 8.0, 15.0)
+_KEYPOINTS = 300
+_WALK, _FLIGHT = Piece(28.0, 11.8, 15.0), Piece(40.0, 8.0, 15.0)
+_EFFORT = Effort(adjusted=60)
 
 
 def _missing() -> str:
@@ -65,7 +66,7 @@ class RoomScene:
             views = self._room.look(_WALK, lambda: step(1))
         folder = directory / "colmap"
         folder.mkdir()
-        built = self._room.build(views, folder, _bar)
+        built = self._room.build(views, folder, _bar, _EFFORT)
         self._landmarks = built.landmarks
         write_npz(self.map_file, built.landmarks)
         write_npz(self.global_map_file, without_refinement(built))

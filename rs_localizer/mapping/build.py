@@ -36,6 +36,8 @@ _USUAL_DISTANCE = 2.5
 # A view with fewer features is blurred, dark, or of a blank wall.
 _FEW_FEATURES = 50
 _LEAST_VIEWS = 3
+# Share of the keypoints that fit a good map: nine in ten do.
+_LEAST_FIT = 0.8
 # Share of the keyframes that must hang together.
 _LEAST_PART = 0.5
 # A landmark counts when so many views agree, and it is known to this part of its usual distance.
@@ -139,10 +141,13 @@ def build_map(given: Given, work: Workshop) -> Built:
             "map: it is wrong, as repeated texture or a wrong calibration make it"
         )
     seen = all_seen(given.views, structure, followed)
-    sightings, start, used = for_adjustment(given.stamps_ns, followed, seen, structure.points)
+    sightings, start, used = for_adjustment(
+        given.stamps_ns, followed, seen, structure.points, work.effort.adjusted
+    )
     with work.stage("refine", 3) as step:
         freedom = MapFreedom(readout_time=given.estimate_readout)
         refined = refine(given.camera, sightings, start, freedom, done=lambda _: step(1))
+    _check_fit(refined)
     motion = Motion(followed.views[used], refined.times, refined)
     shown = motion.seen(followed.views[seen.images], seen.landmarks, seen.pixels)
     found = triangulate(refined.camera, motion.sights(shown), len(structure.points))
@@ -213,6 +218,17 @@ def _descriptors(views: Sequence[View], structure: Structure) -> np.ndarray:
         ]
     ).astype(np.float32)
     return np.stack([rows[medoid(rows)] for rows in np.split(all_rows, ends[:-1])])
+
+
+def _check_fit(refined: RefinedMap) -> None:
+    """Images too far apart leave the motion between them open, and the map may follow it."""
+    share = float(np.mean(refined.inliers))
+    if share < _LEAST_FIT:
+        raise MappingError(
+            f"after the refinement {100 * share:.0f} % of the keypoints fit the map, "
+            f"{100 * _LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
+            "check the readout time and the calibration"
+        )
 
 
 def _placement(given: Given, motion: Motion) -> Placement:

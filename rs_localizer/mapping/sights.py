@@ -15,8 +15,6 @@ from rs_localizer.mapping.sightings import Sightings, Start
 from rs_localizer.mapping.structure import Structure
 from rs_localizer.mapping.views import View
 
-# Keypoints of a view that the adjustment takes: more say little more, and cost time.
-_PER_VIEW = 150
 # Of a landmark: fewer hold it on one ray, nearly.
 _LEAST_SIGHTS = 3
 
@@ -52,17 +50,18 @@ def all_seen(views: Sequence[View], structure: Structure, followed: Followed) ->
 
 
 def for_adjustment(
-    stamps_ns: IntArray, followed: Followed, seen: Seen, points: Array
+    stamps_ns: IntArray, followed: Followed, seen: Seen, points: Array, wanted: int
 ) -> tuple[Sightings, Start, IntArray]:
     """The landmarks that are seen most often, as many as the views need.
 
     Args:
         stamps_ns: of all views.
+        wanted: keypoints of each view.
 
     Returns:
         what is adjusted, and which rows of ``followed.views`` take part.
     """
-    chosen = _chosen(seen, len(points), len(followed.views))
+    chosen = _chosen(seen, len(points), len(followed.views), wanted)
     kept = chosen[seen.landmarks]
     used, images = np.unique(seen.images[kept], return_inverse=True)
     return (
@@ -72,7 +71,7 @@ def for_adjustment(
     )
 
 
-def _chosen(seen: Seen, landmarks: int, images: int) -> BoolArray:
+def _chosen(seen: Seen, landmarks: int, images: int, wanted: int) -> BoolArray:
     """Landmarks by how often they are seen, each if half of its views need more."""
     order = np.argsort(seen.landmarks, kind="stable")
     starts = np.searchsorted(seen.landmarks[order], np.arange(landmarks + 1))
@@ -81,7 +80,7 @@ def _chosen(seen: Seen, landmarks: int, images: int) -> BoolArray:
         at = seen.images[order[starts[landmark] : starts[landmark + 1]]]
         if len(at) < _LEAST_SIGHTS:
             break
-        if np.mean(counts[at] < _PER_VIEW) >= 0.5:
+        if np.mean(counts[at] < wanted) >= 0.5:
             chosen[landmark] = True
             counts[at] += 1
     return chosen

@@ -64,10 +64,13 @@ class Structure:
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How COLMAP works."""
+    """How much work is done, and how."""
 
-    threads: int = -1  # -1: all
+    threads: int = 1  # of COLMAP; with more than one, the last digits vary
     seed: int = 0
+    adjusted: int = (
+        150  # keypoints of a view that are adjusted: more say little more, and cost time
+    )
 
 
 def require() -> None:

@@ -96,10 +96,16 @@ class Room:
             done()
         return views
 
-    def build(self, views: Sequence[View], folder: Path, stage: Stage | None = None) -> Built:
+    def build(
+        self,
+        views: Sequence[View],
+        folder: Path,
+        stage: Stage | None = None,
+        effort: Effort | None = None,
+    ) -> Built:
         """The map, with its metres from the markers."""
         given = Given(views, self.camera, Anchors(self.marker_map))
-        return build_map(given, Workshop(folder, Effort(), stage or _silent))
+        return build_map(given, Workshop(folder, effort or Effort(), stage or _silent))
 
     def clouds(self, piece: Piece, done: Callable[[], object] = lambda: None) -> list[Any]:
         """The keypoints of a piece, as the node ``feature_detector`` sends them."""
