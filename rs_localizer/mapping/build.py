@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +24,11 @@ from rs_localizer.mapping.errors import MappingError
 from rs_localizer.mapping.following import follow
 from rs_localizer.mapping.keyframes import Keyframes, choose_keyframes
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
+from rs_localizer.mapping.sightings import Sightings
 from rs_localizer.mapping.sights import Seen, all_seen, for_adjustment
 from rs_localizer.mapping.similarity import Similarity
 from rs_localizer.mapping.structure import Effort, Stage, Structure, build_structure
+from rs_localizer.mapping.tied import tied
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
 from rs_localizer.mapping.views import View
 
@@ -144,8 +146,13 @@ def build_map(given: Given, work: Workshop) -> Built:
     sightings, start, used = for_adjustment(
         given.stamps_ns, followed, seen, structure.points, work.effort.adjusted
     )
+    freedom = MapFreedom()
+    if given.anchors.marker_map is not None:
+        corners = _corners(given, sightings.stamps_ns)
+        places = given.anchors.marker_map.points
+        sightings, start, freedom = tied(given.camera, sightings, start, corners, places)
     with work.stage("refine", 3) as step:
-        freedom = MapFreedom(readout_time=given.estimate_readout)
+        freedom = replace(freedom, readout_time=given.estimate_readout)
         refined = refine(given.camera, sightings, start, freedom, done=lambda _: step(1))
     _check_fit(refined)
     motion = Motion(followed.views[used], refined.times, refined)
@@ -218,6 +225,15 @@ def _descriptors(views: Sequence[View], structure: Structure) -> np.ndarray:
         ]
     ).astype(np.float32)
     return np.stack([rows[medoid(rows)] for rows in np.split(all_rows, ends[:-1])])
+
+
+def _corners(given: Given, stamps_ns: IntArray) -> Sightings:
+    """Corners of markers in the images with these stamps."""
+    views, corners, pixels = given.anchors.seen(given.views)
+    stamps = given.stamps_ns[views]
+    images = np.minimum(np.searchsorted(stamps_ns, stamps), len(stamps_ns) - 1)
+    known = stamps_ns[images] == stamps
+    return Sightings(stamps_ns, images[known], corners[known], pixels[known])
 
 
 def _check_fit(refined: RefinedMap) -> None:
