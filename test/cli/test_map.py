@@ -64,7 +64,7 @@ def test_text(tmp_path: Path) -> None:
         (["map", "convert", "a.ply", "b.obj"], 2, "OUT must end in .npz or .ply or .yaml"),
         (["map", "convert", "a.ply", "b.npz", "--text"], 2, "--text goes with .ply"),
         (["map", "info", "nowhere.ply"], 1, "No such file or directory: 'nowhere.ply'"),
-        (["map", "info", str(COLMAP / "truth.json")], 1, "truth.json is no marker map that is known"),
+        (["map", "info", str(COLMAP / "truth.json")], 1, "truth.json is not a marker map"),
     ],
 )
 def test_what_is_refused(

@@ -128,7 +128,7 @@ def field(number: object, turn: str) -> str:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("{", "is no JSON file"),
+        ("{", "is not a JSON file"),
         ("[]", "must hold a mapping"),
         ("[" * 90 + "]" * 90, "nests deeper than 50"),
         ('{"tags": [{"ID": "x"}]}', "tag 1: ID cannot be 'x'"),
@@ -145,8 +145,8 @@ def test_broken_json(tmp_path: Path, text: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a: [", "is no YAML file"),
-        ("a: 1", "is no marker map that is known .*: it has a"),
+        ("a: [", "is not a YAML file"),
+        ("a: 1", "is not a marker map of a known format .*: it has a"),
         ("bodies: 3", "bodies cannot be 3"),
         ("bodies: [{a: {tags: [{id: 1, pose: {}}]}}]", r"\(id 1\) has no size"),
         ("bodies: []", "none of its static bodies has tags with a pose"),

@@ -10,10 +10,9 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.lab.experiments.mapping.rooms import (
+    Film,
     a_walk,
     estimators_camera,
-    near,
-    see,
     walls,
 )
 from rs_localizer.lab.independent.cameras import Camera
@@ -40,9 +39,8 @@ def bend(seed: int) -> Iterator[str]:
     """Errors of one map: as given, and adjusted with each shutter."""
     camera, rng = Camera(), np.random.default_rng(seed)
     walk, points = a_walk(rng, 0.6), walls(rng, 1500)
-    stamps = np.arange(0.0, 12.0, 1.0 / 15.0)
-    seen = see(camera, walk, points, stamps, _NOISE, rng, 80)
-    start = near(walk, points, stamps + 0.5 * _READOUT, _OFF, rng)
+    film = Film(camera, walk, np.arange(0.0, 12.0, 1.0 / 15.0))
+    seen, start = film.see(points, _NOISE, rng, 80), film.near(points, _OFF, rng)
     yield "shutter of the adjustment    landmarks  median    95 % (mm)  noise (px)  readout (ms)"
     first = ""
     for name, readout, free, offset in (
@@ -69,8 +67,8 @@ def bound(seed: int, trials: int = 20) -> Iterator[str]:
     """Errors by the Cramer-Rao bound, where ten landmarks are known."""
     camera, rng = Camera(), np.random.default_rng(seed)
     walk, points = a_walk(rng, 0.3, 0.8), walls(rng, 500)
-    stamps = np.arange(0.0, 2.0, 1.0 / 15.0)
-    exact = see(camera, walk, points, stamps, 0.0, rng, 60)
+    film = Film(camera, walk, np.arange(0.0, 2.0, 1.0 / 15.0))
+    exact = film.see(points, 0.0, rng, 60)
     seen_often = np.argsort(-np.bincount(exact.landmarks, minlength=len(points)))
     deviations = np.full(len(points), np.inf)
     deviations[seen_often[:10]] = 1e-4
@@ -79,13 +77,13 @@ def bound(seed: int, trials: int = 20) -> Iterator[str]:
     least, ratios, own = None, [], []
     for _ in range(trials):
         noisy = exact.pixels + rng.normal(0.0, _NOISE, exact.pixels.shape)
-        start = near(walk, points, stamps + 0.5 * _READOUT, _OFF, rng)
+        start = film.near(points, _OFF, rng)
         known = points + rng.normal(0.0, 1e-4, points.shape)
         places = np.where(np.isfinite(deviations)[:, None], known, start.points)
         seen = replace(exact, pixels=noisy)
         found = refine(ours, seen, replace(start, points=places), freedom)
         if least is None:
-            least = _least(ours, seen, found, freedom)
+            least = _least(seen, found, freedom)
         of = found.refined & np.isinf(deviations) & (found.sights >= 4)
         squared = np.sum((found.points - points) ** 2, axis=1)
         ratios.append(squared[of] / np.trace(least, axis1=1, axis2=2)[of])
@@ -97,7 +95,7 @@ def bound(seed: int, trials: int = 20) -> Iterator[str]:
     )
 
 
-def _least(camera: object, seen: Sightings, found: RefinedMap, freedom: MapFreedom) -> Array:
+def _least(seen: Sightings, found: RefinedMap, freedom: MapFreedom) -> Array:
     """Covariances (p,3,3) of an estimator that loses nothing, at errors of zero."""
     start = Start(found.points, *found.poses())
     prepared = Preparation(found.camera, seen, start, freedom, 0.0)
@@ -118,9 +116,8 @@ def large(seed: int) -> Iterator[str]:
     """300 images that stand alone, 20,000 landmarks."""
     camera, rng = Camera(), np.random.default_rng(seed)
     walk, points = a_walk(rng, 0.25), walls(rng, 20_000)
-    stamps = np.arange(0.0, 119.9, 0.4)
-    seen = see(camera, walk, points, stamps, _NOISE, rng)
-    start = near(walk, points, stamps + 0.5 * _READOUT, _OFF, rng)
+    film = Film(camera, walk, np.arange(0.0, 119.9, 0.4))
+    seen, start = film.see(points, _NOISE, rng), film.near(points, _OFF, rng)
     wall, busy = time.perf_counter(), time.process_time()
     found = refine(estimators_camera(camera, _READOUT), seen, start)
     wall, busy = time.perf_counter() - wall, time.process_time() - busy

@@ -63,53 +63,78 @@ def walls(rng: np.random.Generator, count: int) -> Array:
     return points
 
 
-def _shown(camera: cameras.Camera, walk: Walk, points: Array, stamps: Array) -> Iterator[Array]:
-    """Pixels (p,2) of points in each image; NaN for those that it does not show."""
-    for stamp in stamps.tolist():
+@dataclass(frozen=True, slots=True, eq=False)
+class Film:
+    """Images of a walk."""
 
-        def local_at(delay: Array, stamp: float = stamp) -> Array:
-            rotations, places = walk.poses(stamp + delay)
-            return np.asarray(np.einsum("nji,nj->ni", rotations, points - places))
+    camera: cameras.Camera
+    walk: Walk
+    stamps: Array  # (g,) s, of the first rows
 
-        pixels = camera.project_rolling(local_at, (len(points),))
-        size = np.array([camera.width, camera.height]) - 1.0
-        # What lies far outside is folded back by the lens's polynomial.
-        rotation, place = walk.poses(np.array([stamp]))
-        local = (points - place) @ rotation[0]
-        ahead = np.abs(local[:, :2]).max(axis=1) < 1.0 * local[:, 2]
-        with np.errstate(invalid="ignore"):
-            inside = np.all((pixels > 1.0) & (pixels < size - 1.0), axis=1)
-        yield np.where((inside & ahead)[:, None], pixels, np.nan)
+    def see(
+        self, points: Array, noise: float, rng: np.random.Generator, most: int = 700
+    ) -> Sightings:
+        """Keypoints of points (p,3), so many of an image at most."""
+        images, landmarks, pixels = [], [], []
+        for g, shown in enumerate(self._shown(points)):
+            found = rng.permutation(np.flatnonzero(np.isfinite(shown[:, 0])))[:most]
+            images.append(np.full(len(found), g))
+            landmarks.append(found)
+            pixels.append(shown[found] + rng.normal(0.0, noise, (len(found), 2)))
+        return Sightings(
+            10**12 + np.round(1e9 * self.stamps).astype(np.int64),
+            np.concatenate(images),
+            np.concatenate(landmarks),
+            np.concatenate(pixels),
+        )
+
+    def near(self, points: Array, off: float, rng: np.random.Generator) -> Start:
+        """A first guess that is ``off`` (m) the truth."""
+        rotations, places = self.walk.poses(self.stamps + 0.5 * self.camera.readout_time)
+        return Start(
+            points + rng.normal(0.0, off, points.shape),
+            rotations @ exponential(rng.normal(0.0, 0.25 * off, (len(rotations), 3))),
+            places + rng.normal(0.0, off, places.shape),
+        )
+
+    def spot(
+        self, poses: list[tuple[Array, Array]], size: float, noise: float, rng: np.random.Generator
+    ) -> list[Spotted]:
+        """The markers that images show whole, large and not too slanted."""
+        corners = np.concatenate([size * _SQUARE @ turn.T + place for turn, place in poses])
+        normals = np.array([turn[:, 2] for turn, _ in poses])
+        middles = np.array([place for _, place in poses])
+        spotted = []
+        for stamp, pixels in zip(self.stamps.tolist(), self._shown(corners), strict=True):
+            quads = pixels.reshape(-1, 4, 2)
+            toward = self.walk.poses(np.array([stamp]))[1][0] - middles
+            slant = np.einsum("ni,ni->n", toward, normals) / np.linalg.norm(toward, axis=1)
+            side = np.linalg.norm(np.roll(quads, 1, axis=1) - quads, axis=2).min(axis=1)
+            with np.errstate(invalid="ignore"):
+                seen = np.flatnonzero((slant > _STEEPEST) & (side > _LEAST_SIDE))
+            found = quads[seen] + rng.normal(0.0, noise, (len(seen), 4, 2))
+            spotted.append(Spotted(10**12 + round(1e9 * stamp), seen, found))
+        return spotted
+
+    def _shown(self, points: Array) -> Iterator[Array]:
+        """Pixels (p,2) of points in each image; NaN for those that it does not show."""
+        size = np.array([self.camera.width, self.camera.height]) - 1.0
+        for stamp in self.stamps.tolist():
+
+            def local_at(delay: Array, stamp: float = stamp) -> Array:
+                rotations, places = self.walk.poses(stamp + delay)
+                return np.asarray(np.einsum("nji,nj->ni", rotations, points - places))
+
+            pixels = self.camera.project_rolling(local_at, (len(points),))
+            # What lies far outside is folded back by the lens's polynomial.
+            local = local_at(np.zeros(len(points)))
+            ahead = np.abs(local[:, :2]).max(axis=1) < local[:, 2]
+            with np.errstate(invalid="ignore"):
+                inside = np.all((pixels > 1.0) & (pixels < size - 1.0), axis=1)
+            yield np.where((inside & ahead)[:, None], pixels, np.nan)
 
 
-def see(
-    camera: cameras.Camera, walk: Walk, points: Array, stamps: Array, noise: float,
-    rng: np.random.Generator, most: int = 700,
-) -> Sightings:  # fmt: skip
-    """Keypoints of images at stamps (g,), s."""
-    images, landmarks, pixels = [], [], []
-    for g, shown in enumerate(_shown(camera, walk, points, stamps)):
-        found = rng.permutation(np.flatnonzero(np.isfinite(shown[:, 0])))[:most]
-        images.append(np.full(len(found), g))
-        landmarks.append(found)
-        pixels.append(shown[found] + rng.normal(0.0, noise, (len(found), 2)))
-    return Sightings(
-        10**12 + np.round(1e9 * stamps).astype(np.int64), np.concatenate(images),
-        np.concatenate(landmarks), np.concatenate(pixels),
-    )  # fmt: skip
-
-
-def near(walk: Walk, points: Array, stamps: Array, off: float, rng: np.random.Generator) -> Start:
-    """A first guess that is ``off`` (m) the truth at times (g,), s."""
-    rotations, places = walk.poses(stamps)
-    return Start(
-        points + rng.normal(0.0, off, points.shape),
-        rotations @ exponential(rng.normal(0.0, 0.25 * off, (len(stamps), 3))),
-        places + rng.normal(0.0, off, places.shape),
-    )
-
-
-def ring(rng: np.random.Generator, count: int, size: float) -> list[tuple[Array, Array]]:
+def ring(rng: np.random.Generator, count: int) -> list[tuple[Array, Array]]:
     """Poses map_from_marker of markers all around the room, hung by hand."""
     poses = []
     for k in range(count):
@@ -136,25 +161,3 @@ def grid(columns: int, rows: int, size: float, gap: float) -> list[tuple[Array, 
         for row in range(rows)
         for column in range(columns)
     ]  # fmt: skip
-
-
-def spot(
-    camera: cameras.Camera, walk: Walk, poses: list[tuple[Array, Array]], size: float,
-    stamps: Array, noise: float, rng: np.random.Generator,
-) -> list[Spotted]:  # fmt: skip
-    """The markers that images at stamps (g,), s, show whole, large and not too slanted."""
-    corners = np.concatenate([size * _SQUARE @ turn.T + place for turn, place in poses])
-    normals = np.array([turn[:, 2] for turn, _ in poses])
-    middles = np.array([place for _, place in poses])
-    spotted = []
-    shown = _shown(camera, walk, corners, stamps)
-    for stamp, pixels in zip(stamps.tolist(), shown, strict=True):
-        quads = pixels.reshape(-1, 4, 2)
-        toward = walk.poses(np.array([stamp]))[1][0] - middles
-        slant = np.einsum("ni,ni->n", toward, normals) / np.linalg.norm(toward, axis=1)
-        side = np.linalg.norm(np.roll(quads, 1, axis=1) - quads, axis=2).min(axis=1)
-        with np.errstate(invalid="ignore"):
-            seen = np.flatnonzero((slant > _STEEPEST) & (side > _LEAST_SIDE))
-        found = quads[seen] + rng.normal(0.0, noise, (len(seen), 4, 2))
-        spotted.append(Spotted(10**12 + round(1e9 * stamp), seen, found))
-    return spotted

@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments.mapping.rooms import (
+    Film,
     Walk,
     a_walk,
     estimators_camera,
     grid,
     ring,
-    spot,
 )
 from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.mapping.gauge import similarity
@@ -28,7 +28,7 @@ _LARGE = Camera(width=1280, height=960, focal=840.0)
 
 def surveys(seed: int, trials: int = 3) -> Iterator[str]:
     """Errors of the markers in the frame of the first, and what they are told to be."""
-    yield "scene                              markers  mm and deg (median)  laid over (mm)  in 3 (%)"
+    yield "scene                              markers     mm      deg  laid over (mm)   in 3 (%)"
     room = 0.6, 0.5
     for name, camera, walls in (
         ("printed wall 3x2 of 0.06 m, VGA", Camera(), True),
@@ -39,7 +39,7 @@ def surveys(seed: int, trials: int = 3) -> Iterator[str]:
         for trial in range(trials):
             rng = np.random.default_rng([seed, trial])
             walk = a_walk(rng, 0.0, 0.15) if walls else a_walk(rng, *room)
-            poses = grid(3, 2, 0.06, 0.02) if walls else ring(rng, 12, 0.15)
+            poses = grid(3, 2, 0.06, 0.02) if walls else ring(rng, 12)
             found.append(_one(rng, camera, walk, poses, 0.06 if walls else 0.15))
         places, turns, over, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
         yield (
@@ -53,7 +53,7 @@ def _one(
     size: float,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     stamps = np.arange(0.0, 30.0, 1.0 / 30.0)
-    spotted = spot(camera, walk, poses, size, stamps, _NOISE, rng)
+    spotted = Film(camera, walk, stamps).spot(poses, size, _NOISE, rng)
     markers = every_marker([family("4x4_50")], size, {})
     return _errors(survey(estimators_camera(camera, camera.readout_time), spotted, markers), poses)
 
