@@ -62,7 +62,7 @@ def file_shots(path: Path, rate: float | None, camera: Camera) -> Iterator[Itera
     else:
         files = image_files(path)
         if rate is None and not have_times(files):
-            raise UsageError("the names of the files are no times in ns: give --rate")
+            raise UsageError("the names of the files are not times in ns: give --rate")
         yield from_files(files, camera, clock)
     print(clock.told())
     if fault := clock.fault():

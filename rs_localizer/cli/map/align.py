@@ -76,7 +76,7 @@ def _wishes(args: argparse.Namespace) -> Wishes:
         except ValueError:
             raise UsageError(f"--distance takes two ids and metres, got {args.distance}") from None
         if not 0.0 < distance[2] < np.inf:
-            raise UsageError(f"--distance: {apart} is no length")
+            raise UsageError(f"--distance: {apart} is not a length")
     return Wishes(
         args.scale, distance, _vector(args.up), tuple(args.floor or ()), args.upright, args.origin,
         _vector(args.origin_at),

@@ -39,7 +39,7 @@ def read_any(path: Path, unsaid: Unsaid | None = None) -> tuple[MarkerMap, str]:
     if found is None:
         keys = ", ".join(map(str, tree)) or "nothing"
         raise MarkerMapError(
-            f"{path} is no marker map that is known ({', '.join(FORMATS)}): it has {keys}"
+            f"{path} is not a marker map of a known format ({', '.join(FORMATS)}): it has {keys}"
         )
     if found == OWN:
         return read_marker_map(path), OWN
@@ -71,7 +71,7 @@ def _tree(path: Path) -> dict[Any, Any]:
         raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
     except (YamlError, UnicodeDecodeError, RecursionError, ValueError) as error:
         reason = " ".join(str(error).split())
-        raise MarkerMapError(f"{path} is no {kind} file: {reason}") from error
+        raise MarkerMapError(f"{path} is not a {kind} file: {reason}") from error
     if not isinstance(tree, dict):
         raise MarkerMapError(f"{path} must hold a mapping, found {str(tree)[:60]!r}")
     return tree
