@@ -77,6 +77,7 @@ setup(
         "mapping": ["pycolmap"],
         "view": ["rerun-sdk"],
         "test": [
+            "build",
             "catkin_pkg",
             "codespell==2.4.*",
             "hypothesis",

@@ -69,7 +69,7 @@ def test_poses_of_single_frames_make_a_consistent_filter(
 def test_covariances_about_fixed_axes_are_no_covariances_of_angles(
     flights: tuple[fusion.Frames, fusion.Outputs],
 ) -> None:
-    """Without orientation_covariance roll_pitch_yaw the filter is too sure, and the check sees it."""
+    """Without roll_pitch_yaw the filter is too sure, and the check sees it."""
     choice = next(one for one in fusion.CHOICES if not one.angles)
     fused = fusion.fuse(*flights, choice)
     assert fused.pose.mean() > fused.band[1]

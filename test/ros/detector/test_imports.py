@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 # Modules, packages not counted.
-MOST = 52
+MOST = 54
 
 
 def test_the_detector_does_not_import_the_estimator() -> None:
