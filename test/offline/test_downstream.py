@@ -27,6 +27,7 @@ from rs_localizer.lab.experiments.honesty.estimating import believed
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.jumps import Jumps
 from rs_localizer.settings import build, load_params_file
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -96,6 +97,11 @@ def replayed(flight: Flight, config: NodeConfig) -> tuple[list[Localized], Frame
 @pytest.fixture(scope="module")
 def frames(flight: Flight) -> list[Localized]:
     return replayed(flight, NodeConfig(readout_time=0.03, base_frame="base_link"))[0]
+
+
+def test_a_flight_is_no_jump(frames: list[Localized]) -> None:
+    jumps = Jumps(NodeConfig)
+    assert [jumps.add(frame) for frame in frames] == [0] * LENGTH
 
 
 def squared(errors: Array, covariances: Array) -> float:
