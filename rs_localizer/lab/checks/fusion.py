@@ -139,10 +139,8 @@ def fuse(frames: Frames, published: Outputs, choice: Choice) -> Fused:
     length = len(published[0])
     of_pose, of_velocity, squares = [], [], []
     for flight, messages in enumerate(published):
-        first = next(index for index, message in enumerate(messages) if message is not None)
-        message = messages[first]
-        assert message is not None
-        ekf = Ekf(_PROCESS_NOISE, about_angles(message[0]), *_FIRST)
+        first, begin = _first_pose(messages)
+        ekf = Ekf(_PROCESS_NOISE, about_angles(begin), *_FIRST)
         for index in range(first + 1, length):
             ekf.predict(PERIOD_NS * 1e-9)
             _correct(ekf, messages[index], choice)
@@ -155,6 +153,13 @@ def fuse(frames: Frames, published: Outputs, choice: Choice) -> Fused:
     shape = (len(published), -1)
     rms = float(np.sqrt(np.mean(squares)))
     return Fused(np.reshape(of_pose, shape), np.reshape(of_velocity, shape), rms)
+
+
+def _first_pose(messages: list[tuple[Pose, Twist] | None]) -> tuple[int, Pose]:
+    for index, message in enumerate(messages):
+        if message is not None:
+            return index, message[0]
+    raise ValueError("a flight has no pose at all")
 
 
 def _correct(ekf: Ekf, message: tuple[Pose, Twist] | None, choice: Choice) -> None:
