@@ -151,6 +151,7 @@ class FrameLocalizer:
         so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
         twist_at(_STILL, 0.5, 1.0)
         so3.log(np.eye(3))
+        self.readout_watch.warm_up(self._camera)
         matching.warm_up()
 
     def take_camera_info(self, message: Any) -> None:

@@ -12,7 +12,7 @@ from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.solvers.table import find_solver
-from rs_localizer.trajectory.online import REVERSED, MeasuredReadout, ReadoutMonitor
+from rs_localizer.trajectory.online import REVERSED, MeasuredReadout, ReadoutMonitor, warm_up
 
 # Frames from one measurement to the next: few at first, more when there is more to compute.
 _AT_FIRST, _LATER = 5, 30
@@ -39,6 +39,10 @@ class ReadoutWatch:
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
         self.fault = ""  # how that contradicts the setting, in one sentence
+
+    def warm_up(self, camera: Camera) -> None:
+        """Compile what frames of this camera need."""
+        warm_up(camera)
 
     def reset(self) -> None:
         """Forget all frames."""
