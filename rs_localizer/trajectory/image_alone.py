@@ -46,8 +46,8 @@ def image_alone(
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
     basis = scale[:, None] * vectors
     inverse = basis / np.maximum(values, _LEAST_EIGENVALUE) @ basis.T
-    step: Array = -np.linalg.solve(information + np.diag(variance * _HELD), slope)
-    return step, variance * inverse
+    held = information + np.diag(variance * _HELD)
+    return np.asarray(np.linalg.solve(held, -slope), np.float64), variance * inverse
 
 
 @kernel
