@@ -18,13 +18,10 @@ estimate of a tracked frame believes in the readout time that the tracker was gi
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
@@ -32,7 +29,8 @@ from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.trajectory.image_alone import image_alone
-from rs_localizer.trajectory.online_kernels import SIDE, Equations, Score, View, equation, score
+from rs_localizer.trajectory.measured_readout import MeasuredReadout, Measurement
+from rs_localizer.trajectory.online_kernels import SIDE, Equations, View, equation
 
 REVERSED = {
     ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
@@ -50,36 +48,6 @@ _LONGEST_INTERVAL, _MOST_UNLIKE = 0.15, 2.5
 _LEAST_TRIPLES = 20
 _LEAST_ROOM = 64  # triples
 _MOST_POINTS = 200  # of a frame: more take longer than they are worth
-_LAGS = 6  # neighbouring triples share frames, and errors of the map
-_ROUNDS, _SETTLED = 12, 1e-4
-# Covariances of frames may be wrong by this share; so is the correction for noise at slow motion.
-_COVARIANCE_ERROR = 0.5
-_MODEL_ERROR = 0.005  # of Simpson's rule and of constant velocities in a frame
-# Contradicted is a value that chance puts so far away as seldom as four deviations of a Gaussian,
-# one-sided, and that is off by more than this share.
-_CHANCE, _LEAST_DIFFERENCE = 3.2e-5, 0.06
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredReadout:
-    """A readout time that the frames of the last seconds show."""
-
-    readout_time: float  # s; negative: against the scan direction that was assumed
-    deviation: float  # s
-    triples: int  # frames with two neighbours
-
-    def contradicts(self, readout_time: float) -> bool:
-        """Whether this readout time (s, of the assumed direction) must be wrong."""
-        off = abs(self.readout_time - readout_time)
-        largest = max(abs(self.readout_time), readout_time)
-        # Of few triples the deviation itself is uncertain: Student's t.
-        deviations = float(stdtrit(self.triples / _LAGS, 1.0 - _CHANCE))
-        return off > max(deviations * self.deviation, _LEAST_DIFFERENCE * largest)
-
-    @property
-    def relative_deviation(self) -> float:
-        """Deviation by value."""
-        return self.deviation / max(abs(self.readout_time), 1e-12)
 
 
 class _Window:
@@ -94,6 +62,8 @@ class _Window:
         return self._end - self._first
 
     def clear(self) -> None:
+        """Forget all; equations that were given away stay what they are."""
+        self._all = _room(len(self._times_ns))
         self._first = self._end = 0
 
     def add(self, time_ns: int, views: Sequence[View], first: float, second: float) -> None:
@@ -200,9 +170,14 @@ class ReadoutMonitor:
         Raises:
             LinAlgError: a frame in the window has no covariance.
         """
+        measurement = self.measurement()
+        return None if measurement is None else measurement.finish()
+
+    def measurement(self) -> Measurement | None:
+        """The same, to be computed bit by bit; None as long as there are too few frames."""
         if len(self._window) < _LEAST_TRIPLES:
             return None
-        return _solve(self._window.equations())
+        return Measurement(self._window.equations())
 
 
 def warm_up(camera: Camera) -> None:
@@ -212,35 +187,4 @@ def warm_up(camera: Camera) -> None:
     image_alone(camera, Motion(np.eye(3), *np.zeros((3, 3))), points, pixels)
     window, view = _Window(), View(np.eye(3), np.zeros(3), np.zeros(SIDE), np.eye(2 * SIDE))
     window.add(0, [view, view, view], 1.0, 1.0)
-    _solve(window.equations())
-
-
-def _solve(of: Equations) -> MeasuredReadout | None:
-    """The root of the estimating equation and its deviation."""
-    value = 0.0
-    found = _score(of, value)
-    for _ in range(_ROUNDS):
-        if not found.slope > max(found.noise, 1.0):
-            return None  # the motion is not more than its noise
-        step = float(np.sum(found.terms)) / found.slope
-        value += step
-        found = _score(of, value)
-        if abs(step) < _SETTLED * abs(value):
-            break
-    variance = float(found.terms @ found.terms)
-    for lag in range(1, _LAGS):
-        share = 2.0 * (1.0 - lag / _LAGS)
-        variance += share * float(found.terms[lag:] @ found.terms[:-lag])
-    systematic = _COVARIANCE_ERROR * found.noise / found.slope
-    deviation = math.sqrt(
-        max(variance / found.slope**2, 1.0 / found.slope)
-        + value**2 * (systematic**2 + _MODEL_ERROR**2)
-    )
-    return MeasuredReadout(value, deviation, len(of.x))
-
-
-def _score(of: Equations, value: float) -> Score:
-    found: Score = score(of, value)
-    if math.isnan(found.slope):
-        raise np.linalg.LinAlgError("the covariance of a frame is none")
-    return found
+    Measurement(window.equations()).finish()
