@@ -28,7 +28,7 @@ from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.topics import IMU, KEYPOINTS, MAP_POINTS
+from rs_localizer.io.topics import IMU
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
@@ -127,10 +127,8 @@ def run(args: argparse.Namespace) -> None:
             topics = topics.without(IMU)
         elif IMU not in topics.of and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with --imu")
-        if KEYPOINTS in topics.of and MAP_POINTS not in topics.of and not config.map_file:
-            raise ValueError(
-                f"{args.bag} has keypoints and no map on map_points; give one with --map"
-            )
+        if topics.lacks_map and not config.map_file:
+            raise ValueError(f"{args.bag} has {topics.frames} and no map; give one with --map")
         transforms = find_transforms(bag, topics, config)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         localizer.load_map()
