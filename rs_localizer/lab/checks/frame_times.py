@@ -21,6 +21,8 @@ import numpy as np
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info, make_correspondences
 from rs_localizer.lab.simulation.hand_held import CAMERA, HandHeld
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -60,11 +62,11 @@ def run(given: Messages, profiles: list[cProfile.Profile] | None = None) -> tupl
     """
     localizer = FrameLocalizer(NodeConfig(readout_time=CAMERA.readout_time))
     localizer.warm_up()
-    localizer.take_camera_info(make_camera_info(CAMERA, 0))
+    localizer.calibrate(read_camera_info(make_camera_info(CAMERA, 0)))
     times, done = [], []
     for index, (cloud, readings) in enumerate(zip(given.clouds, given.readings, strict=True)):
         for reading in readings:
-            localizer.take_imu(reading)
+            localizer.imu.add(read_imu(reading))
         if profiles is not None:
             profiles[index].enable()
         start = time.thread_time()
