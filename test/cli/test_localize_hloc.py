@@ -279,6 +279,10 @@ def test_bad_files_are_told_of_in_one_line(
     for data in (b"\x01", struct.pack("<Q", 1000), struct.pack("<Q", 1) + bytes(70)):
         (broken / "images.bin").write_bytes(data)
         refused("images.bin is truncated or damaged", reference_sfm=broken)
+    (broken / "images.bin").unlink()
+    for text, told in (("1 0 0 0 1 0 0\n\n", "expected ID QW QX"), ("#\n", "has no images")):
+        (broken / "images.txt").write_text(text)
+        refused(told, reference_sfm=broken)
     assert localize(files, "-p", "readout:=1") == 2
     assert localize(files, "--row", "third") == 2
 
