@@ -184,7 +184,7 @@ def _check_usage(args: argparse.Namespace) -> None:
     given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
     if any((*given, args.rows, args.nerfstudio)):
         raise UsageError(
-            "--out, --overwrite, --params, --map, --smooth, --row, --nerfstudio and -p are for "
+            "--out, --overwrite, --params, --map, --row, --nerfstudio, --smooth and -p are for "
             "offline replay; with --ros the running node has the settings and publishes the result"
         )
 
