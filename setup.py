@@ -93,6 +93,7 @@ setup(
         "console_scripts": [
             "localizer = rs_localizer.ros.main:main",
             "marker_detector = rs_localizer.ros.main:marker_detector",
+            "feature_detector = rs_localizer.ros.main:feature_detector",
             "rs_localizer = rs_localizer.__main__:run",
         ],
     },

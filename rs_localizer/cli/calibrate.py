@@ -14,7 +14,8 @@ from tqdm import tqdm
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
-from rs_localizer.cli.detect import add_board_arguments, find_map
+from rs_localizer.cli.given import given_settings
+from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
@@ -45,7 +46,6 @@ from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
-from rs_localizer.settings import build, load_params_file, parse_assignment
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
@@ -139,11 +139,7 @@ def run(args: argparse.Namespace) -> None:
 def _config(args: argparse.Namespace) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    try:
-        values = {} if args.params is None else load_params_file(args.params)
-        return build(values | dict(map(parse_assignment, args.assignments)))
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    return given_settings(args)
 
 
 def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:

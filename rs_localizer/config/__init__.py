@@ -7,6 +7,12 @@ ranges here are what users see in ``ros2 param describe``.
 from rs_localizer.config.declared import (
     type_of,
 )
+from rs_localizer.config.detectors import (
+    DetectorConfig,
+    FeatureConfig,
+    FeatureKind,
+    ImageTransport,
+)
 from rs_localizer.config.method import (
     Acceleration,
     LocalizerConfig,
@@ -15,8 +21,6 @@ from rs_localizer.config.method import (
 )
 from rs_localizer.config.nodes import (
     LONGEST_READOUT_TIME,
-    DetectorConfig,
-    ImageTransport,
     Imu,
     ImuUse,
     MatchBy,
@@ -32,6 +36,8 @@ __all__ = [
     "LONGEST_READOUT_TIME",
     "Acceleration",
     "DetectorConfig",
+    "FeatureConfig",
+    "FeatureKind",
     "ImageTransport",
     "Imu",
     "ImuUse",
