@@ -16,6 +16,9 @@ from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.residuals import normal_equations
 
+EXPECTED_NOISE = 0.5
+"""Standard deviation of the noise before it is measured, in inlier thresholds."""
+
 _MOST_DAMPING = 1e8
 # Pivots of a matrix of unit diagonal below this are rounding errors.
 _SINGULAR = 1e-15

@@ -28,7 +28,7 @@ from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside
 from rs_localizer.estimation.refine import apply_step, inverted
-from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, follow
+from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, follow
 
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part.
@@ -163,10 +163,8 @@ def _rather_rests(frame: Inliers, best: Posterior, examined: Examined) -> bool:
 def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -> Posterior | None:
     """The posterior of a camera that shakes; None if it cannot be followed."""
     observations = frame.observations
-    shaken = follow(
-        observations, best.state, best.inliers, frame.terms, sizes.noise, sizes.shake,
-        frame.assumed.shake, threshold,
-    )  # fmt: skip
+    scales = Scales(sizes.noise, sizes.shake, frame.assumed.shake, threshold)
+    shaken = follow(observations, best.state, best.inliers, frame.terms, scales)
     if shaken is None:
         return None
     worth = _worth(_correlation(shaken.agreement, shaken.inliers))

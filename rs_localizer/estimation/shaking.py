@@ -10,6 +10,7 @@ MacKay, "Bayesian nonlinear modeling for the prediction competition", 1994; see
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,27 +54,31 @@ class Shaken:
     sizes: Array  # (k,) mean squares of the coefficients
 
 
+class Scales(NamedTuple):
+    """First estimates, and limits."""
+
+    noise: float  # px
+    size: float  # rad, of the coefficients
+    least_size: float  # rad, that is always possible
+    threshold: float  # px, least gate of inliers
+
+
 def follow(
     observations: Observations,
     start: Array,
     inliers: BoolArray,
     terms: PriorTerms,
-    noise: float,
-    size: float,
-    least_size: float,
-    threshold: float,
+    scales: Scales,
 ) -> Shaken | None:
     """Fit motion and shaking together, and choose the inliers anew: those of a motion without
     shaking are the points that it happens to pass by.
 
     Args:
         start: state (24,), the best without shaking.
-        noise: px, a first estimate.
-        size, least_size: rad, of the coefficients: a first estimate, and what is always possible.
-        threshold: px, least gate of inliers.
 
     None where the fit leaves what can be computed.
     """
+    noise, size, least_size, threshold = scales
     best = None
     for degrees in DEGREES:
         if 3 * degrees > _MOST_COEFFICIENTS * np.count_nonzero(inliers):

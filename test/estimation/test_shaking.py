@@ -9,7 +9,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.model_error import gain_of_shaking
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.shake_sizes import _share, sizes_and_step
-from rs_localizer.estimation.shaking import follow
+from rs_localizer.estimation.shaking import Scales, follow
 from rs_localizer.localizer import assumptions
 from rs_localizer.solvers.table import find_solver
 
@@ -49,7 +49,7 @@ def shaken(seed, size, count=100, outliers=0):
 
 def followed(observations, state, inliers=None, size=0.003):
     inliers = np.ones(len(observations), dtype=bool) if inliers is None else inliers
-    return follow(observations, state, inliers, TERMS, 0.5, size, ASSUMED.shake, 2.0)
+    return follow(observations, state, inliers, TERMS, Scales(0.5, size, ASSUMED.shake, 2.0))
 
 
 def turns(state, coefficients):
