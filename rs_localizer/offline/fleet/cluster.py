@@ -1,0 +1,155 @@
+"""Tasks by Dask: on a cluster of this machine, or by a scheduler that runs already."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rs_localizer.offline.fleet.task import Outcome, Task, perform
+
+# How often a recording may take its worker with it until it counts as failed.
+_DEATHS = 3
+# How long a scheduler that is gone may take to come back, in s, and how often it is looked for.
+_PATIENCE, _PERIOD = 60.0, 1.0
+_CONNECT_TIMEOUT = 5.0
+
+
+class ClusterError(ValueError):
+    """No workers; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Who does the work: a scheduler's workers, or so many processes of this machine."""
+
+    scheduler: str | None = None
+    workers: int | None = None  # None: one for each core
+
+    def processes(self, tasks: int) -> int:
+        """How many of this machine."""
+        return max(1, min(tasks, self.workers or len(os.sched_getaffinity(0))))
+
+
+def perform_all(tasks: Sequence[Task], where: Where) -> Iterator[Outcome]:
+    """The outcome of each task, as they come; close the iterator to stop all.
+
+    A task whose worker is lost is done by another one, one whose scheduler is lost when it is back.
+
+    Raises:
+        ClusterError: when no scheduler answers.
+        ImportError: without Dask.
+    """
+    if not tasks:
+        return
+    # What Dask logs of workers that are lost or ended is told in the outcomes.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    if where.scheduler is None:
+        with _local(where.processes(len(tasks))) as cluster:
+            yield from _all_done({task.name: task for task in tasks}, cluster)
+        return
+    left = {task.name: task for task in tasks}
+    patience = 0.0
+    while left:
+        try:
+            yield from _all_done(left, where.scheduler, patience)
+        except ClusterError as error:
+            if not patience:
+                raise
+            for name in left:
+                yield Outcome(name, None, str(error))
+            return
+        patience = _PATIENCE
+
+
+def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Iterator[Outcome]:
+    """The outcomes of tasks, each of which is taken out of ``left``; a lost scheduler ends it."""
+    from distributed import as_completed
+
+    with _client(cluster, patience) as client:
+        # Not by what they are: a result that has been removed meanwhile would be taken as done.
+        tasks = list(left.values())
+        futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
+        for future in as_completed(futures, loop=client.loop):
+            task = futures.pop(future)
+            if future.status == "cancelled":  # by nobody: the scheduler is gone
+                continue
+            del left[task.name]
+            yield _outcome(task, future)
+
+
+def _outcome(task: Task, future: Any) -> Outcome:
+    from distributed import KilledWorker
+
+    if future.status == "finished":
+        found: Outcome = future.result()
+        return found
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        return Outcome(
+            task.name,
+            None,
+            f"the worker process died on it {_DEATHS} times (out of memory, or killed)",
+        )
+    return Outcome(task.name, None, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+@contextlib.contextmanager
+def _client(cluster: Any, patience: float) -> Iterator[Any]:
+    from distributed import Client
+
+    deadline = time.monotonic() + patience
+    while True:
+        try:
+            client = Client(cluster, timeout=_CONNECT_TIMEOUT, set_as_default=False)
+            break
+        except (OSError, ValueError, ImportError) as error:
+            if time.monotonic() < deadline:
+                time.sleep(_PERIOD)
+                continue
+            raise ClusterError(
+                f"no Dask scheduler answers at {cluster}: {' '.join(str(error).split())}"
+            ) from error
+    with client:
+        yield client
+
+
+@contextlib.contextmanager
+def _local(workers: int) -> Iterator[Any]:
+    """A cluster of processes with one thread each."""
+    import dask
+    from distributed import LocalCluster
+
+    settings = {
+        "distributed.scheduler.allowed-failures": _DEATHS - 1,
+        # A worker that dies takes no task along but the one that it is at.
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.worker.preload": ["rs_localizer.offline.fleet.worker"],
+    }
+    with dask.config.set(settings):
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,  # the operating system's
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL + 1,
+        )
+        try:
+            yield cluster
+        finally:
+            _end(cluster)
+
+
+def _end(cluster: Any) -> None:
+    """Workers are not asked: one that is at a recording would go on for seconds."""
+    for nanny in cluster.workers.values():
+        process = nanny.process
+        with contextlib.suppress(AttributeError, ProcessLookupError):
+            os.kill(process.pid, signal.SIGKILL)
+    with contextlib.suppress(Exception):
+        cluster.close(timeout=5)
