@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, many
+from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.io.bags import STORAGES, is_bag, open_bag
@@ -57,11 +58,12 @@ _BOARD_AXES = np.diag([1.0, -1.0, -1.0])
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "images",
+        "recordings",
         type=Path,
+        nargs="+",
         metavar="VIDEO|BAG|FOLDER",
         help="a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
-        "compressed images, or a folder of .jpg or .png files",
+        "compressed images, or a folder of .jpg or .png files; several: see many recordings",
     )
     markers = parser.add_argument_group("what to look for")
     markers.add_argument("--map", type=Path, metavar="FILE", help="marker map")
@@ -120,9 +122,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timing", action="store_true", help="say how long it took, and how much of it OpenCV did"
     )
+    add_fleet_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> None:
+    if not is_fleet(args):
+        detect_one(argparse.Namespace(**vars(args), images=args.recordings[0]))
+        return
+    find_map(args)  # refuses wrong ones before there are workers
+    many.detect(args)
+
+
+def detect_one(args: argparse.Namespace) -> Recorded:
+    """Detect in the images of one recording, and say what came of it."""
     marker_map = find_map(args)
     notices: Counter[str] = Counter()
     config = DetectorConfig(min_side=args.min_side)
@@ -153,6 +165,7 @@ def run(args: argparse.Namespace) -> None:
     _tell_next(args)
     if args.timing:
         _tell_times(recorded.images, *detector.seconds)
+    return recorded
 
 
 def _tell_times(images: int, seconds: float, in_opencv: float) -> None:

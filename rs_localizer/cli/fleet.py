@@ -37,6 +37,9 @@ from rs_localizer.process.arguments import integer
 # Arguments that say what to do with which recordings, and nothing of a result.
 _OF_THE_FLEET = ("recordings", "out", "workers", "scheduler", "overwrite")
 
+# Figures of a recording that are told while others are waited for.
+_TOLD = 5
+
 
 def add_fleet_arguments(parser: argparse.ArgumentParser) -> None:
     """How many recordings are shared out."""
@@ -191,7 +194,9 @@ def _row(recording: Path, outcome: Outcome) -> Row:
 def _said(row: Row) -> str:
     if row.state == FAILED:
         return f"failed: {row.reason}"
-    return ", ".join(
+    said = [
         f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
         for name, value in row.figures.items()
-    )
+        if value != ""
+    ]
+    return ", ".join(said[:_TOLD])

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
-from rs_localizer.cli.fleet import Plan, add_fleet_arguments, is_fleet, run_fleet
+from rs_localizer.cli import UsageError, many
+from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -24,13 +24,12 @@ from rs_localizer.cli.replay_result import (
     write_texts,
 )
 from rs_localizer.cli.replay_ros import play
-from rs_localizer.cli.replay_summary import Tally, figures, print_summary
+from rs_localizer.cli.replay_summary import Tally, print_summary
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.topics import IMU, KEYPOINTS, MAP_POINTS
-from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
@@ -113,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     _check_usage(args)
     if is_fleet(args):
-        _replay_many(args)
+        many.replay(args, settings_of(args))
         return
     recording: Path = args.recordings[0]
     if args.ros:
@@ -124,23 +123,11 @@ def run(args: argparse.Namespace) -> None:
             play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return
     out = args.out or Path(f"{recording.resolve().with_suffix('').name}_replay")
-    _replay_one(args, recording, out)
+    replay_one(args, recording, out)
 
 
-def _replay_many(args: argparse.Namespace) -> None:
-    config = _settings(args)
-    kernels = f"replay {config.solver}{' smooth' if args.smooth else ''}"
-    files = [path for path in (args.params, config.map_file and Path(config.map_file)) if path]
-    run_fleet(args, Plan(Kind("replay", of_many, kernels), lambda _: files, args.overwrite))
-
-
-def of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
-    """One recording of many, for a worker: its result in ``out``, and figures for the summary."""
-    tally = _replay_one(argparse.Namespace(**vars(args), overwrite=False), recording, out, False)
-    return figures(tally)
-
-
-def _settings(args: argparse.Namespace) -> NodeConfig:
+def settings_of(args: argparse.Namespace) -> NodeConfig:
+    """The settings that the arguments give; refuses those that cannot be."""
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
     return _config(args.params, args.assignments + given)
 
@@ -150,12 +137,10 @@ def _refuse_images(recording: Path) -> None:
         raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
 
 
-def _replay_one(
-    args: argparse.Namespace, recording: Path, out: Path, timed: bool = True
-) -> Tally:
+def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool = True) -> Tally:
     """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
     _refuse_images(recording)
-    config = _settings(args)
+    config = settings_of(args)
     notices: Counter[str] = Counter()
     with open_bag(recording) as bag:
         if image_topics(bag) and not has_frames(bag):

@@ -1,1 +1,1 @@
-"""Many recordings at once, by Dask: each a task of its own, whichever process or machine does it."""
+"""Many recordings by Dask: each a task of its own, whichever process or machine does it."""

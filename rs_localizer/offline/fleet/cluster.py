@@ -7,7 +7,7 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,7 @@ class Where:
         return max(1, min(tasks, self.workers or len(os.sched_getaffinity(0))))
 
 
-def perform_all(tasks: Sequence[Task], where: Where) -> Iterator[Outcome]:
+def perform_all(tasks: Sequence[Task], where: Where) -> Generator[Outcome, None, None]:
     """The outcome of each task, as they come; close the iterator to stop all.
 
     A task whose worker is lost is done by another one, one whose scheduler is lost when it is back.
@@ -131,6 +131,9 @@ def _local(workers: int) -> Iterator[Any]:
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.worker.preload": ["rs_localizer.offline.fleet.worker"],
     }
+    # Of worker processes that were killed, Python's clean-up would tell on the screen.
+    quiet = "ignore:resource_tracker:UserWarning"
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), quiet]))
     with dask.config.set(settings):
         cluster = LocalCluster(
             n_workers=workers,
@@ -141,15 +144,16 @@ def _local(workers: int) -> Iterator[Any]:
         )
         try:
             yield cluster
+        except BaseException:
+            _kill(cluster)
+            raise
         finally:
-            _end(cluster)
+            with contextlib.suppress(Exception):
+                cluster.close(timeout=5)
 
 
-def _end(cluster: Any) -> None:
-    """Workers are not asked: one that is at a recording would go on for seconds."""
+def _kill(cluster: Any) -> None:
+    """End workers at once: one that is asked goes on with its recording for seconds."""
     for nanny in cluster.workers.values():
-        process = nanny.process
-        with contextlib.suppress(AttributeError, ProcessLookupError):
-            os.kill(process.pid, signal.SIGKILL)
-    with contextlib.suppress(Exception):
-        cluster.close(timeout=5)
+        with contextlib.suppress(AttributeError, ProcessLookupError, TypeError):
+            os.kill(nanny.process.pid, signal.SIGKILL)

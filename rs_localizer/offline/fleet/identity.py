@@ -56,7 +56,9 @@ def _fingerprint(path: Path) -> list[tuple[str, int, int]]:
     return found
 
 
-def write_marker(folder: Path, of: str, about: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
+def write_marker(
+    folder: Path, of: str, about: Mapping[str, Any], figures: Mapping[str, Any]
+) -> None:
     """Say of a result's folder that it is complete.
 
     Args:

@@ -121,7 +121,7 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
             figures = task.kind.work(task.arguments, task.recording, inner)
         with told(inner):
             inner.mkdir(exist_ok=True)
-            text = said.getvalue().replace(str(inner), str(task.folder))
+            text = said.getvalue().replace(str(inner), task.name)
             (inner / LOG).write_text(text, encoding="utf-8")
             _complete(task, inner, figures)
     except Exception as error:
