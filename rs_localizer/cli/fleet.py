@@ -100,6 +100,7 @@ def run_fleet(args: Namespace, plan: Plan) -> None:
             _work(tasks, Where(args.scheduler, args.workers), rows)
         finally:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
+            _find_finished(tasks, rows)
             write_summary(out, plan.kind.command, list(rows.values()))
     print(f"written to {args.out}: {CSV}, {MARKDOWN}, {PICTURE}")
     if failed := sum(row.state == FAILED for row in rows.values()):
@@ -163,17 +164,10 @@ def _only_one(out: Path) -> Iterator[None]:
 
 def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
     started, busy = time.perf_counter(), 0.0
-    bar = tqdm(total=len(tasks), unit="recording", disable=None)
-    left = []
-    for task in tasks:
-        if (figures := finished(task)) is None:
-            left.append(task)
-        else:
-            rows[task.name] = Row(task.recording, task.name, DONE, figures)
-            bar.update()
-    before = len(tasks) - len(left)
-    if before:
-        bar.write(f"{before} of {len(tasks)} recordings have been done before")
+    left = _find_finished(tasks, rows)
+    if before := len(tasks) - len(left):
+        print(f"{before} of {len(tasks)} recordings have been done before")
+    bar = tqdm(total=len(tasks), initial=before, unit="recording", disable=None)
     with bar, contextlib.closing(perform_all(left, where)) as outcomes:
         for outcome in outcomes:
             rows[outcome.name] = row = _row(rows[outcome.name].recording, outcome)
@@ -184,6 +178,19 @@ def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
     print(f"{counted(list(rows.values()))}")
     if left:
         print(f"{wall:.1f} s for {busy:.1f} s of work")
+
+
+def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
+    """Enter what is complete on disk; the tasks of which nothing is known."""
+    left = []
+    for task in tasks:
+        if rows[task.name].state != OPEN:
+            continue
+        if (figures := finished(task)) is None:
+            left.append(task)
+        else:
+            rows[task.name] = Row(task.recording, task.name, DONE, figures)
+    return left
 
 
 def _row(recording: Path, outcome: Outcome) -> Row:

@@ -8,6 +8,7 @@ import os
 import signal
 import time
 from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,8 +48,7 @@ def perform_all(tasks: Sequence[Task], where: Where) -> Generator[Outcome, None,
     """
     if not tasks:
         return
-    # What Dask logs of workers that are lost or ended is told in the outcomes.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    _silence()
     if where.scheduler is None:
         with _local(where.processes(len(tasks))) as cluster:
             yield from _all_done({task.name: task for task in tasks}, cluster)
@@ -77,17 +77,28 @@ def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Ite
         futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
         for future in as_completed(futures, loop=client.loop):
             task = futures.pop(future)
-            if future.status == "cancelled":  # by nobody: the scheduler is gone
+            try:
+                outcome = _outcome(task, future)
+            except (CancelledError, OSError):  # by nobody: the scheduler is gone
                 continue
             del left[task.name]
-            yield _outcome(task, future)
+            yield outcome
+
+
+def _silence() -> None:
+    """What Dask logs of workers and schedulers that are lost is told in the outcomes."""
+    import distributed  # gives some of its loggers levels of their own
+
+    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    for name in (distributed.__name__, *known):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def _outcome(task: Task, future: Any) -> Outcome:
     from distributed import KilledWorker
 
-    if future.status == "finished":
-        found: Outcome = future.result()
+    if future.status != "error":
+        found: Outcome = future.result(timeout=_CONNECT_TIMEOUT)
         return found
     error = future.exception()
     if isinstance(error, KilledWorker):
