@@ -94,7 +94,7 @@ def run_fleet(args: Namespace, plan: Plan) -> None:
     _check(tasks, plan)
     with told(out):
         out.mkdir(parents=True, exist_ok=True)
-    with _only_one(out):
+    with only_one(out):
         rows = {task.name: Row(task.recording, task.name, OPEN, {}) for task in tasks}
         try:
             _work(tasks, Where(args.scheduler, args.workers), rows)
@@ -153,7 +153,8 @@ def _check(tasks: list[Task], plan: Plan) -> None:
 
 
 @contextlib.contextmanager
-def _only_one(out: Path) -> Iterator[None]:
+def only_one(out: Path) -> Iterator[None]:
+    """Within ``with``, no other process writes results into a directory."""
     with (out / ".lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
