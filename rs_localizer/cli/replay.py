@@ -25,6 +25,7 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
+from rs_localizer.cli.replay_view import add_view_arguments, check_view, show
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
@@ -106,11 +107,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="times real time, with --ros (default: 1); with --smooth: samples of the motion, Hz "
         "(default: one for each image)",
     )
+    add_view_arguments(parser)
     add_fleet_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> None:
     _check_usage(args)
+    check_view(args)
     if is_fleet(args):
         many.replay(args, settings_of(args))
         return
@@ -164,6 +167,7 @@ def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool
         with fresh(out, args.overwrite):
             _hint(recording, args.params)
             tally = _replay(bag, topics, localizer, notices, out, args)
+            show(args, bag, topics, localizer, tally, out)
         _tell(tally, config, out, timed)
         if not tally.frames:
             raise ValueError(

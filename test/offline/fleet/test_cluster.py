@@ -124,5 +124,5 @@ def _wait_for(port: int) -> None:
 
 
 def test_an_address_without_a_scheduler_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ClusterError, match="no Dask scheduler answers at tcp://127.0.0.1:9: "):
+    with pytest.raises(ClusterError, match="no Dask scheduler answers at tcp://"):
         list(perform_all(tasks(tmp_path, one=""), Where(scheduler="tcp://127.0.0.1:9")))

@@ -1,9 +1,10 @@
-"""One recording of many: whole or not there, done once, redone when anything it depends on changed."""
+"""One recording of many: whole or not there, and done again only when it has changed."""
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 from argparse import Namespace
 from dataclasses import replace
@@ -27,8 +28,8 @@ def count_letters(args: Namespace, recording: Path, out: Path) -> Figures:
     text = recording.read_text()
     out.mkdir()
     (out / "half").write_text(text[:1])
-    print(f"reading into {out}")
-    print("odd", file=sys.stderr)
+    sys.stdout.write(f"reading into {out}\n")
+    sys.stderr.write("odd\n")
     if args.fault is not None:
         raise args.fault
     (out / "letters").write_text(str(len(text)))
@@ -149,8 +150,6 @@ def test_the_first_one_compiles_alone(tmp_path: Path, cache: Path) -> None:
         "with first.alone_until_compiled('k'):\n"
         "    say('('); time.sleep(0.3); say(')')\n"
     )
-    import subprocess
-
     started = [
         subprocess.Popen([sys.executable, "-c", code, str(cache), str(log)]) for _ in range(3)
     ]
