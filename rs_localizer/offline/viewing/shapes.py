@@ -20,6 +20,8 @@ Colours = NDArray[np.uint8]
 _WITHIN = np.sqrt(7.8147)
 # The first row is blue, the last one yellow: both are seen on gray images, by everybody.
 _FIRST, _LAST = np.array([0.0, 114.0, 255.0]), np.array([255.0, 220.0, 0.0])
+# px that a typical residual is to be drawn at most, and by which factors.
+_SEEN, _STEPS = 15.0, (1, 2, 5, 10, 20, 50, 100, 200, 500)
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
 
 
@@ -56,6 +58,13 @@ def reproject(frame: Localized, camera: Camera) -> Reprojection:
     predicted, tau = project_rolling(camera, frame.estimate.at_rows, points)
     seen = np.isfinite(tau)
     return Reprojection(points[seen], pixels[seen], predicted[seen], row_colours(tau[seen]))
+
+
+def enlargement(frames: Sequence[Localized]) -> int:
+    """How much longer residuals are drawn so that one can see them: 1, 2, 5, 10, ..."""
+    rms = [f.estimate.residual_rms for f in frames if f.estimate.inliers.any()]
+    wanted = _SEEN / max(float(np.median(rms)), 1e-3) if rms else 1.0
+    return max(step for step in _STEPS if step <= max(wanted, 1.0))
 
 
 def row_colours(tau: Array) -> Colours:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,19 @@ from rs_localizer.offline.viewing import paths
 from rs_localizer.offline.viewing.blueprint import blueprint
 from rs_localizer.offline.viewing.recorded import Cloud, Picture, shown
 from rs_localizer.offline.viewing.series import series
-from rs_localizer.offline.viewing.shapes import ellipsoid, eye, others, readout_path, reproject
+from rs_localizer.offline.viewing.shapes import (
+    ellipsoid,
+    enlargement,
+    eye,
+    others,
+    readout_path,
+    reproject,
+)
 from rs_localizer.pipeline.frames import FrameLocalizer
 
 _APPLICATION = "rs_localizer"
 # Size of the image and of the body's axes in the scene: shares of the distance to the points.
 _PLANE, _AXES = 0.3, 0.12
-# Residuals are drawn so much longer than they are.
-_LONGER = 20.0
 # More landmarks than this are thinned out.
 _MOST_LANDMARKS = 200_000
 _GRAY, _RED, _ORANGE, _BLUE = (150, 150, 150), (230, 60, 40), (240, 150, 0), (70, 130, 255)
@@ -58,10 +64,10 @@ def write_view(
     camera = calibration.camera(config.readout_time, config.scan_direction)
     stream = rr.RecordingStream(_APPLICATION, recording_id=bag.path.resolve().name)
     items = list(shown(bag, topics))
-    look = eye(frames)
-    arranged = blueprint(any(isinstance(item, Picture) for item in items), look)
+    look, longer = eye(frames), enlargement(frames)
+    arranged = blueprint(any(isinstance(item, Picture) for item in items), look, longer)
     by_stamp = {frame.input_stamp_ns: frame for frame in frames}
-    scene = _Scene(stream, camera, by_stamp, look.depth)
+    scene = _Scene(stream, camera, by_stamp, Sizes(look.depth, longer))
     landmarks = np.zeros((0, 3)) if localizer.map is None else localizer.map.points
     if file is None:
         try:
@@ -79,15 +85,23 @@ def write_view(
         stream.disconnect()
 
 
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """How large things are drawn."""
+
+    depth: float  # m from the camera to its points
+    longer: float  # than they are, residuals
+
+
 class _Scene:
     """Logs to one stream."""
 
     def __init__(
-        self, stream: Any, camera: Camera, frames: dict[int, Localized], depth: float
+        self, stream: Any, camera: Camera, frames: dict[int, Localized], sizes: Sizes
     ) -> None:
         self._stream = stream
         self._camera = camera
-        self._depth = depth
+        self._sizes = sizes
         self._frames = {stamp: frames[stamp] for stamp in sorted(frames)}
 
     def log(self, items: Sequence[Picture | Cloud], landmarks: Array) -> None:
@@ -121,7 +135,7 @@ class _Scene:
                 image_from_camera=camera.K,
                 resolution=camera.size,
                 camera_xyz=rr.ViewCoordinates.RDF,
-                image_plane_distance=_PLANE * self._depth,
+                image_plane_distance=_PLANE * self._sizes.depth,
             ),
             static=True,
         )
@@ -148,7 +162,7 @@ class _Scene:
             self._stream.log(paths.REFUSED, rr.TextLog("no pose", level=rr.TextLogLevel.WARN))
             return
         found = reproject(frame, self._camera)
-        ends = found.pixels + _LONGER * (found.predicted - found.pixels)
+        ends = found.pixels + self._sizes.longer * (found.predicted - found.pixels)
         strips = np.stack([_centred(found.pixels), _centred(ends)], axis=1)
         self._stream.log(
             paths.MATCHES, rr.Points2D(_centred(found.predicted), colors=found.colours, radii=-3.0)
@@ -167,7 +181,7 @@ class _Scene:
         self._stream.log(
             paths.BODY,
             rr.Transform3D(translation=frame.pose.position, mat3x3=frame.pose.rotation),
-            rr.TransformAxes3D(_AXES * self._depth),
+            rr.TransformAxes3D(_AXES * self._sizes.depth),
         )
         shape = ellipsoid(frame.pose.covariance[:3, :3])
         self._stream.log(
