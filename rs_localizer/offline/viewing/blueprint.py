@@ -8,13 +8,12 @@ from rs_localizer.offline.viewing import paths
 from rs_localizer.offline.viewing.shapes import Eye
 
 
-def blueprint(with_images: bool, eye: Eye, longer: int) -> Any:
+def blueprint(with_images: bool, eye: Eye) -> Any:
     """Scene and image on the left, what changes with time on the right, one time line below.
 
     Args:
         with_images: whether there are any.
         eye: from where the scene is seen.
-        longer: how much residuals are.
     """
     import rerun.blueprint as rrb
 
@@ -28,7 +27,7 @@ def blueprint(with_images: bool, eye: Eye, longer: int) -> Any:
     image = rrb.Spatial2DView(
         origin=paths.IMAGE,
         name=f"{'image' if with_images else 'pixels'}: inliers by row (blue first), residuals "
-        f"x{longer}, the others red",
+        "enlarged, the others red",
     )
     plots = [rrb.TimeSeriesView(origin=path, name=name) for path, name in paths.PLOTS.items()]
     return rrb.Blueprint(

@@ -15,7 +15,7 @@ READOUT = "map/readout"
 CAMERA = "map/camera"
 IMAGE = "map/camera/image"
 MATCHES = "map/camera/image/inliers"
-RESIDUALS = "map/camera/image/residuals"
+RESIDUALS = "map/camera/image/residuals_x{}"
 OTHERS = "map/camera/image/others"
 REFUSED = "refused"
 

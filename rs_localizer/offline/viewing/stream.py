@@ -62,10 +62,12 @@ def write_view(
     calibration, config = localizer.calibration, localizer.config
     assert calibration is not None  # without one there is no frame
     camera = calibration.camera(config.readout_time, config.scan_direction)
-    stream = rr.RecordingStream(_APPLICATION, recording_id=bag.path.resolve().name)
+    name = bag.path.resolve().name
+    # The viewer keeps what its user has arranged by application: for each recording on its own.
+    stream = rr.RecordingStream(f"{_APPLICATION} {name}", recording_id=name)
     items = list(shown(bag, topics))
     look, longer = eye(frames), enlargement(frames)
-    arranged = blueprint(any(isinstance(item, Picture) for item in items), look, longer)
+    arranged = blueprint(any(isinstance(item, Picture) for item in items), look)
     by_stamp = {frame.input_stamp_ns: frame for frame in frames}
     scene = _Scene(stream, camera, by_stamp, Sizes(look.depth, longer))
     landmarks = np.zeros((0, 3)) if localizer.map is None else localizer.map.points
@@ -90,7 +92,7 @@ class Sizes:
     """How large things are drawn."""
 
     depth: float  # m from the camera to its points
-    longer: float  # than they are, residuals
+    longer: int  # than they are, residuals
 
 
 class _Scene:
@@ -102,6 +104,7 @@ class _Scene:
         self._stream = stream
         self._camera = camera
         self._sizes = sizes
+        self._residuals = paths.RESIDUALS.format(sizes.longer)
         self._frames = {stamp: frames[stamp] for stamp in sorted(frames)}
 
     def log(self, items: Sequence[Picture | Cloud], landmarks: Array) -> None:
@@ -157,7 +160,7 @@ class _Scene:
         rest = others(cloud.pixels, frame)
         self._stream.log(paths.OTHERS, rr.Points2D(_centred(rest), colors=_RED, radii=-2.0))
         if frame is None:
-            for path in (paths.MATCHES, paths.RESIDUALS, paths.INLIERS):
+            for path in (paths.MATCHES, self._residuals, paths.INLIERS):
                 self._stream.log(path, rr.Clear(recursive=False))
             self._stream.log(paths.REFUSED, rr.TextLog("no pose", level=rr.TextLogLevel.WARN))
             return
@@ -167,7 +170,7 @@ class _Scene:
         self._stream.log(
             paths.MATCHES, rr.Points2D(_centred(found.predicted), colors=found.colours, radii=-3.0)
         )
-        self._stream.log(paths.RESIDUALS, rr.LineStrips2D(list(strips), colors=_ORANGE))
+        self._stream.log(self._residuals, rr.LineStrips2D(list(strips), colors=_ORANGE))
         self._stream.log(paths.INLIERS, rr.Points3D(found.points, colors=found.colours, radii=-3.0))
 
     def _log_pose(self, frame: Localized) -> None:

@@ -61,10 +61,11 @@ class Watched:
     twist: Values | None = None
     status: Status | None = None
     waiting: str = ""  # why nothing comes; empty: somebody publishes
+    _last: float = 0.0
     _arrivals: deque[float] = field(default_factory=deque)
 
     def arrived(self, pose: Values, now: float) -> None:
-        self.pose = pose
+        self.pose, self._last = pose, now
         self._arrivals.append(now)
 
     def rate(self, now: float) -> float:
@@ -79,10 +80,10 @@ class Watched:
         """State and rate, or what is waited for."""
         if self.pose is None:
             return self.waiting or (self.status.state if self.status else "waiting for a pose")
-        age = now - self._arrivals[-1] if self._arrivals else _WINDOW
-        late = f", no pose for {'more than ' if not self._arrivals else ''}{age:.1f} s"
+        age = now - self._last
+        late = f", no pose for {age:.1f} s" if age > _OLD else ""
         state = self.status.state if self.status else "localized"
-        return f"{state}, {self.rate(now):.1f} Hz{late if age > _OLD else ''}"
+        return f"{state}, {self.rate(now):.1f} Hz{late}"
 
 
 def euler(quaternion: Array) -> Array:
