@@ -6,9 +6,10 @@ TYPE_CHECKING = False  # type checkers take it for typing's, which takes millise
 if TYPE_CHECKING:
     from rs_localizer.config import Acceleration, LocalizerConfig, VelocityPrior
     from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection
+    from rs_localizer.core.reasons import Reason
     from rs_localizer.core.rectification import rectify
     from rs_localizer.core.shutter import Motion
-    from rs_localizer.core.types import Estimate, Failure, Reason
+    from rs_localizer.core.types import Estimate, Failure
     from rs_localizer.core.units import CameraState, camera_state
     from rs_localizer.estimation.prior import Prior
     from rs_localizer.io.calibration.files import read_calibration
@@ -46,9 +47,10 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
     _HOMES = {
         "config": ("Acceleration", "LocalizerConfig", "VelocityPrior"),
         "core.camera": ("Camera", "DistortionModel", "Roi", "ScanDirection"),
+        "core.reasons": ("Reason",),
         "core.rectification": ("rectify",),
         "core.shutter": ("Motion",),
-        "core.types": ("Estimate", "Failure", "Reason"),
+        "core.types": ("Estimate", "Failure"),
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
         "io.calibration.files": ("read_calibration",),

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.assumptions import (
     assumptions,

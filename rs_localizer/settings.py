@@ -69,7 +69,7 @@ def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
         return None
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
-    return f"{name!r} is no setting; {hint}"
+    return f"{name!r} is not a setting; {hint}"
 
 
 @overload
@@ -110,7 +110,7 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
         kind: which node's settings.
 
     Raises:
-        SettingsError: for a file that cannot be read, a name that is no setting, or a file
+        SettingsError: for a file that cannot be read, a name that is not a setting, or a file
             without parameters for the node.
     """
     try:
@@ -118,7 +118,7 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
     except OSError as error:
         raise SettingsError(f"{path} cannot be read: {error.strerror}") from error
     except (YamlError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
+        raise SettingsError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
     values: dict[str, Any] = {}
     node = _NODES[kind]
     blocks = list(_blocks(tree, "", node))
@@ -135,7 +135,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     """Name and value of ``name:=value``, the value read as YAML as in ROS 2.
 
     Raises:
-        SettingsError: for another form or a name that is no setting.
+        SettingsError: for another form or a name that is not a setting.
     """
     name, separator, value = text.partition(":=")
     if not separator or not name:
@@ -171,7 +171,7 @@ def _flatten(parameters: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any
 
 def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
     if name not in settings(kind):
-        raise SettingsError(f"{where}: {unknown(name, kind) or f'{name!r} is no setting'}")
+        raise SettingsError(f"{where}: {unknown(name, kind) or f'{name!r} is not a setting'}")
     default = settings(kind)[name].default
     if isinstance(default, tuple):
         return _as_tuple(value)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer import data
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.moments import twist_at
 
@@ -35,7 +36,7 @@ def replayed(messages, **settings):
     frames = []
     for topic, _, message in messages:
         if topic == "/camera/camera_info":
-            localizer.take_camera_info(message)
+            localizer.calibrate(read_camera_info(message))
         else:
             frames.append(localizer.localize(message))
     assert all(frames)

@@ -9,12 +9,13 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from rs_localizer.solvers.table import SOLVERS
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
 D = np.array([-0.1, 0.02, 0.001, 0.001, 0.0])
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 READOUT = 0.03
-ROLLING = ["r6p", "r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p", "joint"]
+ROLLING = [name for name, row in SOLVERS.items() if row.rolling_shutter]
 
 
 def camera(**changes):
@@ -286,7 +287,7 @@ def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
         ({"solver": "epnp"}, "solver must be one of p3p, .*; got 'epnp'"),
         ({"inlier_threshold": -1.0}, "inlier_threshold must lie between .* got -1.0"),
         ({"max_iterations": 2.5}, "max_iterations must be of type int, got 2.5"),
-        ({"iterations": 3}, "'iterations' is no setting of the localizer; did you mean"),
+        ({"iterations": 3}, "'iterations' is not a setting of the localizer; did you mean"),
         ({"velocity_prior": 0.1}, "velocity_prior must be of type VelocityPrior, got 0.1"),
     ],
 )

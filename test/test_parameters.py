@@ -19,8 +19,6 @@ TOO_MANY = {
     "estimation/ransac.py: search",
     "estimation/shaking.py: _fit",
     "estimation/shaking.py: follow",
-    "lab/experiments/results.py: judge",
-    "lab/experiments/results.py: judge_intervals",
 }
 
 

@@ -128,7 +128,7 @@ def test_a_mirrored_pose_is_never_published(small_planes):
     assert max(turns) < 10.0
     refused = [result for result, *_ in small_planes if not result]
     assert sum(result.reason == "mirrored" for result in refused) > 5
-    assert all("deg away, fits but" in r.detail for r in refused if r.reason == "mirrored")
+    assert all("deg away, fits only" in r.detail for r in refused if r.reason == "mirrored")
 
 
 def test_a_prediction_says_which_of_both_poses_it_is(small_planes):

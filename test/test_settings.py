@@ -106,14 +106,14 @@ other_node:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is no setting; did you mean 'seed'"),
-        ("/**:\n  ros__parameters:\n    colour: 5\n", "is no setting; there are solver, "),
-        ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is no setting"),
+        ("/**:\n  ros__parameters:\n    sead: 5\n", "'sead' is not a setting; did you mean 'seed'"),
+        ("/**:\n  ros__parameters:\n    colour: 5\n", "is not a setting; there are solver, "),
+        ("/**:\n  ros__parameters:\n    velocity_prior: 5\n", "'velocity_prior' is not a setting"),
         ("/**:\n  ros__parameters: 5\n", "ros__parameters of /.* must be a mapping"),
         ("other:\n  ros__parameters:\n    seed: 5\n", "has no ros__parameters for /rs_localizer"),
         ("seed: 5\n", "has no ros__parameters"),
         ("", "has no ros__parameters"),
-        ("a: [", "is no YAML file"),
+        ("a: [", "is not a YAML file"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path: Path, text: str, fault: str) -> None:
@@ -125,7 +125,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"none\.yaml cannot be read: No such file"):
         load_params_file(tmp_path / "none.yaml")
     (tmp_path / "binary").write_bytes(b"\xff\xfe\xfa")
-    with pytest.raises(SettingsError, match="is no YAML file"):
+    with pytest.raises(SettingsError, match="is not a YAML file"):
         load_params_file(tmp_path / "binary")
 
 
@@ -171,9 +171,11 @@ def test_wrong_values(values: dict[str, Any], fault: str) -> None:
 
 def test_a_misspelled_keyword_names_the_one_that_was_meant() -> None:
     assert localizer_config({"seed": 3}).seed == 3
-    with pytest.raises(ValueError, match=r"'inlier_treshold' is no .*did you mean 'inlier_t"):
+    with pytest.raises(ValueError, match=r"'inlier_treshold' is not .*did you mean 'inlier_t"):
         localizer_config({"inlier_treshold": 2.0})
-    with pytest.raises(ValueError, match="'colour' is no setting of the localizer; there are sol"):
+    with pytest.raises(
+        ValueError, match="'colour' is not a setting of the localizer; there are sol"
+    ):
         localizer_config({"colour": 1})
     with pytest.raises(ValueError, match="solver must be one of p3p"):
         localizer_config({"solver": "p4p"})

@@ -240,7 +240,7 @@ def _files(args: argparse.Namespace) -> Iterator[Iterator[Shot | Carried]]:
         return
     files = image_files(path)
     if args.rate is None and not have_times(files):
-        raise UsageError("the names of the files are no times in ns: give --rate")
+        raise UsageError("the names of the files are not times in ns: give --rate")
     yield from_files(files, camera, clock)
     _tell_clock(clock)
 

@@ -19,7 +19,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.measures import plots
+from rs_localizer.lab.measures import figures
 from rs_localizer.lab.measures.comparison import Recording, Result, compare, load_recording
 from rs_localizer.lab.measures.comparison_pictures import (
     error_picture,
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
         print(f"\n{args.out / CUBE}")
         for name, figure in _pictures(*acts[:2]).items():
             if figure is not None:
-                plots.save(figure, args.out / name)
+                figures.save(figure, args.out / name)
                 print(args.out / name)
     print(f"done in {time.monotonic() - started:.0f} s")
 

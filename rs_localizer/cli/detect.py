@@ -101,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=above,
         metavar="HZ",
         help="images per second, instead of the presentation times of a video, or for files whose "
-        "names are no times in ns",
+        "names are not times in ns",
     )
     camera.add_argument(
         "--start",
@@ -237,7 +237,7 @@ def _files(args: argparse.Namespace, clock: ImageClock) -> tuple[Iterator[Shot],
         raise UsageError("a video or folder has no camera_info: give --calibration")
     files = image_files(args.images) if args.images.is_dir() else None
     if args.rate is None and files is not None and not have_times(files):
-        raise UsageError("the names of the files are no times in ns: give --rate")
+        raise UsageError("the names of the files are not times in ns: give --rate")
     if args.rate is None and files is None and not has_times(args.images):
         raise UsageError("this video has no presentation times: give --rate")
     camera: Camera = read_calibration(args.calibration)

@@ -193,7 +193,7 @@ def _print_offset(found: TimeOffset | None) -> None:
 def _plot(
     directory: Path, estimate: Trajectory, truth: Trajectory, poses: Errors, twists: Errors | None
 ) -> None:
-    from rs_localizer.lab.measures import plots
+    from rs_localizer.lab.measures import figures, plots
 
     directory.mkdir(parents=True, exist_ok=True)
     drawn = (
@@ -201,7 +201,7 @@ def _plot(
         plots.errors({"estimate": poses}, {"estimate": twists} if twists else {}),
     )
     for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
-        plots.save(figure, directory / name)
+        figures.save(figure, directory / name)
         print(f"{directory / name}")
 
 

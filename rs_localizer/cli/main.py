@@ -67,7 +67,7 @@ COMMANDS = {
     "calibrate": Command(
         "rs_localizer.cli.calibrate",
         "readout time, scan direction and lens of a camera, from a recording in which it moves",
-        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --rate 30 --out camera.yaml",
+        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --rate 30 --out shutter.yaml",
     ),
     "readout": Command(
         "rs_localizer.cli.readout",

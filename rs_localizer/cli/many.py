@@ -11,8 +11,10 @@ from pathlib import Path
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.fleet import Plan, run_fleet
 from rs_localizer.config import NodeConfig
-from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.offline.fleet.task import Figures, Kind
+
+# Of calibrate, in each result.
+_SHUTTER = "shutter.yaml"
 
 
 def replay(args: Namespace, config: NodeConfig) -> None:
@@ -70,7 +72,7 @@ def calibrate_of_many(args: Namespace, recording: Path, out: Path) -> Figures:
 
     out.mkdir(parents=True)
     plots = None if args.plots is None else out / args.plots
-    own = {"recording": recording, "out": out / PARAMETERS, "plots": plots}
+    own = {"recording": recording, "out": out / _SHUTTER, "plots": plots}
     found = calibrate_one(Namespace(**vars(args) | own))
     return {
         "readout time (ms)": 1e3 * verdict.readout_time(found),

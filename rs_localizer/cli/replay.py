@@ -30,7 +30,7 @@ from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.topics import IMU, KEYPOINTS, MAP_POINTS
+from rs_localizer.io.topics import IMU
 from rs_localizer.offline.image_sources import holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
@@ -155,10 +155,8 @@ def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool
             topics = topics.without(IMU)
         elif IMU not in topics.of and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with --imu")
-        if KEYPOINTS in topics.of and MAP_POINTS not in topics.of and not config.map_file:
-            raise ValueError(
-                f"{recording} has keypoints and no map on map_points; give one with --map"
-            )
+        if topics.lacks_map and not config.map_file:
+            raise ValueError(f"{recording} has {topics.frames} and no map; give one with --map")
         transforms = find_transforms(bag, topics, config)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         localizer.load_map()

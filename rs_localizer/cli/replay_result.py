@@ -41,7 +41,7 @@ def fresh(out: Path, overwrite: bool) -> Iterator[None]:
     if not overwrite:
         raise ValueError(f"{out} exists; choose another --out, or --overwrite")
     if not _is_ours(out):
-        raise ValueError(f"{out} is no result of replay; --overwrite leaves it as it is")
+        raise ValueError(f"{out} is not a result of replay; --overwrite leaves it as it is")
     _remove_results(out)
     try:
         with told(out):

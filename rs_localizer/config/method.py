@@ -133,5 +133,5 @@ def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
-            raise ValueError(f"{name!r} is no setting of the localizer; {hint}")
+            raise ValueError(f"{name!r} is not a setting of the localizer; {hint}")
     return LocalizerConfig(**settings)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.checks import Matrix, Vector, numbers, pixel_count
+from rs_localizer.core.checks import Matrix, Vector, choice, numbers, pixel_count
 
 
 class ScanDirection(StrEnum):
@@ -123,13 +123,7 @@ class Camera:
             )
         if K[0, 1] != 0.0 or K[1, 0] != 0.0 or np.any(K[2] != (0.0, 0.0, 1.0)):
             raise ValueError(f"K must have no skew and a last row 0 0 1, got {K.tolist()}")
-        try:
-            model = DistortionModel(self.distortion_model)
-        except ValueError:
-            raise ValueError(
-                f"distortion_model must be one of {', '.join(DistortionModel)}; "
-                f"got {self.distortion_model!r}"
-            ) from None
+        model = choice("distortion_model", DistortionModel, self.distortion_model)
         if len(D) not in _COEFFICIENTS[model]:
             raise ValueError(
                 f"{model} takes {' or '.join(map(str, _COEFFICIENTS[model]))} coefficients, "
@@ -137,13 +131,7 @@ class Camera:
             )
         if not np.all(np.isfinite(D)):
             raise ValueError(f"D must be finite, got {D.tolist()}")
-        try:
-            direction = ScanDirection(self.scan_direction)
-        except ValueError:
-            raise ValueError(
-                f"scan_direction must be one of {', '.join(ScanDirection)}; "
-                f"got {self.scan_direction!r}"
-            ) from None
+        direction = choice("scan_direction", ScanDirection, self.scan_direction)
         if min(self.width, self.height) < 2:
             raise ValueError(f"the image must be at least 2x2, got {self.width}x{self.height}")
         if not isinstance(self.readout_time, Real) or not 0.0 <= self.readout_time < math.inf:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from enum import StrEnum
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from rs_localizer.core.arrays import Array
 # NumPy's ArrayLike is so wide that type checkers take [[500, 0], [0, 500]] for a list of objects.
 Matrix = NDArray[Any] | Sequence[Sequence[float]]
 Vector = NDArray[Any] | Sequence[float]
+
+E = TypeVar("E", bound=StrEnum)
 
 
 def numbers(name: str, values: Any) -> Array:
@@ -32,3 +35,11 @@ def pixel_count(name: str, value: Any) -> int:
         if math.isfinite(number) and number == math.floor(number):
             return int(number)
     raise ValueError(f"{name} must be a whole number of pixels, got {value!r}")
+
+
+def choice(name: str, kind: type[E], value: Any) -> E:
+    """One of the values of an enumeration; ValueError for any other."""
+    try:
+        return kind(value)
+    except ValueError:
+        raise ValueError(f"{name} must be one of {', '.join(kind)}; got {value!r}") from None

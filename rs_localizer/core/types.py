@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from typing import Literal
 
 import numpy as np
@@ -12,23 +11,10 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS
-
-
-class Reason(StrEnum):
-    """Why a frame has no pose."""
-
-    TOO_FEW_POINTS = "too_few_points"
-    NO_HYPOTHESIS = "no_hypothesis"
-    TOO_FEW_INLIERS = "too_few_inliers"
-    BEHIND_CAMERA = "behind_camera"
-    RESIDUAL = "residual"
-    DEGENERATE = "degenerate"
-    IMPLAUSIBLE = "implausible"
-    MIRRORED = "mirrored"
-    MODEL_ERROR = "model_error"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.types import Failure, Reason
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Failure
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior
 
@@ -86,13 +87,13 @@ def refusal(
         return Failure(
             Reason.MODEL_ERROR,
             f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
-            "or the map is wrong by more than a pose could bear",
+            "or the map is too far off for any pose",
         )
     pace = _median(observations.row_paces(state), posterior.inliers)
     if pace < _LEAST_PACE:
         return Failure(
             Reason.IMPLAUSIBLE,
-            f"the image would move along with the rows, {1.0 - pace:.0%} as fast as they",
+            f"the image would move with the rows, at {1.0 - pace:.0%} of their speed",
         )
     turn = float(np.linalg.norm(state[12:15]))
     if turn > _MOST_TURN:
@@ -115,8 +116,8 @@ def refusal(
         return Failure(
             Reason.MIRRORED,
             f"the points lie on a plane, and the pose mirrored on it, "
-            f"{math.degrees(mirror.turn):.0f} deg away, fits but {mirror.evidence:.1f} noise "
-            "variances worse",
+            f"{math.degrees(mirror.turn):.0f} deg away, fits only {mirror.evidence:.1f} "
+            "sigma^2 worse",
         )
     return None
 

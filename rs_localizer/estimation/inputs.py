@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.types import Failure, Reason
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Failure
 
 # Pixels may lie outside the image by this part of it: noise, and features at its border.
 _MARGIN = 0.05

@@ -89,7 +89,7 @@ def _check_motion(motion: Motion) -> None:
     rotation = np.asarray(motion.rotation)
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if off > 1e-6 or np.linalg.det(rotation) < 0.0:
-        raise ValueError(f"the prior motion's rotation is none: {rotation.tolist()}")
+        raise ValueError(f"the prior motion's rotation is not orthonormal: {rotation.tolist()}")
 
 
 def _check_covariance(covariance: Array) -> None:

@@ -32,7 +32,8 @@ from rosbags.typesys.store import Typestore
 from rs_localizer.io.topics import TF_STATIC
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-_SUFFIXES = (".mcap", ".db3", ".bag")
+SUFFIXES = (".mcap", ".db3", ".bag")
+"""Of files that are recordings."""
 # Fields that ROS 2 spells in lower case.
 _ROS1_FIELDS = {"sensor_msgs/msg/CameraInfo": {"D": "d", "K": "k", "R": "r", "P": "p"}}
 # Whoever plays a recording offers its topics as it says; on /tf_static everybody listens for what
@@ -127,8 +128,8 @@ def is_bag(path: Path) -> bool:
     """Whether a path looks like a recording, and not like a video or a folder of images."""
     if path.is_dir():
         holds = {file.suffix for file in path.iterdir()}
-        return (path / "metadata.yaml").exists() or bool(holds & set(_SUFFIXES))
-    return path.suffix in _SUFFIXES
+        return (path / "metadata.yaml").exists() or bool(holds & set(SUFFIXES))
+    return path.suffix in SUFFIXES
 
 
 def _storage(path: Path) -> Path:
@@ -136,10 +137,10 @@ def _storage(path: Path) -> Path:
     if not path.exists():
         raise BagError(f"{path} does not exist")
     if not path.is_dir():
-        if path.suffix not in _SUFFIXES:
+        if path.suffix not in SUFFIXES:
             raise BagError(
-                f"{path} is no recording: expected a rosbag2 directory or a file ending in "
-                f"{', '.join(_SUFFIXES)}"
+                f"{path} is not a recording: expected a rosbag2 directory or a file ending in "
+                f"{', '.join(SUFFIXES)}"
             )
         if path.stat().st_size == 0:
             raise BagError(f"{path} is an empty file")
@@ -147,11 +148,11 @@ def _storage(path: Path) -> Path:
     if (path / "metadata.yaml").exists():
         return path
     # A recorder that was killed leaves its data without metadata.yaml.
-    files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
+    files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
     if len(files) != 1:
         raise BagError(
-            f"{path} is no recording: the directory has no metadata.yaml and "
-            f"{len(files)} files ending in {', '.join(_SUFFIXES)}"
+            f"{path} is not a recording: the directory has no metadata.yaml and "
+            f"{len(files)} files ending in {', '.join(SUFFIXES)}"
         )
     return files[0]
 

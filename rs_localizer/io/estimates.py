@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.io.bags import BagError, BagReader, open_bag
+from rs_localizer.io.bags import SUFFIXES, BagError, BagReader, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.trajectories import Trajectory, Twists, read_tum, read_twists
 
@@ -17,7 +17,6 @@ POSES_FILE, TWISTS_FILE = "poses.txt", "twists.txt"
 """What replay calls its text files."""
 
 _POSE, _TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
-_RECORDINGS = (".mcap", ".db3", ".bag")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +45,7 @@ def read_motions(
             not line.startswith("#") for line in twists.read_text(encoding="utf-8").splitlines()
         )
         return Motions(read_tum(path / POSES_FILE), read_twists(twists) if has_twists else None)
-    if path.is_file() and path.suffix not in _RECORDINGS:
+    if path.is_file() and path.suffix not in SUFFIXES:
         return Motions(read_tum(path), None)
     with open_bag(path) as bag:
         pose_topic = _topic(bag, _POSE, pose_topic, "--pose-topic", required=True)

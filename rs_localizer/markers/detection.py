@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.markers.chessboards import find_charuco, find_chessboard
-from rs_localizer.markers.circles import find_circles
+from rs_localizer.markers.boards import find_charuco, find_chessboard, find_circles
 from rs_localizer.markers.dictionaries import DictionaryError, Gray, MarkerFinder
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import Family

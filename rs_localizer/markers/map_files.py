@@ -86,7 +86,9 @@ def read_marker_map(path: Path | str) -> MarkerMap:
     except OSError as error:
         raise MarkerMapError(f"{path} cannot be read: {error.strerror}") from error
     except (YamlError, UnicodeDecodeError) as error:
-        raise MarkerMapError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
+        raise MarkerMapError(
+            f"{path} is not a YAML file: {' '.join(str(error).split())}"
+        ) from error
     try:
         return _map(tree)
     except ValueError as error:

@@ -31,7 +31,7 @@ class Pose:
         rotation = finite(self.rotation, (3, 3), "rotation")
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE:
-            raise ValueError(f"rotation is no rotation: its rows are {rotation.tolist()}")
+            raise ValueError(f"rotation is not a rotation matrix: its rows are {rotation.tolist()}")
         if np.linalg.det(rotation) < 0.0:
             raise ValueError(
                 "the rotation mirrors (its determinant is -1): x is to the right, y up and z out "

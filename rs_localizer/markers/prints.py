@@ -254,7 +254,7 @@ def _square_pose(corners: Array) -> Pose:
     misfit = np.abs(corners - middle - side * _UNIT_SQUARE @ rotation.T).max() / side
     if misfit > _SQUARE_TOLERANCE:
         raise ValueError(
-            "the corners are no square in the order top left, top right, bottom right, bottom "
+            "the corners are not a square in the order top left, top right, bottom right, bottom "
             f"left: they are {100 * misfit:.0f} % of a side away from one"
         )
     return Pose(middle, rotation)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image
@@ -63,7 +64,7 @@ def from_video(path: Path, camera: Camera, clock: ImageClock) -> Iterator[Shot]:
     for jpeg, gray, seconds in read_video(path):
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:
-            lost = Refusal("no_time", "OpenCV does not tell its presentation time")
+            lost = Refusal(Reason.NO_TIME, "OpenCV does not tell its presentation time")
             yield Shot(lost, make_camera_info(camera, 0), None, 0)
         else:
             yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")
@@ -101,7 +102,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def holds_images(path: Path) -> str:
-    """What a path that is no recording holds of images, as ``is a video``; empty: nothing."""
+    """What a path that is not a recording holds of images, as ``is a video``; empty: nothing."""
     if path.is_dir():
         found = sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
         return f"is a folder of {found} images" if found else ""

@@ -10,7 +10,7 @@ from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.topics import CAMERA_INFO, IMU, TF, TF_STATIC
+from rs_localizer.io.topics import CAMERA_INFO, IMU, MAP_POINTS, TF, TF_STATIC
 from rs_localizer.io.transforms.rigid import TransformError
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.offline.imu_first import LOOK_AHEAD, imu_first
@@ -37,6 +37,12 @@ class Topics:
     def frames(self) -> str:
         """The topic whose messages are localized."""
         return next(topic for name, topic in self.of.items() if INPUTS[name].role == Role.FRAMES)
+
+    @property
+    def lacks_map(self) -> bool:
+        """Whether the frames need a map that the recording does not have."""
+        frames = next(INPUTS[name] for name in self.of if INPUTS[name].role == Role.FRAMES)
+        return frames.needs == MAP_POINTS and MAP_POINTS not in self.of
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,10 +77,10 @@ def find_topics(bag: BagReader, given: Mapping[str, str | None] | None = None) -
             needed = item is frames
         elif item.role == Role.SAMPLES:
             needed = name in wanted or len(_named(bag, item) or imu_topics(bag)) == 1
-        elif item.only_with in ("", frames.topic):
-            needed = item.necessary or name in wanted or bool(_named(bag, item))
         else:
-            needed = False
+            # A map is of no use for frames that bring their own points.
+            used = name == frames.needs or all(name != other.needs for other in INPUTS.values())
+            needed = used and (item.necessary or name in wanted or bool(_named(bag, item)))
         if needed:
             found[name] = _find(bag, item, wanted.get(name))
     return Topics(found)

@@ -5,7 +5,6 @@ The node and the offline ``rs_localizer detect`` run this one class.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +13,7 @@ import numpy as np
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.images import Image, read_compressed_image, read_image
 from rs_localizer.io.messages import Make, MessageError
@@ -21,15 +21,13 @@ from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
 from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 
 # Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
 # map of a kilometre. Larger ones (georeferenced) need more.
 _LARGE_MAP = 1000.0  # m
 # The map is held against every image until so many have agreed, then against one in so many.
 _AGREED, _ONE_IN = 20, 30
-
-Notice = Callable[[str, str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +50,7 @@ def read(message: Any) -> Image | Refusal:
             return read_compressed_image(message)
         return read_image(message)
     except MessageError as error:
-        return Refusal("bad_image", str(error))
+        return Refusal(Reason.BAD_IMAGE, str(error))
 
 
 def correspondences(detected: Detected, make: Make) -> Any:
@@ -77,8 +75,7 @@ class FrameDetector:
 
     Args:
         config: its settings.
-        notice: told of what is wrong but stops nothing, by a name and one sentence:
-            ``unknown_markers``, ``repeated_markers``, ``wrong_map``.
+        notice: told of what is wrong but stops nothing.
         marker_map: instead of the file of the settings.
 
     Raises:
@@ -88,7 +85,7 @@ class FrameDetector:
     def __init__(
         self,
         config: DetectorConfig,
-        notice: Notice = lambda name, text: None,
+        notice: Notify = unheard,
         marker_map: MarkerMap | None = None,
     ) -> None:
         if marker_map is None:
@@ -120,8 +117,8 @@ class FrameDetector:
         """Look for markers in an image."""
         found = self._detector.detect(image.pixels, image.stamp_ns)
         for name, markers, text in (
-            ("unknown_markers", found.unknown, "which the map does not have"),
-            ("repeated_markers", found.repeated, "more than once: not used"),
+            (Notice.UNKNOWN_MARKERS, found.unknown, "which the map does not have"),
+            (Notice.REPEATED_MARKERS, found.repeated, "more than once: not used"),
         ):
             if markers:
                 shown = ", ".join(markers[:8]) + (", ..." if len(markers) > 8 else "")
@@ -131,7 +128,7 @@ class FrameDetector:
             fault = self._check.fault(found)
             if fault is not None:
                 self._agreed = 0
-                self._notice("wrong_map", fault)
+                self._notice(Notice.WRONG_MAP, fault)
             elif len(found.ids):
                 self._agreed += 1
         return Detected(image, found, self.map.map_frame, self._row)

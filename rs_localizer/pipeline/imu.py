@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import ImuUse, NodeConfig
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.buffer import Lack, Lacking, ReadingBuffer
 from rs_localizer.inertial.samples import ImuSamples
@@ -24,7 +24,8 @@ from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms.rigid import TransformError, Transforms
 from rs_localizer.pipeline.imu_axes import in_camera_axes
-from rs_localizer.pipeline.reasons import IMU_REASONS, ImuReason
+from rs_localizer.pipeline.reasons import IMU_REASONS
+from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.tracking import Tracker
 
 # Beside the exposure: the spline through the readings wants neighbours, and the tracker those since
@@ -88,7 +89,7 @@ class ImuInput:
             frames in a row.
     """
 
-    def __init__(self, notice: Callable[[str, str], None]) -> None:
+    def __init__(self, notice: Notify) -> None:
         self._notice = notice
         self._buffer = ReadingBuffer()
         self._recently: deque[bool] = deque(maxlen=_MANY)
@@ -213,7 +214,7 @@ class ImuInput:
         self._in_a_row.append(unused.reason)
         if self._in_a_row.count(unused.reason) == _LONG and self._told != unused.reason:
             self._told = unused.reason
-            self._notice(unused.reason.value, f"the IMU is not used: {unused}")
+            self._notice(unused.reason, f"the IMU is not used: {unused}")
 
 
 def inertial_settings(config: NodeConfig) -> InertialSettings | None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
 
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io import topics
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.imu import read_imu
@@ -50,11 +51,11 @@ class Input:
     type: str  # of its messages
     role: Role
     use: Callable[[FrameLocalizer, Any], Localized | Refusal | None]
-    refused: str
+    refused: Reason
     read: Callable[[Any], Any] = _as_it_is
     said: str = ""  # what a user is told that is missing
     necessary: bool = False  # without it no frame can be localized
-    only_with: str = ""  # the input without which this one is of no use
+    needs: str = ""  # of frames: the input that has to come first, and that only they use
     latched: bool = False  # who comes late wants the last message, too
     lasting: bool = False  # one message is enough
     # Of what comes with every image, and only its stamp is new: what the localizer has of it.
@@ -82,7 +83,7 @@ _ROWS = (
         Role.STATE,
         read=read_camera_info,
         use=lambda localizer, calibration: localizer.calibrate(calibration),
-        refused="bad_camera_info",
+        refused=Reason.BAD_CAMERA_INFO,
         said="camera_info",
         necessary=True,
         latched=True,
@@ -94,9 +95,8 @@ _ROWS = (
         Role.STATE,
         read=read_map,
         use=lambda localizer, landmarks: localizer.use_map(landmarks),
-        refused="bad_map",
+        refused=Reason.BAD_MAP,
         said="a map",
-        only_with=topics.KEYPOINTS,
         latched=True,
         lasting=True,
         help="the map of the keypoints",
@@ -107,7 +107,7 @@ _ROWS = (
         Role.SAMPLES,
         read=read_imu,
         use=lambda localizer, reading: localizer.imu.add(reading),
-        refused="bad_imu",
+        refused=Reason.BAD_IMU,
         help="of the IMU, if there are several",
     ),
     Input(
@@ -115,14 +115,15 @@ _ROWS = (
         CLOUD_TYPE,
         Role.FRAMES,
         use=lambda localizer, message: localizer.localize(message),
-        refused="bad_cloud",
+        refused=Reason.BAD_CLOUD,
     ),
     Input(
         topics.KEYPOINTS,
         CLOUD_TYPE,
         Role.FRAMES,
         use=lambda localizer, message: localizer.localize_keypoints(message),
-        refused="bad_keypoints",
+        refused=Reason.BAD_KEYPOINTS,
+        needs=topics.MAP_POINTS,
         help="instead of correspondences",
     ),
 )

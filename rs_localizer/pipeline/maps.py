@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 
@@ -31,16 +32,16 @@ def read_landmarks(file: str, frame: str) -> Map:
     return landmarks
 
 
-def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[str, str]:
+def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
     """What is worth telling of a map that takes the place of another, or of none."""
-    found = {}
+    found: dict[Notice, str] = {}
     if landmarks.dropped:
-        found["map_incomplete"] = (
+        found[Notice.MAP_INCOMPLETE] = (
             f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
             "descriptor"
         )
     if previous is not None:
-        found["map_replaced"] = (
+        found[Notice.MAP_REPLACED] = (
             f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
             f"one of {len(previous)} in frame {previous.frame!r}"
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.clouds import Correspondences
 
 # Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
@@ -13,8 +14,8 @@ _FINE = 0.00097
 _SLACK = 1.0
 
 
-def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[str, str]:
-    """Sentences by name: ``map_is_camera``, ``coarse_coordinates``, ``pixels_outside``.
+def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[Notice, str]:
+    """What is odd, a sentence each.
 
     Args:
         cloud: of one image.
@@ -22,9 +23,9 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
         camera_frame: its optical frame.
     """
     found = {
-        "map_is_camera": _frame(cloud.frame, camera_frame),
-        "coarse_coordinates": _coordinates(cloud),
-        "pixels_outside": _pixels(cloud, camera),
+        Notice.MAP_IS_CAMERA: _frame(cloud.frame, camera_frame),
+        Notice.COARSE_COORDINATES: _coordinates(cloud),
+        Notice.PIXELS_OUTSIDE: _pixels(cloud, camera),
     }
     return {name: text for name, text in found.items() if text}
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import Localized
@@ -15,8 +16,6 @@ from rs_localizer.pipeline.clock import published_moment
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.solvers.table import find_solver
-
-NO_TRANSFORM = "no_transform"
 
 
 def of_camera(
@@ -62,9 +61,11 @@ def of_body(
     except TransformError as error:
         text = f"from the camera {localized.body_frame!r} to base_frame {base!r}: {error}"
         if not isinstance(error, NotYetError):
-            return Refusal(NO_TRANSFORM, text)
+            return Refusal(Reason.NO_TRANSFORM, text)
         patience = config.transform_tolerance
-        return Waiting(NO_TRANSFORM, text, lambda: of_body(localized, config, transforms), patience)
+        return Waiting(
+            Reason.NO_TRANSFORM, text, lambda: of_body(localized, config, transforms), patience
+        )
     return replace(
         localized,
         body_frame=base,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
 from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.reasons import Notice
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
+from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.trajectory.online import REVERSED, MeasuredReadout, ReadoutMonitor
 
@@ -31,7 +32,7 @@ class ReadoutWatch:
             by the name ``readout_time`` and one sentence.
     """
 
-    def __init__(self, notice: Callable[[str, str], None]) -> None:
+    def __init__(self, notice: Notify) -> None:
         self._notice = notice
         self._monitor = ReadoutMonitor()
         self._frames, self._next = 0, _AT_FIRST
@@ -76,7 +77,7 @@ class ReadoutWatch:
         self.fault = _fault(config, found) if found.contradicts(config.readout_time) else ""
         if self.fault and not self._said:
             self._said = True
-            self._notice("readout_time", self.fault)
+            self._notice(Notice.READOUT_TIME, self.fault)
         return config
 
     def _measure(
@@ -97,7 +98,7 @@ class ReadoutWatch:
         given = ScanDirection(config.scan_direction)
         direction = given if found.readout_time > 0.0 else REVERSED[given]
         self._notice(
-            "readout_time",
+            Notice.READOUT_TIME,
             f"estimated: {_milliseconds(value, found.deviation)}, {direction}; set readout_time to "
             f"{value:.5f} and scan_direction to {direction} to have it from the start",
         )

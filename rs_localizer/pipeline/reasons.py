@@ -5,26 +5,9 @@ And the reasons for which an image is localized, but without the IMU.
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import NamedTuple
 
-
-class ImuReason(StrEnum):
-    """Why an image was localized by the camera alone."""
-
-    NEVER = "imu_never"
-    LATE = "imu_late"
-    STOPPED = "imu_stopped"
-    BEGINS_LATER = "imu_begins_later"
-    GAP = "imu_gap"
-    TOO_SLOW = "imu_too_slow"
-    SATURATED = "imu_saturated"
-    NO_TRANSFORM = "imu_no_transform"
-    NO_READOUT_TIME = "imu_no_readout_time"
-    NOT_TRACKING = "imu_not_tracking"
-    DOUBTED = "imu_doubted"
-    DISAGREES = "imu_disagrees"
-    TURNED = "imu_turned"
+from rs_localizer.core.reasons import ImuReason, Reason
 
 
 class Meaning(NamedTuple):
@@ -38,69 +21,78 @@ _TURNED = (
     "is the readout time in seconds, the scan direction right, are the pixels raw (not rectified)?"
 )
 
-REASONS = {
-    "too_few_points": Meaning(
+REASONS: dict[str, Meaning] = {
+    Reason.TOO_FEW_POINTS: Meaning(
         "fewer points than min_inliers can be used",
         "show more of the map: three markers, or a larger part of it",
     ),
-    "too_few_inliers": Meaning(
+    Reason.TOO_FEW_INLIERS: Meaning(
         "no motion fits min_inliers points to within inlier_threshold",
         f"do map and calibration belong to these images; {_TURNED}",
     ),
-    "no_hypothesis": Meaning(
+    Reason.NO_HYPOTHESIS: Meaning(
         "no sample of points gave a pose", "are all points the same, or on one line?"
     ),
-    "behind_camera": Meaning(
+    Reason.BEHIND_CAMERA: Meaning(
         "most points would lie behind the camera", "is the map mirrored, or another one?"
     ),
-    "residual": Meaning(
+    Reason.RESIDUAL: Meaning(
         "the errors of the inliers fill inlier_threshold: nothing fits them",
         f"calibration, map, or a too small inlier_threshold; {_TURNED}",
     ),
-    "degenerate": Meaning(
+    Reason.DEGENERATE: Meaning(
         "the points do not determine the motion, as on a plane seen straight on",
         "look at it from an angle, show points at other depths, leave tracking and velocity_prior "
         "on",
     ),
-    "implausible": Meaning(
+    Reason.IMPLAUSIBLE: Meaning(
         "the motion would be faster than a camera moves", f"mostly chance matches; {_TURNED}"
     ),
-    "mirrored": Meaning(
+    Reason.MIRRORED: Meaning(
         "points on a plane fit two poses, mirrored on it, alike",
         "come nearer, look from an angle, use a larger board or markers on several walls",
     ),
-    "model_error": Meaning(
+    Reason.MODEL_ERROR: Meaning(
         "the errors of neighbouring points agree: vibration faster than the rows can tell, or a "
-        "map or calibration that is wrong by more than a pose could bear",
+        "map or calibration that is too far off for any pose",
         f"a stiffer mounting, the calibration, the map; {_TURNED}",
     ),
-    "no_camera_info": Meaning(
+    Reason.NO_CAMERA_INFO: Meaning(
         "no usable camera_info came before it", "is it recorded, is its topic the right one?"
     ),
-    "bad_camera_info": Meaning(
+    Reason.BAD_CAMERA_INFO: Meaning(
         "a camera_info cannot be used", "calibrate; uncalibrated drivers publish zeros"
     ),
-    "bad_cloud": Meaning(
+    Reason.BAD_CLOUD: Meaning(
         "a cloud of correspondences cannot be read", "its fields: x y z u v, FLOAT32 or FLOAT64"
     ),
-    "bad_keypoints": Meaning(
+    Reason.BAD_KEYPOINTS: Meaning(
         "a cloud of keypoints cannot be read", "its fields: u v and id and/or descriptor"
     ),
-    "empty_cloud": Meaning("a cloud holds no point", "does the camera see anything of the map?"),
-    "bad_map": Meaning(
+    Reason.EMPTY_CLOUD: Meaning(
+        "a cloud holds no point", "does the camera see anything of the map?"
+    ),
+    Reason.BAD_MAP: Meaning(
         "a map on map_points cannot be used", "its fields: x y z and id and/or descriptor"
     ),
-    "bad_imu": Meaning(
+    Reason.BAD_IMU: Meaning(
         "a message on imu cannot be used", "its units: rad/s and m/s^2; what its driver fills in"
     ),
-    "no_map": Meaning("keypoints came before a map", "give map_file, or publish map_points"),
-    "no_matches": Meaning(
+    Reason.NO_MAP: Meaning("keypoints came before a map", "give map_file, or publish map_points"),
+    Reason.NO_MATCHES: Meaning(
         "no keypoint matches a landmark", "are descriptors, or ids, of map and camera of one kind?"
     ),
-    "internal_error": Meaning(
+    Reason.BAD_IMAGE: Meaning(
+        "an image cannot be read", "its encoding: mono, color, Bayer, YUV 4:2:2, JPEG, PNG"
+    ),
+    Reason.NO_TIME: Meaning(
+        "OpenCV does not tell when an image of a video was taken",
+        "--rate, or another container; the image is left out",
+    ),
+    Reason.INTERNAL_ERROR: Meaning(
         "a fault of this program, which goes on with the next frame", "please report the message"
     ),
-    "no_transform": Meaning(
+    Reason.NO_TRANSFORM: Meaning(
         "TF does not say where the camera is on base_frame",
         "record /tf and /tf_static, too; a robot_state_publisher has to run",
     ),

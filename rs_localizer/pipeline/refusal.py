@@ -1,4 +1,4 @@
-"""A message without a result, and why."""
+"""A message without a result, and why; who is told what is odd."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from rs_localizer.core.reasons import ImuReason, Notice, Reason
+
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A message without a result; false in a condition.
+    """A message without a result; false in a condition. What its reason means: :mod:`.reasons`."""
 
-    Beside the localizer's own reasons there are ``no_camera_info``, ``empty_cloud``, ``bad_cloud``
-    (a message that cannot be read) and ``no_transform`` (from the camera to ``base_frame``); of
-    keypoints ``no_map``, ``bad_keypoints`` (that cannot be read, or not be compared with the map)
-    and ``no_matches``; of images ``bad_image``. What they mean: :mod:`.reasons`.
-    """
-
-    reason: str
+    reason: Reason
     detail: str  # one sentence that says what was found
 
     def __bool__(self) -> Literal[False]:
@@ -33,3 +29,11 @@ class Waiting(Refusal):
 
     again: Callable[[], Any]  # the result or another refusal
     patience: float  # s, for which this makes sense
+
+
+Notify = Callable[[Notice | ImuReason, str], None]
+"""Told of what is odd, with one sentence. Frames are localized all the same."""
+
+
+def unheard(notice: Notice | ImuReason, text: str) -> None:
+    """Tell nobody."""

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.lanes.algebra import least_squares
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, least_squares, traced
+from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced
 from rs_localizer.core.lanes.vectors import load, root, store, uniform, where_less
 
 SOLUTIONS = 20

@@ -9,7 +9,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
 from rs_localizer.trajectory.model import Observations
 

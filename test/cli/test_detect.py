@@ -208,7 +208,7 @@ def test_other_numbers_are_no_times(
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), markers())
     assert detect(files, str(tmp_path / "images"), *files.map, *files.calibration) == 2
-    assert "the names of the files are no times in ns" in capsys.readouterr().err
+    assert "the names of the files are not times in ns" in capsys.readouterr().err
 
 
 def test_nothing_is_left_where_nothing_was_seen(

@@ -296,7 +296,7 @@ def test_only_results_are_overwritten(
     (foreign / "poses.txt").write_text("the only copy")
     arguments = ["replay", str(recording), *SHUTTER, "--overwrite", "--out"]
     assert main([*arguments, str(foreign)]) == 1
-    assert f"{foreign} is no result of replay" in capsys.readouterr().err
+    assert f"{foreign} is not a result of replay" in capsys.readouterr().err
     assert [file.read_text() for file in foreign.iterdir()] == ["the only copy"]
     (tmp_path / "empty").mkdir()
     assert main([*arguments, str(tmp_path / "empty")]) == 0
@@ -367,7 +367,7 @@ def test_topics_are_found_or_chosen(
     ("words", "code", "text"),
     [
         (["-p", "solver:=p4p"], 2, "solver must be one of p3p,"),
-        (["-p", "sead:=1"], 2, "'sead' is no setting"),
+        (["-p", "sead:=1"], 2, "'sead' is not a setting"),
         (["-p", "seed"], 2, "expected name:=value, got 'seed'"),
         (["--params", "nowhere.yaml"], 2, "--params: nowhere.yaml cannot be read"),
         (["--rate", "2"], 2, "--rate goes with --ros"),
@@ -432,11 +432,11 @@ def empty_bag(directory: Path) -> Path:
     ("make", "text"),
     [
         (lambda directory: directory / "nowhere", "nowhere does not exist"),
-        (no_bag, "letter.txt is no recording"),
+        (no_bag, "letter.txt is not a recording"),
         (text_as_bag, "letter.bag cannot be read as a recording"),
         (cut_bag, "cut.db3 cannot be read as a recording"),
         (empty_bag, "is an empty recording"),
-        (lambda directory: directory, "is no recording"),
+        (lambda directory: directory, "is not a recording"),
     ],
 )
 def test_recordings_that_are_none(

@@ -126,7 +126,7 @@ def test_a_recording_of_everything(
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (["keypoints"], 1, "has keypoints and no map on map_points; give one with --map"),
+        (["keypoints"], 1, "has /cam/keypoints and no map; give one with --map"),
         (["keypoints", "--map", "nowhere.npz"], 1, "map_file: [Errno 2] No such file"),
         (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth and -p are for offline replay"),
         (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),

@@ -14,6 +14,7 @@ import pytest
 
 from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.localizer.feed import Feed
 from rs_localizer.settings import Kind, settings
@@ -99,22 +100,15 @@ def literals() -> Iterator[tuple[str, ast.AST]]:
                 yield str(path), node
 
 
-def test_every_notice_is_explained() -> None:
+def test_every_notice_is_explained_and_given_somewhere() -> None:
     (table,) = pages.all_tables("notice")
-    said = {name for cell in table.column("notice") for name in pages.names_in(cell)}
-    called, texts = set(), set()
-    for _, node in literals():
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            texts.add(node.value)
-        elif isinstance(node, ast.Call) and node.args:
-            function = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            name = getattr(node.args[0], "value", None)
-            if function.endswith("notice") and isinstance(name, str):
-                called.add(name)
-    (reasons,) = [t for t in pages.all_tables("reason", "look at") if "residual" in str(t.rows)]
-    refusals = {name for cell in reasons.column("reason") for name in pages.names_in(cell)}
-    assert called - refusals <= said
-    assert said <= texts
+    assert {name for cell in table.column("notice") for name in pages.names_in(cell)} == set(Notice)
+    given = {
+        node.attr
+        for _, node in literals()
+        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "Notice"
+    }
+    assert given == {notice.name for notice in Notice}
 
 
 def states(node: str) -> set[str]:

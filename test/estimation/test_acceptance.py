@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rs_localizer.core.types import Reason
+from rs_localizer.core.reasons import Reason
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori

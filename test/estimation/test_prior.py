@@ -123,7 +123,7 @@ def test_motion_terms_are_precisions_and_none_for_zero():
         ({"motion": motion(), "covariance": np.triu(np.ones((12, 12)))}, "must be symmetric"),
         ({"motion": motion(), "covariance": np.ones((12, 12))}, "must be positive definite"),
         ({"motion": replace(motion(), rotation=2 * np.eye(3)), "covariance": np.eye(12)},
-         "rotation is none"),
+         "rotation is not orthonormal"),
         ({"motion": replace(motion(), translation=np.full(3, np.nan)), "covariance": np.eye(12)},
          "translation is not finite"),
         ({"angular_velocity": [1, 2]}, "angular_velocity must be three finite numbers"),

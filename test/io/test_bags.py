@@ -136,7 +136,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     ("name", "content", "expected"),
     [
         ("absent", None, "absent does not exist"),
-        ("notes.txt", b"hello", r"notes.txt is no recording: expected .*\.mcap, \.db3, \.bag"),
+        ("notes.txt", b"hello", r"notes.txt is not a recording: expected .*\.mcap, \.db3, \.bag"),
         ("zero.mcap", b"", "zero.mcap is an empty file"),
         ("wrong.mcap", b"hello" * 99, "wrong.mcap cannot be read as a recording: .*magic"),
         ("wrong.db3", b"hello" * 99, "wrong.db3 cannot be read as a recording: .*not a database"),

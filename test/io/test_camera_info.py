@@ -1,4 +1,4 @@
-"""CameraInfo becomes a Camera; what is no calibration is refused with what was found."""
+"""CameraInfo becomes a Camera; what is not a calibration is refused with what was found."""
 
 from __future__ import annotations
 

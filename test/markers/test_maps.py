@@ -134,7 +134,7 @@ CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
         ({"family": "4x4_50", "id": 1, "corners": CORNERS[:3]}, "corners must have 4 x 3 values"),
         (
             {"family": "4x4_50", "id": 1, "corners": [CORNERS[k] for k in (0, 2, 1, 3)]},
-            "the corners are no square in the order top left, top right",
+            "the corners are not a square in the order top left, top right",
         ),
         ({"family": "4x4_50", "id": 1, "corners": CORNERS, "size": 0.5}, "1 m apart, but size is"),
     ],
@@ -201,7 +201,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(MarkerMapError, match="cannot be read: No such file"):
         read_marker_map(tmp_path / "missing.yaml")
     (tmp_path / "map.yaml").write_text("a: [1")
-    with pytest.raises(MarkerMapError, match="is no YAML file"):
+    with pytest.raises(MarkerMapError, match="is not a YAML file"):
         read_marker_map(tmp_path / "map.yaml")
 
 

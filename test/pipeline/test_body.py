@@ -16,13 +16,14 @@ import pytest
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.frames
+import rs_localizer.pipeline.method
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, Pose, Twist, messages
 from rs_localizer.io.transforms.rigid import Transform, TransformError, read_transform
 from rs_localizer.io.transforms.tree import TransformTree
@@ -180,7 +181,7 @@ class KnowsTheMotion:
 
 @pytest.fixture(autouse=True)
 def known_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", KnowsTheMotion)
+    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", KnowsTheMotion)
 
 
 @pytest.fixture
@@ -196,7 +197,9 @@ def localize(
             **({"readout_time": READOUT_TIME, "base_frame": "base_link"} | settings)
         )
         frames = FrameLocalizer(config, transforms=transforms)
-        frames.take_camera_info(make_camera_info(**({} if roi is None else {"roi": roi})))
+        frames.calibrate(
+            read_camera_info(make_camera_info(**({} if roi is None else {"roi": roi})))
+        )
         rows = [[1.0, 2.0, 3.0, 100.0, 200.0]] * 8
         return frames.localize(make_cloud_message(rows, fields, point_step=40, stamp=stamp)), config
 

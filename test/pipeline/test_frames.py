@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.frames
+import rs_localizer.pipeline.method
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
@@ -82,7 +84,7 @@ class MockLocalizer:
 @pytest.fixture
 def mock(monkeypatch: pytest.MonkeyPatch) -> type[MockLocalizer]:
     MockLocalizer.made = []
-    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", MockLocalizer)
+    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", MockLocalizer)
     return MockLocalizer
 
 
@@ -108,9 +110,9 @@ def test_reasons_of_refusals(cloud: SimpleNamespace, make_camera_info: Make) -> 
     frames = FrameLocalizer(NodeConfig())
     assert refused(frames.localize(cloud))[0] == "no_camera_info"
     with pytest.raises(MessageError, match="not calibrated"):
-        frames.take_camera_info(make_camera_info(k=np.zeros(9)))
+        frames.calibrate(read_camera_info(make_camera_info(k=np.zeros(9))))
     assert refused(frames.localize(cloud))[0] == "no_camera_info"
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
     assert localized(frames.localize(cloud)).map_frame == "map"
     cloud.width = 3
     assert refused(frames.localize(cloud)) == ("too_few_points", "3 points")
@@ -134,7 +136,7 @@ def test_inliers_are_the_rows_that_were_kept(
     rows = [[i, i, i, 100.0 + i, 200.0] for i in range(8)]
     rows[0][1] = rows[3][4] = float("nan")
     frames = FrameLocalizer(NodeConfig())
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
     message = make_cloud_message(rows, FIELDS, point_step=40)
     frame = localized(frames.localize(message))
     assert frame.dropped == 2
@@ -168,7 +170,7 @@ def test_pose_and_twist_are_those_of_the_published_time(
     )
     x, y, width, height = region or (0, 0, 0, 0)
     roi = SimpleNamespace(x_offset=x, y_offset=y, width=width, height=height)
-    frames.take_camera_info(make_camera_info(roi=roi))
+    frames.calibrate(read_camera_info(make_camera_info(roi=roi)))
     rows = [[1.0, 2.0, 3.0, 100.0, 200.0]] * 8
     message = make_cloud_message(rows, FIELDS, point_step=40, stamp=stamp)
     frame = localized(frames.localize(message))
@@ -211,7 +213,7 @@ def test_without_a_readout_time_there_is_a_pose_but_no_twist(
     cloud: SimpleNamespace, make_camera_info: Make, pose_time: str
 ) -> None:
     frames = FrameLocalizer(NodeConfig(stamp_offset=0.5, pose_time=pose_time))
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
     frame = localized(frames.localize(cloud))
     assert frame.twist is None
     # Row times need no readout time: the stamp is that of the first row.
@@ -227,7 +229,7 @@ def test_a_solver_that_sees_no_motion_gives_no_twist(
     cloud: SimpleNamespace, make_camera_info: Make
 ) -> None:
     frames = FrameLocalizer(NodeConfig(solver="p3p", readout_time=READOUT_TIME))
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
     assert localized(frames.localize(cloud)).twist is None
 
 
@@ -239,13 +241,13 @@ def test_a_new_camera_counts_from_the_next_frame_on(
         NodeConfig(readout_time=READOUT_TIME, scan_direction="left_to_right"),
         lambda *words: notices.append(words),
     )
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
     made = len(mock.made)
-    frames.take_camera_info(make_camera_info())  # the same again
+    frames.calibrate(read_camera_info(make_camera_info()))  # the same again
     assert len(mock.made) == made
     assert notices == []
     other = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="right_eye")
-    frames.take_camera_info(make_camera_info(header=other, width=320))
+    frames.calibrate(read_camera_info(make_camera_info(header=other, width=320)))
     assert [name for name, _ in notices] == ["camera_changed"]
     assert "to 'right_eye', 320 x 480" in notices[0][1]
     assert mock.made[-1].camera.width == 320
@@ -253,7 +255,7 @@ def test_a_new_camera_counts_from_the_next_frame_on(
     assert mock.made[-1].camera.scan_direction == "left_to_right"
     assert localized(frames.localize(cloud)).body_frame == "right_eye"
     with pytest.raises(MessageError):
-        frames.take_camera_info(make_camera_info(height=0))
+        frames.calibrate(read_camera_info(make_camera_info(height=0)))
     assert localized(frames.localize(cloud)).body_frame == "right_eye"
 
 
@@ -261,7 +263,7 @@ def test_new_settings_count_from_the_next_frame_on(
     cloud: SimpleNamespace, make_camera_info: Make, mock: type[MockLocalizer]
 ) -> None:
     frames = FrameLocalizer(NodeConfig())
-    frames.take_camera_info(make_camera_info(width=320))
+    frames.calibrate(read_camera_info(make_camera_info(width=320)))
     assert localized(frames.localize(cloud)).twist is None
     frames.config = NodeConfig(readout_time=READOUT_TIME, inlier_threshold=5.0)
     assert mock.made[-1].camera.width == 320
@@ -280,7 +282,7 @@ def test_a_jump_of_time_and_another_map_start_afresh(
     frames = FrameLocalizer(
         NodeConfig(readout_time=READOUT_TIME), lambda *words: notices.append(words)
     )
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
 
     def tracked(second: int, hundredths: int, frame: str = "map") -> bool:
         """Whether the previous frame helped."""
@@ -310,7 +312,7 @@ def test_points_in_the_frame_of_the_camera_are_said(
 ) -> None:
     notices: list[tuple[str, str]] = []
     frames = FrameLocalizer(NodeConfig(), lambda *words: notices.append(words))
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
     localized(frames.localize(cloud))
     assert notices == []
     cloud.header.frame_id = frames.camera_frame  # a header that was copied from the image
@@ -348,7 +350,7 @@ def test_signs_and_frames_against_the_true_motion(
     frames = FrameLocalizer(
         NodeConfig(readout_time=READOUT_TIME, scan_direction=direction, pose_time=pose_time)
     )
-    frames.take_camera_info(make_camera_info())
+    frames.calibrate(read_camera_info(make_camera_info()))
     for message, motion in simulated(direction)[:4]:
         frame = localized(frames.localize(message))
         delay = 0 if pose_time == PoseTime.STAMP else 15_000_000

@@ -16,15 +16,17 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.config import Imu, NodeConfig
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.estimates import read_motions
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.offline.imu_first import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
 from rs_localizer.pipeline.imu import ImuState
-from rs_localizer.pipeline.reasons import ImuReason
 
 READOUT_TIME = 0.03
 CONFIG = NodeConfig(readout_time=READOUT_TIME)
@@ -124,9 +126,9 @@ def fly(
 
     for topic, _, message in imu_first(changed(), "/imu", awaits):
         if topic == "/camera_info":
-            frames.take_camera_info(message)
+            frames.calibrate(read_camera_info(message))
         elif topic == "/imu":
-            frames.take_imu(message)
+            frames.imu.add(read_imu(message))
         else:
             flown.results.append(frames.localize(message))
     flown.state = frames.imu.state
@@ -306,5 +308,5 @@ def test_bad_messages_are_told_and_the_others_count(flight: Flight) -> None:
     message = next(copy.deepcopy(m) for topic, _, m in flight.items if topic == "/imu")
     message.angular_velocity.x = math.nan
     with pytest.raises(MessageError, match="angular_velocity is not finite"):
-        frames.take_imu(message)
+        frames.imu.add(read_imu(message))
     assert frames.imu.frame == ""

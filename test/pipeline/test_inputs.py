@@ -29,7 +29,7 @@ def test_the_page_of_the_node_has_every_input_with_its_type() -> None:
     rows = re.findall(
         r"^\| in \| `(\w+)`.*? \| (.*?) \|", (ROOT / "docs" / "node.md").read_text(), re.M
     )
-    assert [name for name, _ in rows] == sorted(INPUTS, key=[name for name, _ in rows].index)
+    assert {name for name, _ in rows} == set(INPUTS)
     for name, kind in rows:
         assert kind.startswith(INPUTS[name].type.replace("/msg/", "/"))
 

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rs_localizer.pipeline.frames
+import rs_localizer.pipeline.method
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
@@ -68,7 +70,7 @@ def localizer(
 ) -> FrameLocalizer:
     given = NodeConfig(**{"readout_time": READOUT_TIME, **settings})
     result = FrameLocalizer(given, Notices() if notices is None else notices)
-    result.take_camera_info(make_camera_info())
+    result.calibrate(read_camera_info(make_camera_info()))
     return result
 
 
@@ -89,7 +91,7 @@ def test_the_true_pose(
     frames: list[SimulatedFrame], make_camera_info: Any, names: tuple[str, ...], tracking: bool
 ) -> None:
     node = localizer(make_camera_info, tracking=tracking)
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames:
         result = localized(node.localize_keypoints(keypoints(frame, *names)), frame)
         assert result.map_frame == "map"
@@ -110,7 +112,7 @@ def test_by_id_and_by_correspondences_is_the_same(
 ) -> None:
     """Keypoints by id are correspondences that are put together here."""
     one, other = localizer(make_camera_info), localizer(make_camera_info)
-    one.take_map(map_cloud(LANDMARKS))
+    one.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:4]:
         rows = np.zeros(len(frame.ids), [(n, "<f8") for n in "xyz"] + [("u", "<f4"), ("v", "<f4")])
         for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
@@ -136,7 +138,7 @@ def test_a_map_that_is_missing_and_comes_late(
     )  # fmt: skip
     assert node.missing == ("map_points",)
     assert node.map is None
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     assert node.missing == ()
     assert node.map is not None
     assert len(node.map) == 4000
@@ -158,24 +160,24 @@ def test_correspondences_need_no_map(frames: list[SimulatedFrame], make_camera_i
 def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     notices = Notices()
     node = localizer(make_camera_info, notices)
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     localized(node.localize_keypoints(keypoints(frames[0], "id")), frames[0])
     # The same again says nothing and keeps the track.
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     assert localized(
         node.localize_keypoints(keypoints(frames[1], "id")), frames[1]
     ).estimate.tracked
     assert notices == []
     # A part of it in the same frame: the track goes on.
     half = Map(POINTS[::2], IDS[::2], None, "map")
-    node.take_map(map_cloud(half))
+    node.use_map(read_map(map_cloud(half)))
     assert localized(
         node.localize_keypoints(keypoints(frames[2], "id")), frames[2]
     ).estimate.tracked
     text = "a map of 2000 landmarks in frame 'map' replaces the one of 4000 in frame 'map'"
     assert notices == [("map_replaced", text)]
     # Another frame: everything starts afresh.
-    node.take_map(map_cloud(Map(POINTS, IDS, None, "cellar")))
+    node.use_map(read_map(map_cloud(Map(POINTS, IDS, None, "cellar"))))
     found = localized(node.localize_keypoints(keypoints(frames[3], "id")), frames[3])
     assert found.map_frame == "cellar"
     assert not found.estimate.tracked
@@ -184,7 +186,7 @@ def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: 
     bad = map_cloud(LANDMARKS)
     bad.width = 10**6
     with pytest.raises(MessageError, match="truncated"):
-        node.take_map(bad)
+        node.use_map(read_map(bad))
     assert (
         localized(node.localize_keypoints(keypoints(frames[4], "id")), frames[4]).map_frame
         == "cellar"
@@ -197,14 +199,14 @@ def test_landmarks_that_are_left_out_are_said(make_camera_info: Any) -> None:
     node = localizer(make_camera_info, notices)
     rows = map_rows(LANDMARKS)
     rows["y"][:7] = np.nan
-    node.take_map(make_cloud(make_message, 0, "map", rows))
+    node.use_map(read_map(make_cloud(make_message, 0, "map", rows)))
     text = "7 landmarks are left out: they hold NaN or infinity, or no descriptor"
     assert notices == [("map_incomplete", text)]
 
 
 def test_keypoints_that_give_no_pose(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     node = localizer(make_camera_info)
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     message = keypoints(frames[0], "id")
     message.width = 0
     assert refused(node.localize_keypoints(message))[0] == "empty_cloud"
@@ -227,7 +229,7 @@ def test_keypoints_that_give_no_pose(frames: list[SimulatedFrame], make_camera_i
     few.width = 5
     assert refused(node.localize_keypoints(few))[0] == "too_few_points"
     unknown = FrameLocalizer(NodeConfig())
-    unknown.take_map(map_cloud(LANDMARKS))
+    unknown.use_map(read_map(map_cloud(LANDMARKS)))
     assert refused(unknown.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_camera_info"
     # None of this left a trace.
     localized(node.localize_keypoints(keypoints(frames[0], "id")), frames[0])
@@ -244,16 +246,16 @@ def test_a_wrong_prediction_is_found_out(
             asked.append(arguments[3] is not None)
             return super().match(*arguments)
 
-    monkeypatch.setattr(rs_localizer.pipeline.frames, "Matcher", Asked)
+    monkeypatch.setattr(rs_localizer.pipeline.landmarks, "Matcher", Asked)
     node = localizer(make_camera_info)
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:
         localized(node.localize_keypoints(keypoints(frame, "descriptor")), frame)
     assert asked == [False, True, True]
     away = Map(
         POINTS @ np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), None, LANDMARKS.descriptors, "map"
     )
-    node.take_map(map_cloud(away))
+    node.use_map(read_map(map_cloud(away)))
     asked.clear()
     for frame in frames[3:5]:
         result = node.localize_keypoints(keypoints(frame, "descriptor"))
@@ -267,7 +269,7 @@ def test_settings_of_matching(frames: list[SimulatedFrame], make_camera_info: An
     node = localizer(
         make_camera_info, notices, matching=Matching(max_keypoints=50, by="descriptor")
     )
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     result = localized(node.localize_keypoints(keypoints(frames[0], "id", "descriptor")), frames[0])
     assert len(result.estimate.inliers) <= 50
     text = "70 keypoints have come, matching.max_keypoints of them, 50, are matched"
@@ -299,7 +301,7 @@ def test_coordinates_far_from_the_origin_keep_their_digits(
 ) -> None:
     away = np.array([4e6, 5e5, 100.0])
     node = localizer(make_camera_info)
-    node.take_map(map_cloud(Map(POINTS + away, IDS, LANDMARKS.descriptors, "utm")))
+    node.use_map(read_map(map_cloud(Map(POINTS + away, IDS, LANDMARKS.descriptors, "utm"))))
     for frame in frames[:3]:
         result = node.localize_keypoints(keypoints(frame, "descriptor"))
         assert result, result
@@ -309,6 +311,6 @@ def test_coordinates_far_from_the_origin_keep_their_digits(
 
 def test_any_message_is_answered(make_camera_info: Any) -> None:
     node = localizer(make_camera_info)
-    node.take_map(map_cloud(LANDMARKS))
+    node.use_map(read_map(map_cloud(LANDMARKS)))
     empty = SimpleNamespace(**vars(map_cloud(LANDMARKS)) | {"fields": []})
     assert refused(node.localize_keypoints(empty))[0] == "bad_keypoints"

@@ -13,6 +13,7 @@ from rs_localizer import data
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message, open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
@@ -55,7 +56,7 @@ def watched(count: int = FRAMES, **settings: Any) -> tuple[FrameLocalizer, list[
             notices.append(text)
 
     frames = FrameLocalizer(NodeConfig(**settings), notice)
-    frames.take_camera_info(make_camera_info(CAMERA, 0))
+    frames.calibrate(read_camera_info(make_camera_info(CAMERA, 0)))
     for message in clouds()[:count]:
         frames.localize(message)
     return frames, notices
@@ -108,7 +109,7 @@ def test_what_changes_starts_afresh(change: str) -> None:
     elif change == "settings":
         frames.config = changed(frames.config, seed=1)
     elif change == "camera":
-        frames.take_camera_info(make_camera_info(changed(CAMERA, width=641), 0))
+        frames.calibrate(read_camera_info(make_camera_info(changed(CAMERA, width=641), 0)))
     else:
         message = clouds()[40]
         header = changed(message.header, frame_id="another map")
@@ -138,5 +139,5 @@ def test_the_readout_time_from_nothing(direction: str) -> None:
     assert last.twist is not None
     assert last.estimate.tracked
     # Of another camera nothing is known yet.
-    frames.take_camera_info(make_camera_info(changed(CAMERA, width=641), 0))
+    frames.calibrate(read_camera_info(make_camera_info(changed(CAMERA, width=641), 0)))
     assert frames.config == NodeConfig(**given)

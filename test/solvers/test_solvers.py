@@ -8,9 +8,13 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import SOLVERS, find_solver
 
-LINEAR = ["r6p_vc_wt", "r6p_vct_w", "r6p_vct_wt", "r6p_vcwt", "r9p"]
-VARIANTS = [(name, False) for name in LINEAR] + [("r6p_vcwt", True), ("r9p", True)]
-ROLLING = [*LINEAR, "joint", "r6p"]
+ROLLING = [name for name, row in SOLVERS.items() if row.rolling_shutter]
+LINEAR = [name for name in ROLLING if find_solver(name).solutions == 1]
+VARIANTS = [
+    (name, as_published)
+    for name in LINEAR
+    for as_published in ((False, True) if SOLVERS[name].as_published else (False,))
+]
 
 
 def solve(name, p, **options):

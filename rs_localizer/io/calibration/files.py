@@ -49,19 +49,19 @@ def read_calibration(path: Path | str) -> Camera:
         raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
     except (YamlError, UnicodeDecodeError) as error:
         raise CalibrationError(
-            f"{path} is no YAML, JSON or XML file: {' '.join(str(error).split())}"
+            f"{path} is not a YAML, JSON or XML file: {' '.join(str(error).split())}"
         ) from error
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         fault = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise CalibrationError(f"{path} is no usable calibration: {fault}") from error
+        raise CalibrationError(f"{path} is not a usable calibration: {fault}") from error
     if camera is None:
         raise CalibrationError(
-            f"{path} is no calibration: expected a {CALIBRATION_KINDS}; {_found(text)}"
+            f"{path} is not a calibration: expected a {CALIBRATION_KINDS}; {_found(text)}"
         )
     x, y = camera.K[:2, 2]
     if not (0.0 < x < camera.width and 0.0 < y < camera.height):
         raise CalibrationError(
-            f"{path} is no usable calibration: its principal point ({x:g}, {y:g}) lies outside of "
+            f"{path} is not a usable calibration: its principal point ({x:g}, {y:g}) lies outside "
             f"its image of {camera.width}x{camera.height}: are width and height exchanged, or of "
             "another resolution?"
         )

@@ -163,7 +163,7 @@ def _of_image(
     if extractor in (_UNDEFINED, _SIFT):
         return np.frombuffer(data, np.uint8).reshape(rows, columns)
     if columns % 4:
-        raise MapError(f"image {image}: descriptors of {columns} bytes are no floats")
+        raise MapError(f"image {image}: descriptors of {columns} bytes are not floats")
     return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, columns // 4)
 
 

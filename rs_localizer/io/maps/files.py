@@ -31,7 +31,7 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
         if path.is_dir():
             return read_colmap(path, frame, database)
         if database is not None:
-            raise MapError("it is no folder of COLMAP, which alone has a database")
+            raise MapError("it is not a folder of COLMAP, which alone has a database")
         if path.suffix not in _READERS:
             raise MapError(f"expected a folder of COLMAP or a file ending in {', '.join(_READERS)}")
         return _READERS[path.suffix](path, frame)

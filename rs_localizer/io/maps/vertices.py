@@ -199,7 +199,7 @@ def _ascii(file: IO[bytes], element: _Element, order: str, size: int) -> NDArray
             numbers.extend(map(float, line.split()))
         except ValueError:
             text = line[:80].decode("ascii", "replace").strip()
-            raise PlyError(f"vertex {index + 1} is no line of numbers: {text!r}") from None
+            raise PlyError(f"vertex {index + 1} is not a line of numbers: {text!r}") from None
         per_row = per_row or len(numbers)
         if not line or len(numbers) != (index + 1) * per_row:
             raise PlyError(
@@ -224,7 +224,7 @@ def _ascii(file: IO[bytes], element: _Element, order: str, size: int) -> NDArray
         if kind.base.kind in "iu":
             limits = np.iinfo(kind.base)
             if not np.all((part >= limits.min) & (part <= limits.max) & (part == np.floor(part))):
-                raise PlyError(f"{name} holds what is no {_NAMES[kind.base.str[1:]]}")
+                raise PlyError(f"{name} holds what is not a {_NAMES[kind.base.str[1:]]}")
         with np.errstate(over="ignore"):
             table[name] = part.reshape(element.count, *kind.shape)
     _check_lengths(table, element)

@@ -88,7 +88,7 @@ def from_numbers(
     x, y, z, w = quaternion
     square = x * x + y * y + z * z + w * w
     if not abs(square - 1.0) < _NORM_TOLERANCE:  # NaN is wrong, too
-        raise TransformError(f"the quaternion {quaternion} is no rotation")
+        raise TransformError(f"the quaternion {quaternion} is not a rotation")
     s = 2.0 / square
     rotation = np.array(
         [

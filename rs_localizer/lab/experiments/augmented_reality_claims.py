@@ -9,7 +9,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.lab.experiments import methods as m
-from rs_localizer.lab.experiments.results import Claim, judge_intervals
+from rs_localizer.lab.experiments.results import Claim, Statement
 from rs_localizer.lab.experiments.uncertainty import Interval, bootstrap, share
 
 QUANTILES = np.linspace(0.01, 0.99, 99)
@@ -84,11 +84,12 @@ def _plain(found: Frames) -> Claim:
     left_out = (m.R9P.name, m.R9P_OURS.name)
     errors = {name: each for name, each in found.plain.items() if name not in left_out}
     ratio = _under_p3p(errors, m.P3P.name, found.plain_owners)
-    return judge_intervals(
+    return Statement(
         "augmented-reality.plain",
         _PAPER,
         "The best minimal model of every rolling-shutter solver fits the markers better than P3P's",
         "under P3P in every quantile from the median to 99 % (100 samples, two walls or more)",
+    ).judged_by(
         f"{_ratio(ratio)}; {_medians(errors)}",
         [ratio],
         (0.0, 1.0),
@@ -99,11 +100,12 @@ def _r9p(found: Frames) -> Claim:
     names = (m.P3P.name, m.R9P.name, m.R9P_OURS.name)
     errors = {name: found.plain[name] for name in names if name in found.plain}
     ratio = _under_p3p(errors, m.P3P.name, found.plain_owners)
-    return judge_intervals(
+    return Statement(
         "augmented-reality.r9p",
         _OURS,
         "So does that of R9P, by its own model, as published and with its trace fixed",
         "the same",
+    ).judged_by(
         f"{_ratio(ratio)}; {_medians(errors)}",
         [ratio],
         (0.0, 1.0),
@@ -113,11 +115,12 @@ def _r9p(found: Frames) -> Claim:
 
 def _product(found: Frames) -> Claim:
     ratio = _under_p3p(found.products, "p3p", found.owners)
-    return judge_intervals(
+    return Statement(
         "augmented-reality.localizer",
         _OURS,
         "With every rolling-shutter solver the Localizer fits the markers better than with P3P",
         "under P3P in every quantile from the median to 99 %, 100 samples, all frames",
+    ).judged_by(
         f"{_ratio(ratio)}; {_medians(found.products)}",
         [ratio],
         (0.0, 1.0),
@@ -126,11 +129,12 @@ def _product(found: Frames) -> Claim:
 
 def _localized(found: Frames) -> Claim:
     shares = {s: share(np.isfinite(p)) for s, p in found.positions.items()}
-    return judge_intervals(
+    return Statement(
         "augmented-reality.localized",
         _OURS,
         "Frames that show three markers are localized",
         f"at least {_LOCALIZED:.0%} of them",
+    ).judged_by(
         f"{shares[_PRODUCT].share()} of {len(found.speeds)}, P3P {shares['p3p'].share()} "
         f"({found.taken} frames in all)",
         [shares[_PRODUCT]],
@@ -144,11 +148,12 @@ def _position(found: Frames) -> Claim:
     gain = bootstrap(
         lambda chosen: float(np.median(p3p[chosen]) / np.median(ours[chosen])), len(ours)
     )
-    return judge_intervals(
+    return Statement(
         "augmented-reality.position",
         _OURS,
         f"Faster than {_FAST:g} deg/s, positions are better than P3P's",
         f"median error at least {_BETTER:g} times smaller",
+    ).judged_by(
         f"{1e3 * np.median(ours):.1f} mm against {1e3 * np.median(p3p):.0f} mm, {len(ours)} "
         f"frames: {gain.value:.1f} times ({gain.low:.1f} to {gain.high:.1f})",
         [gain],
@@ -159,11 +164,12 @@ def _position(found: Frames) -> Claim:
 def _reprojection(found: Frames) -> Claim:
     errors = found.products[_PRODUCT]
     median = bootstrap(lambda chosen: float(np.median(errors[chosen])), len(errors), found.owners)
-    return judge_intervals(
+    return Statement(
         "augmented-reality.reprojection",
         _OURS,
         "The markers' corners fit the pose",
         f"median error below {_FITS:g} px",
+    ).judged_by(
         f"{median.value:.3f} px ({median.low:.3f} to {median.high:.3f}), "
         f"P3P {np.median(found.products['p3p']):.2f} px",
         [median],
@@ -174,11 +180,12 @@ def _reprojection(found: Frames) -> Claim:
 def _time(found: Frames) -> Claim:
     seconds = found.seconds[_PRODUCT]
     soon = share(seconds < _SOON)
-    return judge_intervals(
+    return Statement(
         "augmented-reality.time",
         _PAPER,
         "An estimate with 100 RANSAC iterations takes less than 5 ms",
         f"{_IN_TIME:.0%} of the frames, least of three runs",
+    ).judged_by(
         f"{soon.share()}, median {1e3 * np.median(seconds):.2f} ms",
         [soon],
         (_IN_TIME, 1.0),
@@ -198,12 +205,13 @@ def _cube(found: Frames) -> Claim:
 
     middle, worst = at(0.5), at(0.95)
     p3p = [float(np.quantile(found.cube["p3p"], q, method="lower")) for q in (0.5, 0.95)]
-    return judge_intervals(
+    return Statement(
         "augmented-reality.cube",
         _PAPER,
         "A cube stays in its place while the camera shakes",
         f"its farthest corner within {_CUBE:g} px in the median and {_CUBE_WORST:g} px in 95 % of "
         "the images",
+    ).judged_by(
         f"{middle.value:.2f} ({middle.low:.2f} to {middle.high:.2f}) and {worst.value:.1f} "
         f"({worst.low:.1f} to {worst.high:.1f}) px, P3P {p3p[0]:.1f} and {p3p[1]:.0f} px, "
         f"{len(errors)} images",

@@ -13,7 +13,7 @@ from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import ORIENTATION, motion_errors
 from rs_localizer.lab.experiments.methods import available, estimate
-from rs_localizer.lab.experiments.results import Claim, Context, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Statement, Table
 from rs_localizer.lab.experiments.trials import Setting, draw_trials, random_rotations
 
 BASIN = Setting(angular=20.0, linear=0.2)
@@ -51,12 +51,13 @@ def reach(basin: Mapping[str, Array], offset: float, most: float) -> Claim:
     at = _OFFSETS.index(offset)
     ours, frozen = (float(basin[x.name][at]) for x in (m.VCWT_OURS, m.VCWT))
     start = float(basin[m.VCWT_OURS.name][0])
-    return judge(
+    return Statement(
         f"convergence.basin_{offset:g}",
         "this project",
         f"relinearized, {m.VCWT.label} converges from {offset:g} degrees, frozen it does not",
         f"at least 95 % of the frames that are found from the truth itself; frozen at most "
         f"{most:.0%} of all",
+    ).judged(
         f"{ours:.0%} and {frozen:.1%} of all frames ({start:.0%} from the truth itself)",
         ours >= 0.95 * start and frozen <= most,
     )

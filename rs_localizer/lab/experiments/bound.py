@@ -13,14 +13,7 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    Table,
-    judge,
-    judge_intervals,
-)
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.uncertainty import Interval, quantile, share
 from rs_localizer.lab.experiments.views import GROSS, Outcome, outcome, synthetic_views
@@ -168,20 +161,22 @@ def claims(found: Found) -> list[Claim]:
     low, high = _COVERED
     block = ", pose alone" if case.at_rest else ""
     listed = [
-        judge_intervals(
+        Statement(
             f"bound.{case.name}_calibrated",
             "this project",
             f"the covariance is honest: {case.label}{block}",
             f"the {_REGION:.0%} region covers {low:.0%} to {high:.0%} of the truths",
+        ).judged_by(
             found.coverage.share(),
             [found.coverage],
             _COVERED,
         ),
-        judge_intervals(
+        Statement(
             f"bound.{case.name}_gross",
             "this project",
             f"hardly a pose is wrong: {case.label}",
             f"more than {GROSS:g} sigma off, or no pose: at most {_MOST_GROSS:.0%}",
+        ).judged_by(
             f"{found.gross:.2%} off, {found.refused:.2%} without a pose",
             [found.lost],
             (0.0, _MOST_GROSS),
@@ -190,11 +185,12 @@ def claims(found: Found) -> list[Claim]:
     if np.isfinite(case.at_most):
         listed.insert(
             0,
-            judge_intervals(
+            Statement(
                 f"bound.{case.name}",
                 "this project",
                 f"at the Cramér-Rao bound: {case.label}",
                 f"median at most {case.at_most:g} of the bound's, as standard deviations",
+            ).judged_by(
                 f"{found.ratio.value:.3f}",
                 [found.ratio],
                 (-np.inf, case.at_most),
@@ -207,11 +203,12 @@ def _overconfident(found: Sequence[Found]) -> Claim:
     gross = sum(outcome.gross for one in found for outcome in one.outcomes)
     hidden = sum(one.overconfident for one in found)
     total = sum(len(one.outcomes) for one in found)
-    return judge(
+    return Statement(
         "bound.none_hidden",
         "this project",
         "no gross error is published with a small covariance",
         "none outside the 99.99 % region of its own covariance",
+    ).judged(
         f"{hidden} of {gross} gross errors in {total} frames",
         hidden == 0,
     )

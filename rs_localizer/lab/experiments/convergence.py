@@ -22,7 +22,7 @@ from rs_localizer.lab.experiments.basin import (
 from rs_localizer.lab.experiments.errors import METRICS, ORIENTATION, POSITION, motion_errors
 from rs_localizer.lab.experiments.methods import Method, estimate
 from rs_localizer.lab.experiments.motion import SPEEDS, TRANSLATION, X_LABEL
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.experiments.sweeps import Curves, quartiles, sweep
 from rs_localizer.lab.experiments.trials import Motions, Setting, Trials, draw_trials
 
@@ -117,12 +117,13 @@ def _medians(method: Method, trials: Trials) -> tuple[float, float, float]:
 def _once_is_enough(after: Mapping[int, Curves]) -> Claim:
     once, often = (after[count].medians(m.VCWT)[1:] for count in (_SHOWN[0], _SHOWN[-1]))
     excess = float(np.max(once / often)) - 1.0
-    return judge(
+    return Statement(
         "convergence.vcwt_once",
         _PAPER,
         f"{m.VCWT.label} is done after one iteration",
         f"all medians after one iteration at most 5 % above those after {_SHOWN[-1]}, wherever it "
         "moves",
+    ).judged(
         f"at most {excess:+.1%}",
         excess <= 0.05,
     )
@@ -138,12 +139,13 @@ def _others_slow(after: Mapping[int, Curves]) -> Claim:
                      / after[_SHOWN[-1]].medians(method)[1:, :_POSE]))
         for method in m.TWO_STEP
     )  # fmt: skip
-    return judge(
+    return Statement(
         "convergence.others_slow",
         _PAPER,
         "the solvers in two steps need many iterations and stay worse",
         f"wherever it moves, their medians of orientation and position after {_SHOWN[-1]} "
         f"iterations are still above those of {m.VCWT.label} after one, and below theirs after 5",
+    ).judged(
         f"at least {worse:.1f} times those of {m.VCWT.label}; from 5 to {_SHOWN[-1]} iterations "
         f"they fall to 1/{gain:.1f} or less",
         worse > 1.0 and gain > 1.0,
@@ -159,11 +161,12 @@ def _flat(history: Mapping[str, Array]) -> Claim:
         for method in _ITERATIVE
     }  # fmt: skip
     listed = ", ".join(f"{label} {fall:.2g}" for label, fall in falls.items())
-    return judge(
+    return Statement(
         "convergence.flat_after_eight",
         _PAPER,
         "the algebraic error is flat after about eight iterations",
         f"its median after {_FLAT_FROM} iterations at most 1.5 times that after {_SHOWN[-1]}",
+    ).judged(
         f"times {listed}",
         all(fall <= 1.5 for fall in falls.values()),
         "alternation between two groups of unknowns converges linearly: the curves of the solvers "

@@ -8,13 +8,7 @@ from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import ORIENTATION, POSITION
 from rs_localizer.lab.experiments.motion import equal_to_r6p
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    judge,
-    judge_intervals,
-)
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement
 from rs_localizer.lab.experiments.sweeps import Curves, crossing, sampled, sweep
 from rs_localizer.lab.experiments.trials import Setting, random_rotations
 
@@ -59,11 +53,12 @@ def _useful(what: str, metric: int, reach: float, straight: Curves, drifting: Cu
         passes = crossing(curves.x, curves.median(m.VCWT, metric), curves.median(m.P3P, metric))
         reaches.append(np.inf if np.isnan(passes) else passes)
     listed = [f"{x:.0f}" if np.isfinite(x) else f"more than {_OFFSETS[-1]:.0f}" for x in reaches]
-    return judge(
+    return Statement(
         f"linearisation.useful_{what}",
         "paper: linearisation",
         f"{m.VCWT.label} beats P3P in {what} up to about {reach:g} degrees from the linearisation",
         f"its median passes that of P3P at {reach:g} degrees or later",
+    ).judged(
         f"{listed[0]} deg where the camera's centre moves straight, {listed[1]} where the scene "
         "drifts straight",
         min(reaches) >= reach,
@@ -76,11 +71,12 @@ def _relinearised(curves: Curves) -> Claim:
         return float(np.max(values / values[0])) - 1.0
 
     found = sampled(growth, curves)
-    return judge_intervals(
+    return Statement(
         "linearisation.relinearized_flat",
         "this project",
         "relinearized, it does not matter how far off the initial orientation is",
         f"all medians up to {_OFFSETS[-1]:g} degrees within 5 % of those from the truth",
+    ).judged_by(
         f"at most {found.value:+.1%}",
         [found],
         (-np.inf, 0.05),

@@ -19,7 +19,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments.matching_scores import scores_claim
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.simulation.frames import (
     FrameSettings,
     SimulatedFrame,
@@ -161,12 +161,13 @@ def _judge_frame(run: Run, result: Localized, frame: SimulatedFrame) -> None:
 
 def _fast_enough(run: Run) -> Claim:
     clock, cpu = run.milliseconds
-    return judge(
+    return Statement(
         f"matching.{run.name}_rate",
         "this project",
         f"{_SEEN.points} keypoints in a map of {_LANDMARKS:,} landmarks are matched and localized "
         f"at {run.at_least:g} Hz or more: {run.label}",
         f"median of the CPU time of a frame at most {1e3 / run.at_least:.3g} ms",
+    ).judged(
         f"{cpu:.3g} ms, {1e3 / cpu:.0f} Hz ({clock:.3g} ms by the clock)",
         cpu <= 1e3 / run.at_least,
     )
@@ -176,23 +177,25 @@ def _recognized(runs: Sequence[Run]) -> list[Claim]:
     usual = [run for run in runs if not run.first_by_id]
     unclear, predicted = (run for run in runs if run.first_by_id)
     return [
-        judge(
+        Statement(
             "matching.localized",
             "this project",
             "where landmarks look different, every frame is localized, by right matches",
             f"all frames to {100 * _LOST:g} cm, 99 % of the inliers right, however matched",
+        ).judged(
             "; ".join(
                 f"{run.label}: {run.localized} of {len(run.seconds)}, {run.rightness:.1%}"
                 for run in usual
             ),
             all(run.localized == len(run.seconds) and run.rightness >= 0.99 for run in usual),
         ),
-        judge(
+        Statement(
             "matching.alike",
             "this project",
             f"where {_ALIKE} landmarks each look the same, a tracked camera is localized all the "
             "same, because only landmarks near their prediction compete",
             "all frames after a first one by id; without the prediction none of them",
+        ).judged(
             f"{predicted.localized} of {len(predicted.seconds)} and {unclear.localized}",
             predicted.localized == len(predicted.seconds) and unclear.localized <= 1,
         ),

@@ -12,7 +12,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.lab.experiments.results import Claim, Context, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Statement
 from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
 from rs_localizer.lab.simulation.landmarks import random_descriptors, seen_descriptors
 from rs_localizer.lab.simulation.true_motion import TrueMotion
@@ -48,12 +48,13 @@ def scores_claim(
         found["with"] += bool(localizer.localize(*given, matches.scores))
         found["without"] += bool(localizer.localize(*given))
         count += 1
-    return judge(
+    return Statement(
         "matching.scores",
         "this project",
         f"where {_WRONG:.0%} of the keypoints show what is not in the map, the scores of their "
         "matches lead the search to the right ones",
         f"all frames localized with scores and {_SAMPLES} samples, fewer without",
+    ).judged(
         f"{found['with']} and {found['without']} of {count}",
         found["with"] == count > found["without"],
     )

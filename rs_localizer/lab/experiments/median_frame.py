@@ -11,7 +11,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.lab.experiments.competitors import poselib, poselib_camera
-from rs_localizer.lab.experiments.results import Claim, Context, Table, judge, not_tested
+from rs_localizer.lab.experiments.results import Claim, Context, Statement, Table
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.views import View, synthetic_views
 from rs_localizer.localizer import Localizer
@@ -117,11 +117,12 @@ def frame_claims(found: Frames) -> list[Claim]:
     return [
         _no_slower("median_frame", _POSELIB, found),
         _no_slower("median_frame_bounded", _BOUNDED, found),
-        judge(
+        Statement(
             "timings.inliers_kept",
             "this project",
             "an ordinary frame keeps nearly all true inliers",
             f"over {_LEAST_KEPT:.0%} of them",
+        ).judged(
             f"{ours:.1%}" + (f" ({others})" if others else ""),
             ours > _LEAST_KEPT,
         ),
@@ -132,15 +133,11 @@ def _no_slower(name: str, other: str, found: Frames) -> Claim:
     statement = f"an ordinary frame takes no longer than {other}"
     criterion = "median frame at most that of the same points in the same run (aim half)"
     if other not in found.kept:
-        return not_tested(
-            f"timings.{name}", "this project", statement, criterion, "PoseLib is not installed"
+        return Statement(f"timings.{name}", "this project", statement, criterion).not_tested(
+            "PoseLib is not installed"
         )
     mine, theirs = found.milliseconds(_OURS), found.milliseconds(other)
-    return judge(
-        f"timings.{name}",
-        "this project",
-        statement,
-        criterion,
+    return Statement(f"timings.{name}", "this project", statement, criterion).judged(
         f"{mine:.2f} ms of {theirs:.2f} ms ({mine / theirs:.2f})",
         mine <= theirs,
         f"it stops after 1000 samples with {found.share(other):.0%} of the true inliers"

@@ -11,13 +11,7 @@ from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import ORIENTATION, POSITION, T, W
 from rs_localizer.lab.experiments.methods import Method
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    judge_intervals,
-    not_tested,
-)
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement
 from rs_localizer.lab.experiments.sweeps import Curves, largest_difference, sampled, sweep
 from rs_localizer.lab.experiments.trials import Setting
 
@@ -98,7 +92,7 @@ def equal_to_r6p(
         f"all medians of the four errors within {_EQUAL:.0%}, {where}",
     )
     if not sweeps[0].has(m.R6P):
-        return not_tested(*said, "r6p is not part of this version")
+        return Statement(*said).not_tested("r6p is not part of this version")
 
     def difference(*sweeps: Curves) -> float:
         return max(
@@ -112,7 +106,7 @@ def equal_to_r6p(
 
     found = sampled(difference, *sweeps)
     finding = f"largest difference {found.value:.1%}"
-    return judge_intervals(*said, finding, [found], (-np.inf, _EQUAL), why)
+    return Statement(*said).judged_by(finding, [found], (-np.inf, _EQUAL), why)
 
 
 def joint_is_best(experiment: str, curves: Curves) -> Claim:
@@ -123,12 +117,13 @@ def joint_is_best(experiment: str, curves: Curves) -> Claim:
         return float(np.max(curves.medians(m.JOINT) / better)) - 1.0
 
     found = sampled(excess, curves)
-    return judge_intervals(
+    return Statement(
         f"{experiment}.joint",
         "this project",
         "joint, by the robust score over the 50 noisy points of the frame, is never worse than "
         "the better of its two solvers",
         f"all medians of the four errors at most {_EQUAL:.0%} above those of the better one",
+    ).judged_by(
         f"at most {found.value:+.1%}",
         [found],
         (-np.inf, _EQUAL),
@@ -149,11 +144,12 @@ def _two_step_poor(sweeps: Sequence[Curves]) -> Claim:
         )
 
     found = sampled(ratio, *sweeps)
-    return judge_intervals(
+    return Statement(
         "motion.two_step_poor",
         _PAPER,
         "the three solvers in two steps are poor",
         f"all their medians at least {_POOR:g} times those of {m.VCWT.label}, wherever it moves",
+    ).judged_by(
         f"at least {found.value:.1f} times",
         [found],
         (_POOR, np.inf),
@@ -172,11 +168,12 @@ def _r9p_ahead(name: str, when: str, method: Method, sweeps: Sequence[Curves]) -
 
     ratios = all_ratios(*sweeps)
     fast = SPEEDS[-1]
-    return judge_intervals(
+    return Statement(
         name,
         "this project" if method is m.R9P_OURS else _PAPER,
         f"{method.label} is slightly better than {m.VCWT.label} in pose, {when}",
         f"its medians of orientation and position below those of {m.VCWT.label}, wherever it moves",
+    ).judged_by(
         f"{ratios.min():.2f} to {ratios.max():.2f} times ({ratios[:, -1].max():.2f} at {fast:g} "
         "deg per frame)",
         [sampled(lambda *sweeps: float(all_ratios(*sweeps).max()), *sweeps)],
@@ -198,13 +195,14 @@ def _gauge(noisy: Curves) -> Claim:
     pose = sampled(
         lambda curves: min(gain(curves, metric, fast) for metric in (ORIENTATION, POSITION)), noisy
     )
-    return judge_intervals(
+    return Statement(
         "motion.r9p_gauge",
         "this project",
         "fixing trace(R_RS) = 0 removes the gauge of R9P: about half the error in pose, a tenth "
         "of that in t",
         f"at 1 px: error of t at most a tenth, at every speed; from {_FAST:g} deg per frame on, "
         "errors of the pose at most two thirds",
+    ).judged_by(
         f"t {drift.value:.0f} times better or more; pose {pose.value:.2f} times or more",
         # Each in units of what is asked of it.
         [drift.over(10.0), pose.over(1.5)],
@@ -226,12 +224,13 @@ def _velocity_of_r9p(exact: Curves, noisy: Curves) -> Claim:
     def least(curves: Curves) -> float:
         return float(np.min(curves.median(m.R9P_OURS, W)[places] / curves.x[places]))
 
-    return judge_intervals(
+    return Statement(
         "motion.r9p_no_velocity",
         "paper: R9P",
         "the angular velocity cannot be had from R9P",
         f"the skew part of R_RS, trace fixed, at 1 px, misses w by half of it or more from "
         f"{_FAST:g} deg per frame on",
+    ).judged_by(
         f"misses {relative.min():.0%} to {relative.max():.0%}; at {top:g} deg per frame "
         f"{errors(exact)} without noise, {errors(noisy)} at 1 px",
         [sampled(least, noisy)],

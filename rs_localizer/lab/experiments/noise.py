@@ -16,14 +16,7 @@ from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.errors import ORIENTATION, motion_errors
 from rs_localizer.lab.experiments.kernels import frame_errors
 from rs_localizer.lab.experiments.methods import Method
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    Table,
-    judge,
-    judge_intervals,
-)
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.experiments.sweeps import Curves, sampled, sweep
 from rs_localizer.lab.experiments.trials import POINTS, Setting, Trials, draw_trials
 from rs_localizer.lab.experiments.uncertainty import share
@@ -83,12 +76,13 @@ def _alike(name: str, who: str, methods: Sequence[Method], curves: Curves) -> Cl
         if curves.has(x)
     }
     listed = ", ".join(f"{x.label} {slope.value * reference:.2f}" for x, slope in slopes.items())
-    return judge_intervals(
+    return Statement(
         name,
         "paper: noise",
         f"{who} degrade alike",
         "from 2 to 4 px, median orientation errors grow per px by half to twice as much as that of "
         f"{m.VCWT.label}",
+    ).judged_by(
         f"{m.VCWT.label} {reference:.2f} deg per px; {listed}",
         list(slopes.values()),
         (1.0 / _ALIKE, _ALIKE),
@@ -105,11 +99,12 @@ def _six_points(curves: Curves, bound: Array) -> Claim:
         if curves.has(x)
     }
     listed = ", ".join(f"{label} {error.value:.2f}" for label, error in found.items())
-    return judge_intervals(
+    return Statement(
         "noise.six_point_bound",
         "this project",
         "a six-point pose is limited by the noise, not by the solver",
         "median orientation error at 1 px at most 1.5 times the bound of six points",
+    ).judged_by(
         f"{listed} deg; bound {bound[0]:.2f}",
         list(found.values()),
         (-np.inf, 1.5 * bound[0]),
@@ -118,11 +113,12 @@ def _six_points(curves: Curves, bound: Array) -> Claim:
 
 def _fifty_points(curves: Curves, bound: Array) -> Claim:
     error = sampled(lambda drawn: drawn.at(m.REFINED, ORIENTATION, 1.0), curves)
-    return judge_intervals(
+    return Statement(
         "noise.refined_reaches_bound",
         "this project",
         f"refined on all {POINTS} points, the pose is as good as it can be",
         f"median orientation error at 1 px at most 1.15 times the bound of {POINTS} points",
+    ).judged_by(
         f"{error.value:.4f} deg; bound {bound[0]:.4f}; six-point start "
         f"{curves.at(m.VCWT_OURS, ORIENTATION, 1.0):.2f}",
         [error],
@@ -138,28 +134,32 @@ def _visible_shares(trials: Trials) -> list[float]:
 
 
 def _visible(shares: Sequence[float]) -> Claim:
-    return judge(
+    return Statement(
         "noise.few_inliers_seen",
         "this project",
         "a six-point model of inliers alone sees few of the others (13, 38, 67 % within 2, 4, 8 px "
         "in a pilot): counting its inliers tells little",
         "at 1 px noise, fewer than "
-        + ", ".join(f"{few:.0%} within {radius:g} px" for few, radius in
-                    zip(_FEW, _RADII, strict=True)),
-        ", ".join(f"{seen:.0%} within {radius:g} px" for seen, radius in
-                  zip(shares, _RADII, strict=True)),
+        + ", ".join(
+            f"{few:.0%} within {radius:g} px" for few, radius in zip(_FEW, _RADII, strict=True)
+        ),
+    ).judged(
+        ", ".join(
+            f"{seen:.0%} within {radius:g} px" for seen, radius in zip(shares, _RADII, strict=True)
+        ),
         all(seen < few for seen, few in zip(shares, _FEW, strict=True)),
-    )  # fmt: skip
+    )
 
 
 def _one_sample(trials: Trials, bound: Array) -> Claim:
     found = motion_errors(m.estimate(m.REFINED, trials, noise=1.0), trials.truth)
     succeeded = share(found[:, ORIENTATION] < 10.0 * bound[0])
-    return judge_intervals(
+    return Statement(
         "noise.one_sample_suffices",
         "this project",
         "local optimisation from one sample of inliers alone succeeds in 99 to 100 %",
         "at 1 px, 98 % of the refined orientations within ten times the median bound",
+    ).judged_by(
         succeeded.share(),
         [succeeded],
         (0.98, 1.0),

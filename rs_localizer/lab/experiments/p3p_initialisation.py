@@ -8,7 +8,7 @@ from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import ORIENTATION, POSITION
 from rs_localizer.lab.experiments.motion import SPEEDS, TRANSLATION, X_LABEL, equal_to_r6p
-from rs_localizer.lab.experiments.results import Claim, Context, Result, judge_intervals
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement
 from rs_localizer.lab.experiments.sweeps import Curves, Initial, sampled, sweep
 from rs_localizer.lab.experiments.trials import Setting
 
@@ -62,12 +62,13 @@ def _as_from_truth(plausible: Curves, context: Context) -> Claim:
         return float(np.max(one / other)) - 1.0
 
     found = sampled(excess, plausible, ideal)
-    return judge_intervals(
+    return Statement(
         "p3p-initialisation.relinearized",
         "this project",
         "relinearized, P3P's orientation is as good a start as the truth",
         "medians of orientation and position, from the triplet that fits best, at most 10 % above "
         "those from the true orientation",
+    ).judged_by(
         f"at most {found.value:+.1%}",
         [found],
         (-np.inf, 0.10),

@@ -17,7 +17,7 @@ from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
 from rs_localizer.lab.experiments.errors import angles
 from rs_localizer.lab.experiments.plain_ransac import observe
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge_intervals
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.experiments.trials import Setting, camera
 from rs_localizer.lab.experiments.uncertainty import quantile
 from rs_localizer.lab.experiments.views import View, synthetic_views
@@ -111,11 +111,12 @@ _COLUMNS = ("case", "method", "orientation_deg_q25", "median", "q75", "no_pose")
 def _claim(case: Case, errors: Mapping[str, Array]) -> Claim:
     medians = {name: float(np.median(values)) for name, values in errors.items()}
     others = ", ".join(f"{medians[name]:.2f} with {_LABELS[name]}" for name in (_FREE, _P3P))
-    return judge_intervals(
+    return Statement(
         f"planes.{case.name}",
         "this project",
         f"the velocity prior makes a plane usable: {case.label}",
         f"median orientation error at most {case.at_most:g} deg",
+    ).judged_by(
         f"{medians[_OURS]:.2f} deg ({others})",
         [quantile(errors[_OURS])],
         (-np.inf, case.at_most),

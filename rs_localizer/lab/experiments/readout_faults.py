@@ -9,7 +9,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.lab.experiments.results import Claim, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Statement, Table
 from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
 from rs_localizer.lab.simulation.true_motion import RecordedMotion
 from rs_localizer.trajectory import verdict
@@ -96,11 +96,14 @@ def readout_faults(
         rows.append((what, error, 1e6 * found.deviation, said))
     honest = [row for row in rows if row[0] != "stamps run 1 % fast"]
     worst = max(abs(float(row[1])) / float(row[2]) for row in honest)
-    claim = judge(
-        "readout-time.faults", _SPECIFICATION,
+    claim = Statement(
+        "readout-time.faults",
+        _SPECIFICATION,
         "Wrong stamps, a wrong focal length and a wrong distortion do not spoil it.",
         "errors within four deviations, but for stamps that run fast: nothing can tell those",
-        f"{worst:.1f} deviations at worst, of {len(honest)} recordings", worst < 4.0,
+    ).judged(
+        f"{worst:.1f} deviations at worst, of {len(honest)} recordings",
+        worst < 4.0,
         "one recording",
-    )  # fmt: skip
+    )
     return claim, Table(COLUMNS, rows)

@@ -12,7 +12,7 @@ from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.readout_faults import readout_faults
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import RecordedMotion
@@ -121,47 +121,60 @@ def _map(motion: RecordedMotion, scene: str, rng: np.random.Generator) -> Array:
 
 def _efficient(trials: list[Trial]) -> Claim:
     ratio = float(np.sqrt(np.mean([(trial.error / trial.bound) ** 2 for trial in trials])))
-    return judge(
-        "readout-time.bound", _SPECIFICATION,
+    return Statement(
+        "readout-time.bound",
+        _SPECIFICATION,
         "The readout time is as good as the keypoints allow.",
         "rms error at most 1.15 times the Cramér-Rao bound",
+    ).judged(
         f"{ratio:.2f} times, {len(trials)} recordings; median error "
         f"{1e6 * np.median([abs(t.error) for t in trials]):.0f} us",
         ratio <= 1.15,
         f"{len(trials)} recordings know the ratio to {50 / np.sqrt(len(trials) / 2):.0f} %",
-    )  # fmt: skip
+    )
 
 
 def _covered(trials: list[Trial]) -> Claim:
     inside = float(np.mean([abs(t.error) < 1.96 * t.found.deviation for t in trials]))
-    return judge(
-        "readout-time.coverage", _SPECIFICATION, "Its deviation is honest.",
+    return Statement(
+        "readout-time.coverage",
+        _SPECIFICATION,
+        "Its deviation is honest.",
         "95 % intervals hold 90 to 99 %, or all of fewer than 100 recordings",
-        f"{inside:.0%} of {len(trials)}", inside >= 0.9,
+    ).judged(
+        f"{inside:.0%} of {len(trials)}",
+        inside >= 0.9,
         "intervals too short",
-    )  # fmt: skip
+    )
 
 
 def _directed(trials: list[Trial]) -> Claim:
     wrong = sum(trial.found.readout_time < 0.0 for trial in trials)
     least = min(trial.found.odds for trial in trials)
-    return judge(
-        "readout-time.direction", _SPECIFICATION, "The direction is always right.",
-        "no recording with the wrong sign", f"{wrong} of {len(trials)}, odds of 10^{least:.0f} "
-        "and more", wrong == 0,
-    )  # fmt: skip
+    return Statement(
+        "readout-time.direction",
+        _SPECIFICATION,
+        "The direction is always right.",
+        "no recording with the wrong sign",
+    ).judged(
+        f"{wrong} of {len(trials)}, odds of 10^{least:.0f} and more",
+        wrong == 0,
+    )
 
 
 def _global(trials: list[Trial]) -> Claim:
     still = [trial for trial in trials if trial.truth == 0.0]
     right = sum(trial.found.global_shutter for trial in still)
     false = sum(verdict.readout_time(t.found) == 0.0 for t in trials if t.truth > 0.0)
-    return judge(
-        "readout-time.global", _SPECIFICATION, "A global shutter is one.",
+    return Statement(
+        "readout-time.global",
+        _SPECIFICATION,
+        "A global shutter is one.",
         "0 within the error, and no rolling shutter taken for one",
-        f"{right} of {len(still)}; {false} rolling ones taken for global", right == len(still)
-        and false == 0,
-    )  # fmt: skip
+    ).judged(
+        f"{right} of {len(still)}; {false} rolling ones taken for global",
+        right == len(still) and false == 0,
+    )
 
 
 def _row(trial: Trial) -> tuple[str | float, ...]:

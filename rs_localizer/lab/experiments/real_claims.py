@@ -9,7 +9,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.methods import Method, available
-from rs_localizer.lab.experiments.results import Claim, judge_intervals, not_tested
+from rs_localizer.lab.experiments.results import Claim, Statement
 from rs_localizer.lab.experiments.uncertainty import (
     Interval,
     bootstrap,
@@ -81,17 +81,18 @@ def _equal_to_r6p(found: Mapping[str, Inliers]) -> Claim:
         "means within 10 % on the simulated sequences",
     )
     if m.R6P.name not in found[_HARDEST]:
-        return not_tested(*said, "r6p is not part of this version")
+        return Statement(*said).not_tested("r6p is not part of this version")
     ratios = [_ratio(found[name], m.VCWT.name, m.R6P.name, len(_SIMULATED)) for name in _SIMULATED]
-    return judge_intervals(*said, _listed(found, m.VCWT, m.R6P), ratios, _EQUAL)
+    return Statement(*said).judged_by(_listed(found, m.VCWT, m.R6P), ratios, _EQUAL)
 
 
 def _ahead_of_p3p(found: Mapping[str, Inliers]) -> Claim:
-    return judge_intervals(
+    return Statement(
         "real.vcwt_ahead_of_p3p",
         _PAPER,
         f"{m.VCWT.label} finds more inliers than P3P",
         "higher means on the simulated sequences",
+    ).judged_by(
         _listed(found, m.VCWT, m.P3P),
         [_ratio(found[name], m.VCWT.name, m.P3P.name, len(_SIMULATED)) for name in _SIMULATED],
         (1.0, np.inf),
@@ -106,11 +107,12 @@ def _often_more(found: Mapping[str, Inliers]) -> Claim:
         )
         for name, rows in found.items()
     }
-    return judge_intervals(
+    return Statement(
         "real.vct_often_more",
         _PAPER,
         f"{m.VCT_W.label} or {m.VCT_WT.label} often find more than {m.VCWT.label}",
         f"in {_OFTEN:.0%} of the frames of one of the sequences at least",
+    ).judged_by(
         ", ".join(f"{name} {one.share()} of the frames" for name, one in shares.items())
         + f" (means, {_listed(found, m.VCWT, m.VCT_W, m.VCT_WT)})",
         [_largest(list(shares.values()))],
@@ -138,28 +140,31 @@ def _unstable(found: Mapping[str, Inliers]) -> Claim:
     }
     # The least of the ratios is what the largest of their negatives is.
     least = _largest([Interval(-x.value, -x.high, -x.low, x.trials) for x in ratios.values()])
-    return judge_intervals(
+    return Statement(
         "real.vc_wt_unstable",
         _PAPER,
         f"{m.VC_WT.label} is unstable",
         "in the worst tenth of the frames of one simulated sequence it keeps less than two thirds "
         f"of what {m.VCWT.label} keeps in its worst tenth",
-        ", ".join(f"{name} {x.value:.2f} ({x.low:.2f} to {x.high:.2f})"
-                  for name, x in ratios.items()),
+    ).judged_by(
+        ", ".join(
+            f"{name} {x.value:.2f} ({x.low:.2f} to {x.high:.2f})" for name, x in ratios.items()
+        ),
         [least],
         (-_UNSTABLE, 0.0),
-    )  # fmt: skip
+    )
 
 
 def _r9p_hardest(found: Mapping[str, Inliers]) -> Claim:
     rows = found[_HARDEST]
     others = [x.name for x in available(m.PAPERS) if x is not m.R9P]
     ratios = [_ratio(rows, m.R9P.name, other, len(others)) for other in others]
-    return judge_intervals(
+    return Statement(
         "real.r9p_hardest",
         _PAPER,
         "R9P is best on the hardest sequence",
         "highest mean of the paper's solvers at 30 degrees and 0.3 m per readout",
+    ).judged_by(
         _listed({_HARDEST: rows}, *available(METHODS)),
         ratios,
         (1.0, np.inf),
@@ -173,11 +178,12 @@ def _ours_most(found: Mapping[str, Inliers]) -> Claim:
         for name, rows in found.items()
     }
     ratios = {name: _ratio(rows, OURS, best[name], len(found)) for name, rows in found.items()}
-    return judge_intervals(
+    return Statement(
         "real.localizer_most",
         "this project",
         "with local optimisation the Localizer keeps more inliers than the best minimal model",
         "mean at least as high as that of every solver, on every sequence",
+    ).judged_by(
         ", ".join(
             f"{name} {one.value:.2f} ({one.low:.2f} to {one.high:.2f}) times {best[name]}"
             for name, one in ratios.items()

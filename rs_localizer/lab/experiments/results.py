@@ -37,41 +37,46 @@ class Claim:
     why: str = ""  # where it does not hold
 
 
-def judge(
-    name: str, source: str, statement: str, criterion: str, finding: str, held: bool, why: str = ""
-) -> Claim:
-    """A claim and its verdict; ``why`` is kept for one that does not hold."""
-    verdict = Verdict.HELD if held else Verdict.NOT_HELD
-    return Claim(name, source, statement, criterion, finding, verdict, "" if held else why)
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """What somebody says, before figures judge it; the fields are those of a claim."""
 
+    name: str
+    source: str
+    statement: str
+    criterion: str
 
-def judge_intervals(
-    name: str,
-    source: str,
-    statement: str,
-    criterion: str,
-    finding: str,
-    intervals: Sequence[Interval],
-    limits: tuple[float, float],
-    why: str = "",
-) -> Claim:
-    """A claim that figures lie between limits, judged by how well they are known.
+    def judged(self, finding: str, held: bool, why: str = "") -> Claim:
+        """By a fact; ``why`` is kept where it does not hold."""
+        if held:
+            return self._claim(finding, Verdict.HELD)
+        return self._claim(finding, Verdict.NOT_HELD, why)
 
-    It holds where all intervals lie within, does not where one lies outside, and is undecided
-    between.
-    """
-    if any(interval.outside(*limits) for interval in intervals):
-        return Claim(name, source, statement, criterion, finding, Verdict.NOT_HELD, why)
-    if all(interval.within(*limits) for interval in intervals):
-        return Claim(name, source, statement, criterion, finding, Verdict.HELD)
-    trials = min(interval.trials for interval in intervals)
-    said = f"{finding}; undecided at {trials} trials"
-    return Claim(name, source, statement, criterion, said, Verdict.UNDECIDED)
+    def judged_by(
+        self,
+        finding: str,
+        intervals: Sequence[Interval],
+        limits: tuple[float, float],
+        why: str = "",
+    ) -> Claim:
+        """By figures that have to lie between limits, as well as they are known.
 
+        It holds where all intervals lie within, does not where one lies outside, and is undecided
+        between.
+        """
+        if any(interval.outside(*limits) for interval in intervals):
+            return self._claim(finding, Verdict.NOT_HELD, why)
+        if all(interval.within(*limits) for interval in intervals):
+            return self._claim(finding, Verdict.HELD)
+        trials = min(interval.trials for interval in intervals)
+        return self._claim(f"{finding}; undecided at {trials} trials", Verdict.UNDECIDED)
 
-def not_tested(name: str, source: str, statement: str, criterion: str, reason: str) -> Claim:
-    """A claim that this run says nothing of."""
-    return Claim(name, source, statement, criterion, reason, Verdict.NOT_TESTED)
+    def not_tested(self, reason: str) -> Claim:
+        """This run says nothing of it."""
+        return self._claim(reason, Verdict.NOT_TESTED)
+
+    def _claim(self, finding: str, verdict: Verdict, why: str = "") -> Claim:
+        return Claim(self.name, self.source, self.statement, self.criterion, finding, verdict, why)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,81 +10,30 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.camera import Camera
-from rs_localizer.core.shutter import Motion
+from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    Table,
-    judge,
-    judge_intervals,
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
+from rs_localizer.lab.experiments.robustness_cases import (
+    _DEPTH,
+    _NOISE,
+    _SIZE,
+    CASES,
+    HARD,
+    Case,
+    camera_of,
+    scores_of,
+    view_of,
 )
 from rs_localizer.lab.experiments.uncertainty import CONFIDENCE, Interval, share, together
 from rs_localizer.lab.experiments.views import (
     GROSS,
     Outcome,
-    View,
-    direction,
     outcome,
-    seen_at,
-    uniform_pixels,
 )
 from rs_localizer.localizer import Localizer
 
-_SIZE = 1000
-_NOISE = 1.0  # px
-_DEPTH = (1.0, 4.0)  # m
 _FOUND, _MOST_MS, _MOST_WRONG = 0.99, 15.0, 0.01
-# A second object has turned and moved by so much against the scene (deg, m).
-_OBJECT = (20.0, 0.5)
-_PERIOD = 0.3  # m from one window of a facade to the next
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """Frames of one kind."""
-
-    name: str
-    label: str
-    points: int = 200
-    uniform: float = 0.0  # share of pixels anywhere in the image
-    second: float = 0.0  # share of points on an object that moves by itself
-    shifted: float = 0.0  # share of points matched one period aside
-    field_of_view: float = 45.0  # deg
-    offset: float = 0.0  # m, of the map's origin
-    scores: str = ""  # "right", "random" or "reversed"
-    motion: float = 1.0  # of 10 deg and 0.1 m per readout
-    at_least: float = 0.99  # share localized correctly; NaN: no claim
-    frames: float = 0.2  # per trial
-
-
-HARD = Case("uniform_70", "70 % uniform outliers", uniform=0.7, frames=0.5)
-_CASES = (
-    HARD,
-    Case("uniform_50", "50 % uniform outliers", uniform=0.5),
-    Case("object", "30 % on a second moving object", second=0.3),
-    Case("object_uniform", "30 % on an object, 20 % uniform", second=0.3, uniform=0.2),
-    Case("texture", "30 % shifted by a period", shifted=0.3),
-    Case("points_12", "12 points", points=12, at_least=math.nan),
-    Case("points_20", "20 points", points=20),
-    Case("points_50", "50 points, 30 % uniform", points=50, uniform=0.3),
-    Case("points_1000", "1000 points, 50 % uniform", points=1000, uniform=0.5),
-    Case("points_5000", "5000 points, 50 % uniform", points=5000, uniform=0.5, frames=0.05),
-    Case("narrow", "field of view 10 deg, 30 % uniform, 2 deg", field_of_view=10.0, uniform=0.3,
-         motion=0.2),
-    Case("narrow_fast", "field of view 10 deg, 30 % uniform, 10 deg", field_of_view=10.0,
-         uniform=0.3, at_least=math.nan),
-    Case("wide", "field of view 120 deg, 30 % uniform", field_of_view=120.0, uniform=0.3),
-    Case("offset", "origin 5e6 m away, 30 % uniform", offset=5e6, uniform=0.3),
-    Case("scores_right", "right scores, 50 % uniform", scores="right", uniform=0.5),
-    Case("scores_random", "random scores, 50 % uniform", scores="random", uniform=0.5),
-    Case("scores_reversed", "reversed scores, 50 % uniform", scores="reversed", uniform=0.5),
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +70,7 @@ class Found:
 def run(context: Context) -> Result:
     """The experiment."""
     found = []
-    for index, case in enumerate(_CASES):
+    for index, case in enumerate(CASES):
         count = max(1, round(case.frames * context.trials))
         found.append(_examine(case, count, [context.seed, 4, index], context))
     listed = {one.case.name: one for one in found}
@@ -164,12 +112,12 @@ _WHY_NARROW = (
 
 def _examine(case: Case, count: int, seed: Sequence[int], context: Context) -> Found:
     rng = np.random.default_rng(seed)
-    view_camera = _camera(case.field_of_view)
+    view_camera = camera_of(case.field_of_view)
     localizer = Localizer(view_camera)
     outcomes, seconds = [], []
     for _ in context.track(range(count), count):
-        view = _view(case, view_camera, rng)
-        scores = _scores(case, view.inliers, rng)
+        view = view_of(case, view_camera, rng)
+        scores = scores_of(case, view.inliers, rng)
         start = time.perf_counter()
         result = localizer.localize(view.points, view.pixels, scores)
         seconds.append(time.perf_counter() - start)
@@ -177,62 +125,13 @@ def _examine(case: Case, count: int, seed: Sequence[int], context: Context) -> F
     return Found(case, outcomes, np.array(seconds))
 
 
-def _camera(field_of_view: float) -> Camera:
-    focal = 0.5 * _SIZE / math.tan(0.5 * math.radians(field_of_view))
-    centre = 0.5 * (_SIZE - 1)
-    K = np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
-    return Camera(width=_SIZE, height=_SIZE, K=K)
-
-
-def _view(case: Case, view: Camera, rng: np.random.Generator) -> View:
-    """A frame: pixels are drawn first, and their points lie on the rays of their rows."""
-    n = case.points
-    pixels = uniform_pixels(view, n, rng)
-    place = case.offset * direction(rng)
-    motion = _motion(so3.exp(math.pi * rng.uniform(-1.0, 1.0, 3)), place + rng.normal(size=3), case,
-                     rng)  # fmt: skip
-    points = seen_at(motion, view, pixels, rng.uniform(*_DEPTH, n))
-    group = np.zeros(n, dtype=np.int64)  # 0: the scene
-    order, first = rng.permutation(n), 0
-    for kind, part in enumerate((case.uniform, case.second, case.shifted), 1):
-        group[order[first : first + round(part * n)]] = kind
-        first += round(part * n)
-    measured = pixels + _NOISE * rng.normal(size=(n, 2))
-    measured[group == 1] = uniform_pixels(view, int(np.count_nonzero(group == 1)), rng)
-    # The camera as the object sees it: elsewhere, and moving in another way.
-    other = group == 2
-    turn, way = _OBJECT
-    beside = _motion(
-        so3.exp(math.radians(turn) * direction(rng)) @ motion.rotation,
-        -motion.rotation.T @ motion.translation + way * direction(rng),
-        case,
-        rng,
-    )
-    points[other] = seen_at(beside, view, pixels[other], rng.uniform(*_DEPTH, n)[other])
-    points[group == 3] += _PERIOD * motion.rotation[0]  # along the rows of the image
-    return View(view, points, measured, pixels, group == 0, motion, _NOISE)
-
-
-def _motion(rotation: Array, position: Array, case: Case, rng: np.random.Generator) -> Motion:
-    turn, travel = math.radians(10.0) * case.motion, 0.1 * case.motion
-    return Motion(rotation, -rotation @ position, turn * direction(rng), travel * direction(rng))
-
-
-def _scores(case: Case, inliers: BoolArray, rng: np.random.Generator) -> Array | None:
-    if not case.scores:
-        return None
-    noise = rng.normal(size=len(inliers))
-    gain = {"right": 2.0, "random": 0.0, "reversed": -2.0}[case.scores]
-    scores: Array = noise + gain * inliers
-    return scores
-
-
 def _hard(found: Found) -> Claim:
-    return judge_intervals(
+    return Statement(
         "robustness.uniform_70",
         "this project",
         "70 % uniform outliers are borne",
         f"at least {_FOUND:.0%} of the frames localized correctly",
+    ).judged_by(
         f"{found.correct.share()}, median error {found.median:.2f} of the bound",
         [found.correct],
         (_FOUND, 1.0),
@@ -240,11 +139,12 @@ def _hard(found: Found) -> Claim:
 
 
 def _hard_time(found: Found) -> Claim:
-    return judge(
+    return Statement(
         "robustness.uniform_70_time",
         "this project",
         "70 % uniform outliers do not take long",
         f"median at most {_MOST_MS:g} ms",
+    ).judged(
         f"{found.milliseconds:.1f} ms",
         found.milliseconds <= _MOST_MS,
         "the machine had other work, or is of another kind",
@@ -253,11 +153,12 @@ def _hard_time(found: Found) -> Claim:
 
 def _localized(found: Found) -> Claim:
     case = found.case
-    return judge_intervals(
+    return Statement(
         f"robustness.{case.name}",
         "this project",
         f"localized correctly: {case.label}",
         f"at least {case.at_least:.0%} of the frames",
+    ).judged_by(
         f"{found.correct.share()}, median error {found.median:.2f} of the bound",
         [found.correct],
         (case.at_least, 1.0),
@@ -268,11 +169,12 @@ def _none_wrong(found: Sequence[Found]) -> Claim:
     wrong = {one.case.name: one.wrong(together(len(found))) for one in found}
     some = {name: interval for name, interval in wrong.items() if interval.value > 0.0}
     listed = ", ".join(f"{name} {interval.value:.1%}" for name, interval in some.items())
-    return judge_intervals(
+    return Statement(
         "robustness.none_wrong",
         "this project",
         "where there is no good pose, none is published",
         f"at most {_MOST_WRONG:.0%} of the frames of each kind have a wrong one",
+    ).judged_by(
         listed or "none at all",
         list(wrong.values()),
         (0.0, _MOST_WRONG),

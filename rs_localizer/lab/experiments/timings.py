@@ -17,7 +17,7 @@ from rs_localizer.lab.experiments.frame_timings import (
     frame_subjects,
 )
 from rs_localizer.lab.experiments.median_frame import examine_frames, frame_claims, frame_note
-from rs_localizer.lab.experiments.results import Claim, Context, Result, Table, judge
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.experiments.startup import Startup, cold_and_warm
 from rs_localizer.lab.experiments.stopwatch import Subject, interleaved, ratio
 from rs_localizer.lab.experiments.trials import Setting, Trials, draw_trials
@@ -160,11 +160,12 @@ def _cost(budget: Budget, times: Mapping[str, Array]) -> Claim:
     share = ratio(times[_key(budget)], times[_REFERENCE])
     kernel, reference = (float(np.median(times[name])) for name in (_key(budget), _REFERENCE))
     steps = "once" if budget.iterations == 1 else f"{budget.iterations} iterations"
-    return judge(
+    return Statement(
         f"timings.{budget.solver}_{budget.iterations}",
         "this project",
         f"{budget.solver}, {steps}, costs a fraction of a general 12x12 solve",
         f"kernel at most {budget.at_most:g} of `{_REFERENCE}` (aim {budget.aim:g})",
+    ).judged(
         f"{share:.3f} ({kernel:.3f} us of {reference:.2f} us)",
         share <= budget.at_most,
         "the machine had other work, or is of another kind: compare the columns with each other",
@@ -177,11 +178,12 @@ def _faster_than_paper(rows: list[tuple[str | float | int, ...]]) -> Claim:
         for row in rows
         if np.isfinite(float(row[8]))
     }
-    return judge(
+    return Statement(
         "timings.faster_than_paper",
         "this project",
         "every solver is faster than in the paper's Table 1",
         "per iteration",
+    ).judged(
         ", ".join(f"{name} {gain:.0f} times" for name, gain in gains.items()),
         min(gains.values()) > 1.0,
     )
@@ -189,12 +191,13 @@ def _faster_than_paper(rows: list[tuple[str | float | int, ...]]) -> Claim:
 
 def _all_samples(times: Array) -> Claim:
     milliseconds = float(np.median(times)) / 1000.0
-    return judge(
+    return Statement(
         "timings.all_samples",
         "this project",
         f"all 1000 hypotheses on {FRAME.points} points, {OUTLIERS:.0%} of them outliers, are cheap",
         "drawn, solved, scored and the best optimised, without stopping early, in at most "
         f"{_ALL_SAMPLES_AT_MOST:g} ms",
+    ).judged(
         f"{milliseconds:.1f} ms",
         milliseconds <= _ALL_SAMPLES_AT_MOST,
         "the machine had other work, or is of another kind",
@@ -206,20 +209,26 @@ def _startup_claims(startup: tuple[Startup, Startup] | None) -> list[Claim]:
         return []
     cold, warm = startup
     return [
-        judge(
-            "timings.compile", "this project", "all kernels compile soon enough",
+        Statement(
+            "timings.compile",
+            "this project",
+            "all kernels compile soon enough",
             f"import and compilation from nothing take at most {_COMPILE_AT_MOST:g} s of the "
             "processor",
+        ).judged(
             f"{cold.all_kernels_work:.1f} s ({cold.all_kernels:.1f} s by the clock)",
             cold.all_kernels_work <= _COMPILE_AT_MOST,
         ),
-        judge(
-            "timings.first_pose", "this project", "with the cache, the first pose comes soon",
+        Statement(
+            "timings.first_pose",
+            "this project",
+            "with the cache, the first pose comes soon",
             f"import to first pose takes at most {_FIRST_POSE_AT_MOST:g} s of the processor",
+        ).judged(
             f"{warm.first_pose_work:.2f} s ({warm.first_pose:.2f} s by the clock)",
             warm.first_pose_work <= _FIRST_POSE_AT_MOST,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _text(
@@ -229,8 +238,14 @@ def _text(
     startup: tuple[Startup, Startup] | None,
 ) -> str:
     """The tables as they are printed."""
-    headings = (("kernel", 9), ("/iteration", 11), ("solve_minimal", 14), ("/ 12x12", 9),
-                ("at most", 9), ("paper /iteration", 17))  # fmt: skip
+    headings = (
+        ("kernel", 9),
+        ("/iteration", 11),
+        ("solve_minimal", 14),
+        ("/ 12x12", 9),
+        ("at most", 9),
+        ("paper /iteration", 17),
+    )
     lines = [f"{'us per minimal problem':26}" + "".join(f"{h:>{width}}" for h, width in headings)]
     for name, iterations, kernel, per_iteration, public, share, at_most, _, paper in rows:
         lines.append(

@@ -15,14 +15,7 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.charts import Look
-from rs_localizer.lab.experiments.results import (
-    Claim,
-    Context,
-    Result,
-    Table,
-    judge,
-    judge_intervals,
-)
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement, Table
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
 from rs_localizer.lab.measures.palette import BLUE, ORANGE
 from rs_localizer.lab.simulation.frames import (
@@ -178,11 +171,12 @@ def _errors(result: Estimate | Failure, frame: SimulatedFrame) -> tuple[float, f
 
 def _improves(case: Case, found: Run) -> Claim:
     ratios = [found.ratio(0.5, column) for column in (_POSITION, _VELOCITY)]
-    return judge_intervals(
+    return Statement(
         f"tracking.{case.name}",
         "this project",
         f"tracking makes weak frames much better: {case.label}",
         "median errors of position and linear velocity at most 0.6 of the untracked ones",
+    ).judged_by(
         f"{ratios[_POSITION].value:.2f} and {ratios[_VELOCITY].value:.2f}",
         ratios,
         (-np.inf, 0.6),
@@ -195,11 +189,12 @@ def _never_worse(case: Case, found: Run) -> Claim:
         for column in (_POSITION, _VELOCITY)
     ]
     listed = [", ".join(f"{x.value:.2f}" for x in of_column) for of_column in ratios]
-    return judge_intervals(
+    return Statement(
         f"tracking.{case.name}",
         "this project",
         f"tracking never makes rich frames worse: {case.label}",
         "no quartile of the errors of position and linear velocity above the untracked one",
+    ).judged_by(
         f"quartiles {listed[_POSITION]} and {listed[_VELOCITY]} of the untracked ones",
         [*ratios[_POSITION], *ratios[_VELOCITY]],
         (-np.inf, 1.0),
@@ -208,11 +203,12 @@ def _never_worse(case: Case, found: Run) -> Claim:
 
 def _one_start(runs: Mapping[str, Run]) -> Claim:
     shares = {name: found.share for name, found in runs.items()}
-    return judge(
+    return Statement(
         "tracking.one_start",
         "this project",
         "one starting orientation, the predicted one, mostly suffices",
         "in at least 95 % of the frames of each kind",
+    ).judged(
         ", ".join(f"{name} {share:.1%}" for name, share in shares.items()),
         min(shares.values()) >= 0.95,
     )
@@ -226,11 +222,12 @@ def _after_a_gap(camera: Camera, frames: Sequence[SimulatedFrame]) -> Claim:
             result = tracker.localize(frame.middle_ns, frame.points, frame.pixels)
         found.append(_errors(result, frame)[_POSITION] < _LOST)
         tracker.reset()
-    return judge(
+    return Statement(
         "tracking.gap",
         "this project",
         "after a gap of 2 s the first frame is localized",
         f"every one, to {100 * _LOST:g} cm",
+    ).judged(
         f"{sum(found)} of {len(found)}",
         all(found),
     )

@@ -8,7 +8,7 @@ from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.errors import ORIENTATION, POSITION, T
 from rs_localizer.lab.experiments.motion import CHOICE, joint_is_best
-from rs_localizer.lab.experiments.results import Claim, Context, Result, judge_intervals
+from rs_localizer.lab.experiments.results import Claim, Context, Result, Statement
 from rs_localizer.lab.experiments.sweeps import Curves, crossing, sampled, sweep
 from rs_localizer.lab.experiments.trials import Setting
 
@@ -60,12 +60,13 @@ def _ahead(curves: Curves) -> Claim:
         return max(ratios)
 
     found = sampled(worst, curves)
-    return judge_intervals(
+    return Statement(
         "translation.vct_ahead",
         "paper: pure translation",
         "R6P v,C,t | w and v,C,t | w,t are ahead of all others",
         f"from {_FROM:g} per frame on, medians of orientation, position and t of both below those "
         "of every other solver of the paper",
+    ).judged_by(
         f"at most {found.value:.2f} times the best of the others",
         [found],
         (-np.inf, 1.0),

@@ -1,8 +1,8 @@
 """What a limited number of trials can say: intervals around shares, medians and ratios.
 
 Intervals hold the true figure with a stated confidence, and verdicts are read off them
-(:func:`rs_localizer.lab.experiments.results.judge_intervals`). Trials that share a recording are
-not independent: ``groups`` names the recording of each.
+(:class:`rs_localizer.lab.experiments.results.Statement`). Trials that share a recording are not
+independent: ``groups`` names the recording of each.
 """
 
 from __future__ import annotations

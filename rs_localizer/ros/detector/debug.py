@@ -10,6 +10,7 @@ import numpy as np
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.markers.maps import MarkerMap
@@ -68,7 +69,7 @@ class DebugPictures:
         """A nav_msgs/Odometry, of the camera in the map: show the image that it belongs to."""
         if self._calibration is not None and message.child_frame_id != self._calibration.frame:
             self._notice(
-                "other_body",
+                Notice.OTHER_BODY,
                 f"the odometry is of {message.child_frame_id}, not of the camera "
                 f"({self._calibration.frame}): no cubes are drawn",
             )
@@ -110,7 +111,7 @@ class DebugPictures:
         try:
             return self._calibration.camera(config.readout_time, config.scan_direction)
         except MessageError as error:
-            self._notice("bad_camera_info", str(error))
+            self._notice(Reason.BAD_CAMERA_INFO, str(error))
             return None
 
 

@@ -11,6 +11,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from rs_localizer.config import DetectorConfig
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, ODOMETRY, POSE
@@ -69,7 +70,7 @@ class Feed:
         try:
             calibration = read_camera_info(message)
         except MessageError as error:
-            self._refusals.notice("bad_camera_info", str(error))
+            self._refusals.notice(Reason.BAD_CAMERA_INFO, str(error))
             return
         self._worker.update(CAMERA_INFO, lambda work: work.debug.take_camera_info(calibration))
 

@@ -12,6 +12,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.timer import Timer
 
 from rs_localizer.config import DetectorConfig, ImageTransport
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.pipeline.images import Detected, FrameDetector
 from rs_localizer.ros.detector.debug import DebugPictures
@@ -45,7 +46,7 @@ class MarkerDetectorNode(ManagedNode[DetectorConfig, Work, Detected, Sight]):
     """Looks for markers; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
 
     task = DETECTOR_NAME
-    lack = "no_images"
+    lack = Notice.NO_IMAGES
     checked_at_start = False  # the map may come later: on_configure tells
 
     def __init__(self, **options: Any) -> None:

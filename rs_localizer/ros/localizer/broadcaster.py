@@ -12,6 +12,7 @@ from typing import Any
 from rclpy.node import Node
 
 from rs_localizer.config import NodeConfig, PublishTf
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError, make_transform
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
@@ -78,7 +79,7 @@ class Broadcaster:
         since = time.monotonic() - WINDOW
         if failed is None or failed[0] < since or self._sent >= since:
             return {}
-        return {"not_broadcast": failed[1]}
+        return {Notice.NOT_BROADCAST: failed[1]}
 
     def close(self) -> None:
         self.forget()
@@ -125,7 +126,7 @@ class Broadcaster:
     def _say(self, item: _Pending, error: TransformError) -> None:
         text = f"publish_tf {item.config.publish_tf}: {error}"
         self._failed = time.monotonic(), text
-        self._refusals.notice("not_broadcast", text)
+        self._refusals.notice(Notice.NOT_BROADCAST, text)
 
     def _send(self, item: Broadcast | None) -> None:
         if item is None or self._broadcaster is None:

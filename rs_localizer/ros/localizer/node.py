@@ -10,6 +10,7 @@ from rclpy.service import Service
 from std_srvs.srv import Trigger
 
 from rs_localizer.config import NodeConfig
+from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -33,7 +34,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     """Localizes; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
 
     task = "localizer"
-    lack = "no_pose"
+    lack = Notice.NO_POSE
     faults = MapError
 
     def __init__(self, **options: Any) -> None:

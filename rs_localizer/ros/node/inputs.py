@@ -23,6 +23,7 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
+from rs_localizer.core.reasons import Notice
 from rs_localizer.ros.node.conversion import type_name
 from rs_localizer.ros.node.intake import Intake, NotByExecutor
 from rs_localizer.ros.node.quality import Policies, best, offered, policies
@@ -184,7 +185,9 @@ class Inputs:
         if seconds > _LONG and not (heard is not None and self._topics[name].lasting):
             cause, mismatch = self._cause(self._subscriptions[name])
         if mismatch:
-            self._refusals.notice("incompatible_publisher", f"nothing is heard on {topic}: {cause}")
+            self._refusals.notice(
+                Notice.INCOMPATIBLE_PUBLISHER, f"nothing is heard on {topic}: {cause}"
+            )
         reliability, _ = policies(self._subscriptions[name].qos_profile)
         reliable = reliability == ReliabilityPolicy.RELIABLE
         return Silence(topic, seconds, heard is not None, cause, mismatch, reliable)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+from rs_localizer.core.reasons import Reason
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.ros.node.errors import describe
 from rs_localizer.ros.node.mailbox import Mailbox, Update, Work
@@ -191,7 +192,7 @@ class Worker(Generic[State, Result]):
         try:
             return function()
         except Exception as error:  # of one message: the others go on
-            return Refusal("internal_error", describe(error))
+            return Refusal(Reason.INTERNAL_ERROR, describe(error))
 
     def _finish(
         self,

@@ -153,11 +153,14 @@ def test_both_kinds(tmp_path: Path, text: str, model: str, D: list[float]) -> No
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("a: [", r"camera.yaml is no YAML, JSON or XML file"),
-        ("just text", r"is no calibration: expected a calibration file of ROS' .* found neither"),
-        ("width: 3\nname: x", r"is no calibration: .* found name, width"),
-        (ROS.replace("image_width", "breite"), r"no usable calibration: no 'image_width'"),
-        (ROS.replace("500.0, 0, ", ""), r"no usable calibration: cannot reshape"),
+        ("a: [", r"camera.yaml is not a YAML, JSON or XML file"),
+        (
+            "just text",
+            r"is not a calibration: expected a calibration file of ROS' .* found neither",
+        ),
+        ("width: 3\nname: x", r"is not a calibration: .* found name, width"),
+        (ROS.replace("image_width", "breite"), r"not a usable calibration: no 'image_width'"),
+        (ROS.replace("500.0, 0, ", ""), r"not a usable calibration: cannot reshape"),
         (ROS.replace("rational_polynomial", "fov"), r"distortion_model must be .* got 'fov'"),
         (BOOFCV.replace("skew: 0.0", "skew: 0.5"), r"skew must be 0, found 0.5"),
         (BOOFCV.replace("-0.16", "1, 2, 3"), r"at most 3 radial coefficients .* found 4"),
@@ -167,7 +170,7 @@ def test_both_kinds(tmp_path: Path, text: str, model: str, D: list[float]) -> No
         (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),
         (COLMAP.format("OPENCV", "500 510 321 241 1"), r"OPENCV has width, height, fx fy"),
         (JSON % '"a": 1', r"does not say for which size of images"),
-        (JSON % '"width": 640', r"no usable calibration: no 'image_height'"),
+        (JSON % '"width": 640', r"not a usable calibration: no 'image_height'"),
         (JSON % '"width": 300, "height": 480', r"principal point \(320.5, 240.5\) lies outside"),
         (XML.replace("<opencv_storage>", "<opencv_storage"), "XML cannot be read"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><x>&a;</x>', "the XML defines entities"),

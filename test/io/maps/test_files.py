@@ -359,9 +359,12 @@ LIST = XYZ + "property list uint float descriptor\n"
             "face with lists stands before",
         ),
         (text_ply(2, b"1 2 30\n1   2", XYZ), "vertex 2 of 2 must have 3 numbers, found 2"),
-        (text_ply(1, b"1 two 3\n", XYZ), "vertex 1 is no line of numbers: '1 two 3'"),
+        (text_ply(1, b"1 two 3\n", XYZ), "vertex 1 is not a line of numbers: '1 two 3'"),
         (text_ply(1, b"1 2 3 4\n", XYZ), "must have 3 numbers, found 4"),
-        (text_ply(1, b"1 2 256\n", XYZ.replace("float z", "uchar z")), "z holds what is no uchar"),
+        (
+            text_ply(1, b"1 2 256\n", XYZ.replace("float z", "uchar z")),
+            "z holds what is not a uchar",
+        ),
         (text_ply(10**12, b"1 2 3\n", XYZ), "truncated"),
     ],
 )

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from rs_localizer.lab.experiments import methods as m
 from rs_localizer.lab.experiments.motion import equal_to_r6p, joint_is_best
 from rs_localizer.lab.experiments.report import count_verdicts, write_result, write_summary
-from rs_localizer.lab.experiments.results import Result, Table, Verdict, judge
+from rs_localizer.lab.experiments.results import Result, Statement, Table, Verdict
 from rs_localizer.lab.experiments.sweeps import Curves
 
 X = np.array([0.0, 10.0, 30.0])
@@ -45,8 +45,8 @@ def test_joint_is_measured_against_the_better_one() -> None:
 
 
 def test_why_is_for_claims_that_do_not_hold() -> None:
-    assert judge("a.b", "s", "it flies", "c", "f", True, "no wings").why == ""
-    assert judge("a.b", "s", "it flies", "c", "f", False, "no wings").why == "no wings"
+    assert Statement("a.b", "s", "it flies", "c").judged("f", True, "no wings").why == ""
+    assert Statement("a.b", "s", "it flies", "c").judged("f", False, "no wings").why == "no wings"
 
 
 def test_every_method_can_be_told_from_the_others() -> None:
@@ -61,8 +61,8 @@ def test_every_method_can_be_told_from_the_others() -> None:
 
 
 def test_results_on_disk(tmp_path: Path) -> None:
-    held = judge("flight.up", "paper", "birds | fly", "up", "3 m", True)
-    fell = judge("flight.fish", "paper", "fish fly", "up", "0 m", False, "no wings")
+    held = Statement("flight.up", "paper", "birds | fly", "up").judged("3 m", True)
+    fell = Statement("flight.fish", "paper", "fish fly", "up").judged("0 m", False, "no wings")
     result = Result(
         "Flight", "In air.", [held, fell], {"flight": Table(("x", "name"), [(1 / 3, "a")])},
         {"flight": Figure()}, ["line\nline"], {"flight.gif": b"GIF89a"},

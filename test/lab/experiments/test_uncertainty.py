@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rs_localizer.lab.experiments.results import Verdict, judge_intervals
+from rs_localizer.lab.experiments.results import Statement, Verdict
 from rs_localizer.lab.experiments.uncertainty import (
     Interval,
     bootstrap,
@@ -105,7 +105,9 @@ def test_several_intervals_are_wider() -> None:
 def test_verdicts(low: float, high: float, verdict: Verdict) -> None:
     certain = Interval(0.95, 0.94, 0.96, 1000)
     own = Interval(0.5 * (low + high), low, high, 60)
-    claim = judge_intervals("a.b", "s", "c", "d", "found", [certain, own], (0.92, 0.98), "no luck")
+    claim = Statement("a.b", "s", "c", "d").judged_by(
+        "found", [certain, own], (0.92, 0.98), "no luck"
+    )
     assert claim.verdict is verdict
     assert ("undecided at 60 trials" in claim.finding) == (verdict is Verdict.UNDECIDED)
     assert claim.why == ("no luck" if verdict is Verdict.NOT_HELD else "")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.core.types import Estimate, Failure, Reason
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.lab.experiments import bound, robustness, tracking
 from rs_localizer.lab.experiments.results import Verdict

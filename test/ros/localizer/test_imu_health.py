@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.pipeline.imu import ImuState, Unused
-from rs_localizer.pipeline.reasons import ImuReason
 from rs_localizer.ros.localizer.imu_health import imu_oddity, imu_values
 
 STATUS = InertialStatus(

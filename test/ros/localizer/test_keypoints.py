@@ -17,6 +17,7 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map
@@ -203,7 +204,7 @@ def test_a_map_file(
         NodeConfig(readout_time=READOUT_TIME, map_file=str(path), map_frame="hall")
     )
     replay.load_map()
-    replay.take_camera_info(info)
+    replay.calibrate(read_camera_info(info))
     for frame in frames[:6]:
         found = talk.localize(frame)
         assert found.header.frame_id == "hall"

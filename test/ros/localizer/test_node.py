@@ -539,7 +539,7 @@ def test_what_it_says_at_start(start_node: Start, tmp_path: Path) -> None:
     lines = [line.partition("]: ")[2] for line in node.log.splitlines()]
     compiling = lines.index("compiling kernels (once on this machine, up to a minute)")
     assert re.fullmatch(r"kernels are ready after \d+\.\d s", lines[compiling + 1])
-    ignored = "a parameter is ignored: {} is no setting; did you mean {}?"
+    ignored = "a parameter is ignored: {} is not a setting; did you mean {}?"
     assert [line for line in lines if "ignored" in line] == [
         ignored.format("'min_inlier'", "'min_inliers'"),
         ignored.format("'readout_tim'", "'readout_time'"),

@@ -164,6 +164,6 @@ def test_names_that_no_parameter_has(context: Context) -> None:
     texts = parameters.unknown_names(recorder.node, NodeConfig)
     recorder.node.destroy_node()
     colour, readout_time, angular = texts
-    assert colour.startswith("'colour' is no setting; there are solver, ")
-    assert readout_time == "'readout_tim' is no setting; did you mean 'readout_time'?"
+    assert colour.startswith("'colour' is not a setting; there are solver, ")
+    assert readout_time == "'readout_tim' is not a setting; did you mean 'readout_time'?"
     assert angular.endswith("did you mean 'velocity_prior.angular'?")

@@ -150,11 +150,11 @@ class _Localizer:
     def __call__(self, message: Any) -> object:
         # A new one each time, so that a number says all of an execution.
         node = FrameLocalizer(NodeConfig(readout_time=0.03))
-        node.take_camera_info(seeds.camera_info(plain=True))
+        node.calibrate(read_camera_info(seeds.camera_info(plain=True)))
         if self._landmarks is None:
             node.localize(self._good)  # so that the other one is tracked
             return node.localize(message)
-        node.take_map(self._landmarks)
+        node.use_map(read_map(self._landmarks))
         node.localize_keypoints(self._good)
         return node.localize_keypoints(message)
 

@@ -18,7 +18,7 @@ from rs_localizer.lab.experiments.honesty.estimating import Found
 from rs_localizer.lab.experiments.honesty.scores import Scores, percent
 from rs_localizer.lab.experiments.honesty.small_planes import GROSS
 from rs_localizer.lab.experiments.honesty.tags import Replayed
-from rs_localizer.lab.experiments.results import Claim, judge, judge_intervals
+from rs_localizer.lab.experiments.results import Claim, Statement
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, share, together
 
 _SOURCE = "this project"
@@ -71,11 +71,12 @@ def plane_claims(found: Mapping[str, Found]) -> list[Claim]:
     total = sum(len(one.middle) for one in found.values())
     return [
         _regions("honesty.planes", what, "pose", found, _HOLD_PLANES),
-        judge(
+        Statement(
             "honesty.planes_gross",
             _SOURCE,
             "small planes far away: no pose is wrong by far",
             f"none off by more than {GROSS:g} deg",
+        ).judged(
             f"{gross} of {total} frames",
             gross == 0,
         ),
@@ -93,11 +94,12 @@ def p3p_claims(found: Mapping[str, Pair]) -> list[Claim]:
         for name in ("ours", "p3p")
     )
     claims.append(
-        judge_intervals(
+        Statement(
             "honesty.p3p_refused",
             _SOURCE,
             "the default refuses no more frames than P3P",
             "of the frames that one of them refuses, at most half are the default's",
+        ).judged_by(
             f"{ours} and {theirs} refused",
             [_refused_by_us(found.values())],
             (0.0, 0.5),
@@ -133,11 +135,12 @@ def tag_claims(found: Mapping[str, Replayed]) -> list[Claim]:
     ]
     shares = {name: percent(one.insignificant) for name, one in others.items()}
     return [
-        judge(
+        Statement(
             "honesty.tags_jitter",
             _SOURCE,
             "before real tags a real global shutter's poses jitter no more than P3P's",
             "second difference of the orientation, median and 95 %: not above P3P's",
+        ).judged(
             f"{', '.join(listed)} deg",
             all(
                 ours <= theirs
@@ -145,11 +148,12 @@ def tag_claims(found: Mapping[str, Replayed]) -> list[Claim]:
                 for ours, theirs in zip(jitter(one), jitter(p3p), strict=True)
             ),
         ),
-        judge(
+        Statement(
             "honesty.tags_velocities",
             _SOURCE,
             "no motion is found within its frames",
             f"velocities are insignificant in at least {_LEAST_INSIGNIFICANT:.0%}",
+        ).judged(
             ", ".join(f"{name} {value:.1f} %" for name, value in shares.items()),
             all(value >= 100.0 * _LEAST_INSIGNIFICANT for value in shares.values()),
         ),
@@ -209,11 +213,12 @@ def _family(
     certain = [condition for condition, one in single.items() if one.outside(*bad_side)]
     worst = min(certain or single, key=lambda condition: sign * single[condition].value)
     wanted = f"at most {high:.0%}" if low == 0.0 else f"{low:.0%} to {high:.0%}"
-    return judge_intervals(
+    return Statement(
         name,
         _SOURCE,
         statement,
         f"{criterion} {wanted} of all frames, and under no condition is it certainly worse",
+    ).judged_by(
         f"{pooled.share()}; certainly worse under {len(certain)} of {len(single)} conditions; "
         f"worst: {100 * single[worst].value:.0f} %, {worst}",
         [single[worst]] if certain else [pooled],
@@ -239,12 +244,13 @@ def _ratio(name: str, label: str, quantile: float, found: Mapping[str, Pair]) ->
     worst = max(ratios, key=lambda condition: ratios[condition].value)
     above = sum(ratio.outside(0.0, MOST_RATIO) for ratio in ratios.values())
     figure = "median" if label == "median" else "95 %"
-    return judge_intervals(
+    return Statement(
         name,
         _SOURCE,
         "before boards and markers whose map or lens is a little off, the default is never worse "
         f"than P3P: {figure} of the orientation error",
         f"at most {MOST_RATIO:g} times P3P's, under every condition",
+    ).judged_by(
         f"certainly above under {above} of {len(ratios)}; worst {ratios[worst].value:.2f} times, "
         f"{worst}",
         list(ratios.values()),

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, write_frame
 from rs_localizer.io.trajectories import read_tum
@@ -118,7 +119,7 @@ def _scores(recording: Path, tracking: bool, moment: PoseTime) -> Scores:
     with open_bag(recording) as bag:
         for topic, stamp_ns, message in bag.messages((CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC)):
             if topic == CAMERA_INFO_TOPIC:
-                localizer.take_camera_info(message)
+                localizer.calibrate(read_camera_info(message))
                 continue
             found, block = localizer.localize(message), stamp_ns // _BLOCK_NS
             scores.append(

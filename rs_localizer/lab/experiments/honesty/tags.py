@@ -13,6 +13,7 @@ import numpy as np
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized
 from rs_localizer.lab.experiments.honesty.scores import REGION, motion_evidence, percent
 from rs_localizer.lab.experiments.uncertainty import IntArray, Interval, bootstrap
@@ -72,7 +73,7 @@ def measure(condition: Condition, recording: Path, frames: int = FRAMES) -> Repl
     with open_bag(recording) as bag:
         for topic, _, message in bag.messages((CAMERA_INFO, CORRESPONDENCES)):
             if topic == CAMERA_INFO:
-                localizer.take_camera_info(message)
+                localizer.calibrate(read_camera_info(message))
             elif len(results) < frames:
                 results.append(localizer.localize(message))
     found = [result for result in results if isinstance(result, Localized)]

@@ -1,8 +1,9 @@
-"""Inner corners of chessboards and ChArUco boards in images."""
+"""Chessboards, ChArUco boards and grids of circles in images, by OpenCV's own detectors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import Gray
-from rs_localizer.markers.prints import Charuco, Chessboard
+from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid
 
 # Half the window of the sub-pixel search, as a share of the smallest distance between corners:
 # the next corner must stay outside, and more of the edges inside means less noise.
@@ -24,6 +25,9 @@ _LARGEST_SEARCH = 1024
 # OpenCV's search fails in smaller ones (px), which cannot show a board.
 _SMALLEST_SEARCH = 16
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+# Circles between this many pixels and this share of the image are looked for: OpenCV's own upper
+# limit of 5000 px is soon passed by a board that fills the image of a large sensor.
+_LEAST_AREA, _LARGEST_SHARE = 12.0, 0.02
 
 
 def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = None) -> Array | None:
@@ -168,3 +172,35 @@ def _starts_black(grid: Array, image: Gray) -> bool:
     second = grid[0:2, 1:3].mean(axis=(0, 1))
     (x, y), (u, v) = np.rint(first).astype(int), np.rint(second).astype(int)
     return bool(image[y, x] < image[v, u])
+
+
+def find_circles(image: Gray, grid: CircleGrid, previous: Array | None = None) -> Array | None:
+    """Pixels (n,2) of the centres of a grid in the order of ``grid.points``.
+
+    A symmetric one looks the same turned by half (a square one by a quarter, too): then the order
+    is the one that is closest to the ``previous`` centres; without them, the one that reads as text
+    does. Seen at an angle, the middle of a circle's image is not quite that of the circle: the
+    larger the circles and the nearer the board, the farther off.
+
+    Returns:
+        None when the whole grid is not seen.
+    """
+    if grid.inverted:
+        image = np.asarray(cv2.bitwise_not(image), np.uint8)
+    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+    found, centres = cv2.findCirclesGrid(
+        image, (grid.columns, grid.rows), flags=kind, blobDetector=_blobs(image)
+    )
+    if not found:
+        return None
+    pixels = np.asarray(centres, np.float64).reshape(-1, 2)
+    if grid.asymmetric:
+        return pixels
+    return ordered(pixels.reshape(grid.rows, grid.columns, 2), previous)
+
+
+def _blobs(image: Gray) -> Any:
+    opencv: Any = cv2  # whose type stubs lack these
+    wanted = opencv.SimpleBlobDetector_Params()
+    wanted.minArea, wanted.maxArea = _LEAST_AREA, max(5000.0, _LARGEST_SHARE * image.size)
+    return opencv.SimpleBlobDetector_create(wanted)

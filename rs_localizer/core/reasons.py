@@ -1,0 +1,81 @@
+"""Names of what users are told: THE lists. docs/reasons.md says what each means and what to do."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Reason(StrEnum):
+    """Why there is no pose, or nothing to make one of."""
+
+    # Points that give no motion.
+    TOO_FEW_POINTS = "too_few_points"
+    NO_HYPOTHESIS = "no_hypothesis"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    BEHIND_CAMERA = "behind_camera"
+    RESIDUAL = "residual"
+    DEGENERATE = "degenerate"
+    IMPLAUSIBLE = "implausible"
+    MIRRORED = "mirrored"
+    MODEL_ERROR = "model_error"
+    # Messages that cannot be used, or not yet.
+    NO_CAMERA_INFO = "no_camera_info"
+    BAD_CAMERA_INFO = "bad_camera_info"
+    EMPTY_CLOUD = "empty_cloud"
+    BAD_CLOUD = "bad_cloud"
+    NO_MAP = "no_map"
+    BAD_MAP = "bad_map"
+    BAD_KEYPOINTS = "bad_keypoints"
+    NO_MATCHES = "no_matches"
+    BAD_IMU = "bad_imu"
+    NO_TRANSFORM = "no_transform"
+    # Images that cannot be searched.
+    BAD_IMAGE = "bad_image"
+    NO_TIME = "no_time"
+    # Our own fault.
+    INTERNAL_ERROR = "internal_error"
+
+
+class ImuReason(StrEnum):
+    """Why an image was localized by the camera alone."""
+
+    NEVER = "imu_never"
+    LATE = "imu_late"
+    STOPPED = "imu_stopped"
+    BEGINS_LATER = "imu_begins_later"
+    GAP = "imu_gap"
+    TOO_SLOW = "imu_too_slow"
+    SATURATED = "imu_saturated"
+    NO_TRANSFORM = "imu_no_transform"
+    NO_READOUT_TIME = "imu_no_readout_time"
+    NOT_TRACKING = "imu_not_tracking"
+    DOUBTED = "imu_doubted"
+    DISAGREES = "imu_disagrees"
+    TURNED = "imu_turned"
+
+
+class Notice(StrEnum):
+    """What is odd, and yet no reason to refuse anything."""
+
+    # Of frames.
+    TIME_WENT_BACK = "time_went_back"
+    MAP_CHANGED = "map_changed"
+    CAMERA_CHANGED = "camera_changed"
+    MAP_IS_CAMERA = "map_is_camera"
+    COARSE_COORDINATES = "coarse_coordinates"
+    PIXELS_OUTSIDE = "pixels_outside"
+    READOUT_TIME = "readout_time"
+    # Of maps and keypoints.
+    MAP_REPLACED = "map_replaced"
+    MAP_INCOMPLETE = "map_incomplete"
+    TOO_MANY_KEYPOINTS = "too_many_keypoints"
+    # Of markers in images.
+    UNKNOWN_MARKERS = "unknown_markers"
+    REPEATED_MARKERS = "repeated_markers"
+    WRONG_MAP = "wrong_map"
+    # Of nodes.
+    NOT_BROADCAST = "not_broadcast"
+    INCOMPATIBLE_PUBLISHER = "incompatible_publisher"
+    NO_POSE = "no_pose"
+    NO_IMAGES = "no_images"
+    OTHER_BODY = "other_body"
