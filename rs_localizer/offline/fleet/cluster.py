@@ -141,6 +141,8 @@ def _local(workers: int) -> Iterator[Any]:
         # A worker that dies takes no task along but the one that it is at.
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.worker.preload": ["rs_localizer.offline.fleet.worker"],
+        # Nobody looks at what Dask samples of the work every 10 ms.
+        "distributed.worker.profile.enabled": False,
     }
     # Of worker processes that were killed, Python's clean-up would tell on the screen.
     quiet = "ignore:resource_tracker:UserWarning"

@@ -8,11 +8,13 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from rs_localizer.io.whole import told
 from rs_localizer.offline.fleet.task import Figures
+
+if TYPE_CHECKING:  # half a second of importing, which workers do not need
+    from matplotlib.figure import Figure
 
 CSV, MARKDOWN, PICTURE = "summary.csv", "summary.md", "summary.png"
 
@@ -92,6 +94,8 @@ def _text(value: float | int | str) -> str:
 
 def _draw(rows: Sequence[Row], columns: Sequence[str]) -> Figure:
     """The first figures that are numbers, recording by recording; what failed is marked below."""
+    from matplotlib.figure import Figure
+
     numbers = [name for name in columns if any(_is_number(row, name) for row in rows)]
     shown = numbers[:_MOST_PANELS] or [""]
     figure = Figure((_WIDTH, 0.6 + _PANEL * len(shown)), layout="constrained")

@@ -96,8 +96,8 @@ def _unfit(task: Task) -> str:
     here = socket.gethostname()
     if program() != task.program:
         return (
-            f"worker on {here} has rs_localizer {program()}, who asks has {task.program}: install "
-            "the same on both"
+            f"worker on {here} has another rs_localizer (sources {program()}, here "
+            f"{task.program}): install the same on both"
         )
     if not task.out.is_dir():
         return f"worker on {here} does not see {task.out}: machines have to share its file system"
