@@ -7,8 +7,9 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,8 @@ from rs_localizer.offline.fleet.task import Outcome, Task, perform
 _DEATHS = 3
 # How long a scheduler that is gone may take to come back, in s, and how often it is looked for.
 _PATIENCE, _PERIOD = 60.0, 1.0
+# How often in a row all tasks may be given out without a single outcome.
+_ROUNDS = 5
 _CONNECT_TIMEOUT = 5.0
 
 
@@ -49,26 +52,38 @@ def perform_all(tasks: Sequence[Task], where: Where) -> Generator[Outcome, None,
     if not tasks:
         return
     _silence()
-    if where.scheduler is None:
-        with _local(where.processes(len(tasks))) as cluster:
-            yield from _all_done({task.name: task for task in tasks}, cluster)
-        return
     left = {task.name: task for task in tasks}
-    patience = 0.0
-    while left:
-        try:
-            yield from _all_done(left, where.scheduler, patience)
-        except ClusterError as error:
-            if not patience:
-                raise
-            for name in left:
-                yield Outcome(name, None, str(error))
-            return
-        patience = _PATIENCE
+    patience, idle = 0.0, 0
+    with _cluster(where, len(tasks)) as cluster:
+        while left:
+            before = len(left)
+            try:
+                yield from _all_done(left, cluster, patience)
+            except ClusterError as error:
+                if not patience:
+                    raise
+                yield from _given_up(left, str(error))
+                return
+            # What is left was lost on its way, or with the scheduler: who has done it, tells again.
+            patience, idle = _PATIENCE, idle + 1 if len(left) == before else 0
+            if idle == _ROUNDS:
+                yield from _given_up(left, "the scheduler never answers with its result")
+                return
+
+
+def _given_up(left: Iterable[str], reason: str) -> Iterator[Outcome]:
+    return (Outcome(name, None, reason) for name in left)
+
+
+def _cluster(where: Where, tasks: int) -> AbstractContextManager[Any]:
+    """What a client connects to."""
+    if where.scheduler is not None:
+        return contextlib.nullcontext(where.scheduler)
+    return _local(where.processes(tasks))
 
 
 def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Iterator[Outcome]:
-    """The outcomes of tasks, each of which is taken out of ``left``; a lost scheduler ends it."""
+    """The outcomes of tasks, each of which is taken out of ``left``; some may be lost."""
     from distributed import as_completed
 
     with _client(cluster, patience) as client:
@@ -79,7 +94,7 @@ def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Ite
             task = futures.pop(future)
             try:
                 outcome = _outcome(task, future)
-            except (CancelledError, OSError):  # by nobody: the scheduler is gone
+            except (CancelledError, OSError):  # the scheduler is gone, or who has the outcome
                 continue
             del left[task.name]
             yield outcome
@@ -102,11 +117,8 @@ def _outcome(task: Task, future: Any) -> Outcome:
         return found
     error = future.exception()
     if isinstance(error, KilledWorker):
-        return Outcome(
-            task.name,
-            None,
-            f"the worker process died on it {_DEATHS} times (out of memory, or killed)",
-        )
+        reason = "every worker process that took it died (out of memory, or killed)"
+        return Outcome(task.name, None, reason)
     return Outcome(task.name, None, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
@@ -152,7 +164,7 @@ def _local(workers: int) -> Iterator[Any]:
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=0,  # the operating system's
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",  # any free port, for nobody else
             silence_logs=logging.CRITICAL + 1,
         )
         try:
