@@ -21,7 +21,16 @@ def replay(args: Namespace, config: NodeConfig) -> None:
     """``replay`` of many recordings."""
     kernels = f"replay {config.solver}{' smooth' if args.smooth else ''}"
     files = _given(args.params, config.map_file and Path(config.map_file))
-    run_fleet(args, Plan(Kind("replay", replay_of_many, kernels), lambda _: files, args.overwrite))
+    kind = Kind("replay", replay_of_many, kernels, None if args.smooth else replay_warm)
+    run_fleet(args, Plan(kind, lambda _: files, args.overwrite))
+
+
+def replay_warm(args: Namespace) -> None:
+    """Compile what the settings need."""
+    from rs_localizer.cli.replay import settings_of
+    from rs_localizer.pipeline.frames import FrameLocalizer
+
+    FrameLocalizer(settings_of(args)).warm_up()
 
 
 def replay_of_many(args: Namespace, recording: Path, out: Path) -> Figures:
@@ -38,7 +47,15 @@ def detect(args: Namespace) -> None:
     if args.timing:
         raise UsageError("--timing is of one recording: beside others it would tell little")
     files = _given(args.map, args.calibration)
-    run_fleet(args, Plan(Kind("detect", detect_of_many, "detect"), lambda _: files))
+    kind = Kind("detect", detect_of_many, "detect", detect_warm)
+    run_fleet(args, Plan(kind, lambda _: files))
+
+
+def detect_warm(_: Namespace) -> None:
+    """Compile what the search needs."""
+    from rs_localizer.markers.detection import warm_up
+
+    warm_up()
 
 
 def detect_of_many(args: Namespace, recording: Path, out: Path) -> Figures:

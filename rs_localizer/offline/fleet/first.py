@@ -1,4 +1,4 @@
-"""The first recording on a machine is done alone: it compiles the kernels for all others.
+"""The first process on a machine compiles the kernels for all others, which wait for it.
 
 As many processes that compile at once take as much longer; and kernels that two of them compile at
 once may round differently.
@@ -20,17 +20,20 @@ from rs_localizer.offline.fleet.identity import program
 
 
 @contextlib.contextmanager
-def alone_until_compiled(kernels: str) -> Iterator[None]:
+def alone_until_compiled(kernels: str) -> Iterator[bool]:
     """Within ``with``, no other process of this machine is, unless one has been through.
 
     Args:
         kernels: names what is compiled within.
+
+    Returns:
+        whether this is the first one.
     """
     folder = cache_directory() / "fleet"
     done = folder / _name(kernels)
     lock = None if done.exists() else _locked(done)
     try:
-        yield
+        yield lock is not None
         if lock is not None:
             with contextlib.suppress(OSError):
                 done.touch()

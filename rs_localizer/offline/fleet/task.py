@@ -39,6 +39,8 @@ class Kind:
     # Arguments of the command, recording, folder to create: does it, as for one recording alone.
     work: Callable[[Namespace, Path, Path], Figures]
     kernels: str  # names what has to be compiled for it
+    # Compiles just that; without it, the first recording on a machine does, and the others wait.
+    warm: Callable[[Namespace], None] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +116,10 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
             partial.mkdir(parents=True)
         with (
             _PRINTING,
-            alone_until_compiled(task.kind.kernels),
             contextlib.redirect_stdout(said),
             contextlib.redirect_stderr(said),
         ):
-            figures = task.kind.work(task.arguments, task.recording, inner)
+            figures = _work(task, inner)
         with told(inner):
             inner.mkdir(exist_ok=True)
             text = said.getvalue().replace(str(inner), task.name)
@@ -132,6 +133,16 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return figures, ""
+
+
+def _work(task: Task, folder: Path) -> Figures:
+    kind = task.kind
+    with alone_until_compiled(kind.kernels) as first:
+        if first and kind.warm is None:
+            return kind.work(task.arguments, task.recording, folder)
+        if first and kind.warm is not None:
+            kind.warm(task.arguments)
+    return kind.work(task.arguments, task.recording, folder)
 
 
 def _complete(task: Task, inner: Path, figures: Figures) -> None:

@@ -171,6 +171,22 @@ def test_a_first_one_that_fails_leaves_the_next_one_first(tmp_path: Path, cache:
     assert len(marks()) == 1
 
 
+def test_who_can_compile_alone_does_no_more_alone(tmp_path: Path, cache: Path) -> None:
+    """While the first one works, having compiled, a second one may come."""
+    given = task(tmp_path, kernels="k")
+    said: list[str] = []
+
+    def work(args: Namespace, recording: Path, out: Path) -> Figures:
+        with first.alone_until_compiled("k") as is_first:
+            said.append(f"work, first: {is_first}")
+        return {}
+
+    kind = Kind("count", work, "k", lambda args: said.append("compiled"))
+    assert perform(replace(given, kind=kind)).figures == {}
+    perform(replace(given, kind=kind, name="again"))
+    assert said == ["compiled", "work, first: False", "work, first: False"]
+
+
 def test_without_a_cache_nobody_waits(tmp_path: Path, cache: Path) -> None:
     cache.write_text("a file where the folder should be")
     with first.alone_until_compiled("k"), first.alone_until_compiled("k"):
