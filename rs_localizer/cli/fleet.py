@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import fcntl
 import importlib.util
+import os
 import shutil
 import time
 from argparse import Namespace
@@ -74,7 +75,8 @@ class Plan:
     kind: Kind
     # What a result depends on beside the recording and the settings.
     inputs: Callable[[Path], Sequence[Path]]
-    overwrite: bool = False
+    # Whether results of other settings are replaced; None: the command has no such option.
+    overwrite: bool | None = None
 
 
 def run_fleet(args: Namespace, plan: Plan) -> None:
@@ -115,10 +117,10 @@ def _need_dask() -> None:
 
 
 def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
-    recordings = list(dict.fromkeys(path.absolute() for path in args.recordings))
+    recordings = list(dict.fromkeys(map(_absolute, args.recordings)))
     kept = {name: value for name, value in vars(args).items() if name not in _OF_THE_FLEET}
     arguments = Namespace(
-        **{name: v.absolute() if isinstance(v, Path) else v for name, v in kept.items()}
+        **{name: _absolute(v) if isinstance(v, Path) else v for name, v in kept.items()}
     )
     settings = readable(arguments)
     return [
@@ -135,6 +137,11 @@ def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
     ]
 
 
+def _absolute(path: Path) -> Path:
+    """Without "..", and with links as they are called."""
+    return Path(os.path.abspath(path))
+
+
 def _check(tasks: list[Task], plan: Plan) -> None:
     """Refuse what would be overwritten, before hours of work."""
     for task in tasks:
@@ -146,9 +153,10 @@ def _check(tasks: list[Task], plan: Plan) -> None:
                 "--out, or remove it"
             )
         if not plan.overwrite:
+            way_out = "remove it" if plan.overwrite is None else "--overwrite"
             raise ValueError(
                 f"{task.folder} is a result of other settings, another recording or another "
-                "version; choose another --out, or --overwrite"
+                f"version; choose another --out, or {way_out}"
             )
 
 

@@ -25,7 +25,7 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
-from rs_localizer.cli.replay_view import add_view_arguments, check_view, show
+from rs_localizer.cli.replay_view import add_view_arguments, check_view, open_viewer, write_file
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
@@ -165,8 +165,9 @@ def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool
         with fresh(out, args.overwrite):
             _hint(recording, args.params)
             tally = _replay(bag, topics, localizer, notices, out, args)
-            show(args, bag, topics, localizer, tally, out)
+            write_file(args, bag, topics, localizer, tally, out)
         _tell(tally, config, out, timed)
+        open_viewer(args, bag, topics, localizer, tally)
         if not tally.frames:
             raise ValueError(
                 f"no frame of {bag.path} was localized; of the last one, {tally.last_refusal}"

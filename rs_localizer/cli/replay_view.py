@@ -57,7 +57,7 @@ def check_view(args: argparse.Namespace) -> None:
         )
 
 
-def show(
+def write_file(
     args: argparse.Namespace,
     bag: BagReader,
     topics: Topics,
@@ -65,12 +65,20 @@ def show(
     tally: Tally,
     out: Path,
 ) -> None:
-    """Write the file, open the viewer, as far as they are asked for."""
-    if not tally.frames:
-        return
-    if args.rerun is not None:
+    """Write what ``--rerun`` asks for; of no pose there is nothing to be seen."""
+    if args.rerun is not None and tally.frames:
         file = out / VIEW if args.rerun == Path(VIEW) else args.rerun
         write_view(bag, topics, localizer, tally.written, file)
         print(f"to look at: rerun {file}")
-    if args.view:
+
+
+def open_viewer(
+    args: argparse.Namespace,
+    bag: BagReader,
+    topics: Topics,
+    localizer: FrameLocalizer,
+    tally: Tally,
+) -> None:
+    """Open the viewer if ``--view`` asks for it; the result is there, whether it starts or not."""
+    if args.view and tally.frames:
         write_view(bag, topics, localizer, tally.written, None)

@@ -126,3 +126,20 @@ def test_without_the_sdk_one_sentence_says_what_to_install(
         "rs_localizer replay: --rerun and --view need the Rerun SDK, which is not installed: "
         "pip install 'rs_localizer[view]'\n"
     )
+
+
+def test_without_a_screen_the_result_is_there_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    out = tmp_path / "out"
+    assert main(["replay", str(flight), *SHUTTER, "--out", str(out), "--view"]) == 1
+    assert capsys.readouterr().err == (
+        "rs_localizer replay: the Rerun viewer needs a screen (DISPLAY or WAYLAND_DISPLAY); "
+        "--rerun writes a file\n"
+    )
+    assert (out / "poses.txt").is_file()

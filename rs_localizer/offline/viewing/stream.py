@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +32,8 @@ from rs_localizer.offline.viewing.shapes import (
 from rs_localizer.pipeline.frames import FrameLocalizer
 
 _APPLICATION = "rs_localizer"
+_TIMEOUT = 60.0  # s, for a viewer to take everything
+_SCREENS, _INSTEAD = ("DISPLAY", "WAYLAND_DISPLAY"), "--rerun writes a file"
 # Size of the image and of the body's axes in the scene: shares of the distance to the points.
 _PLANE, _AXES = 0.3, 0.12
 # More landmarks than this are thinned out.
@@ -72,12 +76,9 @@ def write_view(
     scene = _Scene(stream, camera, by_stamp, Sizes(look.depth, longer))
     landmarks = np.zeros((0, 3)) if localizer.map is None else localizer.map.points
     if file is None:
-        try:
-            stream.spawn(default_blueprint=arranged)
-        except (OSError, RuntimeError) as error:
-            raise ValueError(f"the Rerun viewer does not start: {error}; use --rerun") from error
+        _start_viewer(stream, arranged)
         scene.log(items, landmarks)
-        stream.flush()
+        stream.flush(timeout_sec=_TIMEOUT)
         return
     with whole_files(file):
         file.touch()  # what cannot be written says so here
@@ -85,6 +86,22 @@ def write_view(
         scene.log(items, landmarks)
         stream.flush()
         stream.disconnect()
+
+
+def _start_viewer(stream: Any, arranged: Any) -> None:
+    if sys.platform == "linux" and not any(map(os.environ.get, _SCREENS)):
+        # It would end at once, and what is sent to it would wait for ever.
+        raise ValueError(f"the Rerun viewer needs a screen ({' or '.join(_SCREENS)}); {_INSTEAD}")
+    # Beside the interpreter, where pip puts it; that need not be on the path.
+    beside = str(Path(sys.executable).parent)
+    os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", os.defpath), beside])
+    try:
+        stream.spawn(default_blueprint=arranged)
+    except (OSError, RuntimeError) as error:
+        reason = str(error).partition(". ")[0]
+        raise ValueError(
+            f"the Rerun viewer does not start: {reason}; --rerun writes a file"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
