@@ -17,7 +17,6 @@ DECLARATIONS = {"config/declared.py: setting", "solvers/minimal.py: solve_minima
 # To be mended; nothing is added here.
 TOO_MANY = {
     "estimation/ransac.py: search",
-    "estimation/shaking.py: _fit",
     "estimation/shaking.py: follow",
 }
 

@@ -14,8 +14,9 @@ from tqdm import tqdm
 from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
-from rs_localizer.cli.detect import add_board_arguments, find_map
 from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
+from rs_localizer.cli.given import given_settings
+from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
@@ -46,7 +47,6 @@ from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
-from rs_localizer.settings import build, load_params_file, parse_assignment
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
@@ -124,7 +124,7 @@ class _Source:
 
 def run(args: argparse.Namespace) -> None:
     if is_fleet(args):
-        settings_of(args)  # refuses wrong ones before there are workers
+        given_settings(args)  # refuses wrong ones before there are workers
         many.calibrate(args)
     else:
         calibrate_one(argparse.Namespace(**vars(args), recording=args.recordings[0]))
@@ -160,16 +160,7 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
 def _config(args: argparse.Namespace) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    return settings_of(args)
-
-
-def settings_of(args: argparse.Namespace) -> NodeConfig:
-    """The settings that the arguments give; refuses those that cannot be."""
-    try:
-        values = {} if args.params is None else load_params_file(args.params)
-        return build(values | dict(map(parse_assignment, args.assignments)))
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    return given_settings(args)
 
 
 def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
+from rs_localizer.cli.replay_exports import add_export_arguments, write_exports
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -93,6 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="one motion through all images, from those before and after each; images without a "
         f"pose are bridged where their neighbours determine them, and listed in {BRIDGED}",
     )
+    add_export_arguments(offline)
     offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
     graph = parser.add_argument_group("through the ROS graph")
     graph.add_argument(
@@ -182,7 +184,8 @@ def _detect_command(path: Path) -> str:
     seen = shlex.quote(f"{path.resolve().with_suffix('').name}_seen")
     return (
         f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {seen} (or --board "
-        f"6x4 --square 0.03 instead of --map), then: rs_localizer replay {seen}"
+        "6x4 --square 0.03, or --features sift, instead of --map), then: rs_localizer replay "
+        f"{seen}"
     )
 
 
@@ -201,6 +204,8 @@ def _check_usage(args: argparse.Namespace) -> None:
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
     if not args.ros:
+        if args.rate is not None and args.nerfstudio:
+            raise UsageError("--nerfstudio is of images, --rate of samples between them")
         if args.rate is not None and not args.smooth:
             raise UsageError(
                 "--rate goes with --ros or --smooth; offline replay runs at full speed"
@@ -209,10 +214,10 @@ def _check_usage(args: argparse.Namespace) -> None:
     if is_fleet(args):
         raise UsageError("--ros plays one recording, and needs no workers")
     given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
-    if any(given):
+    if any((*given, args.rows, args.nerfstudio)):
         raise UsageError(
-            "--out, --overwrite, --params, --map, --smooth and -p are for offline replay; with "
-            "--ros the running node has the settings and publishes the result"
+            "--out, --overwrite, --params, --map, --row, --nerfstudio, --smooth and -p are for "
+            "offline replay; with --ros the running node has the settings and publishes the result"
         )
 
 
@@ -273,6 +278,7 @@ def _replay(
     tally.seconds = time.perf_counter() - start
     tally.imu = localizer.imu.state
     tally.repeated = write_texts(out, tally.written, localizer.config)
+    write_exports(args, bag, localizer, tally.written, out)
     return tally
 
 

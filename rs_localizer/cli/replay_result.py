@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_localizer.cli.replay_exports import written_names
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
@@ -54,6 +55,8 @@ def fresh(out: Path, overwrite: bool) -> Iterator[None]:
 def _remove_results(out: Path) -> None:
     for name in (POSES, TWISTS, BRIDGED, VIEW):
         (out / name).unlink(missing_ok=True)
+    for path in written_names(out):
+        path.unlink(missing_ok=True)
     shutil.rmtree(out / RESULT, ignore_errors=True)
 
 

@@ -11,13 +11,12 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.images import Gray, Image
+from rs_localizer.io.images import Gray, read_any_image
 from rs_localizer.io.keypoints import read_keypoints
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.topics import COMPRESSED_IMAGE, CORRESPONDENCES
 from rs_localizer.offline.image_sources import image_topics
 from rs_localizer.offline.replay import Topics
-from rs_localizer.pipeline.images import read
 
 _MEDIA = {b"\xff\xd8": "image/jpeg", b"\x89P": "image/png"}
 
@@ -50,8 +49,7 @@ def shown(bag: BagReader, topics: Topics) -> Iterator[Picture | Cloud]:
             item = _picture(message) if topic == pictures else _cloud(message, matched)
         except MessageError:  # replay has refused it, too
             continue
-        if item is not None:
-            yield item
+        yield item
 
 
 def _picture_topic(bag: BagReader) -> str | None:
@@ -62,15 +60,14 @@ def _picture_topic(bag: BagReader) -> str | None:
     return chosen[0] if len(chosen) == 1 else None
 
 
-def _picture(message: Any) -> Picture | None:
+def _picture(message: Any) -> Picture:
     stamp = stamp_ns(message)
     if hasattr(message, "format"):
         data = bytes(message.data)
         media_type = _MEDIA.get(data[:2], "")
         if media_type:
             return Picture(stamp, data, media_type)
-    found = read(message)
-    return Picture(stamp, found.pixels) if isinstance(found, Image) else None
+    return Picture(stamp, read_any_image(message).pixels)
 
 
 def _cloud(message: Any, matched: bool) -> Cloud:
