@@ -122,7 +122,7 @@ def test_results_of_other_settings_are_in_the_way(
         (["replay", "a", "--workers", "2", "--scheduler", "tcp://h:1", "--out", "o"], "give it or"),
         (["replay", "a", "b", "--out", "o", "-p", "solver:=magic"], "-p: solver"),
         (["calibrate", "a", "b", "--out", "o", "--plots", "x/y"], "--plots is a name in the"),
-        (["detect", "a", "b", "--out", "o"], "give either --map or --board"),
+        (["detect", "a", "b", "--out", "o"], "give --map, --board or --features"),
         (["evaluate", "a"], "give EST and TRUTH"),
         (["evaluate", "a", "b", "--out", "o"], "go with --truths"),
         (["evaluate", "a", "--truths", "t"], "many recordings need --out DIR"),
