@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, detect_features
+from rs_localizer.cli import UsageError, detect_features, many
+from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
 from rs_localizer.cli.image_source import (
     Source,
     add_source_arguments,
@@ -31,11 +32,12 @@ from rs_localizer.process.arguments import number
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "images",
+        "recordings",
         type=Path,
+        nargs="+",
         metavar="VIDEO|BAG|FOLDER",
         help="a video (also a stream of JPEG images, .mjpeg), a rosbag2 or ROS 1 bag with raw or "
-        "compressed images, or a folder of .jpg or .png files",
+        "compressed images, or a folder of .jpg or .png files; several: see many recordings",
     )
     wanted = parser.add_argument_group("what to look for")
     wanted.add_argument("--map", type=Path, metavar="FILE", help="marker map")
@@ -56,16 +58,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timing", action="store_true", help="say how long it took, and how much of it OpenCV did"
     )
+    add_fleet_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> None:
-    if args.features is not None:
-        detect_features.run(args)
-        return
-    if args.max_keypoints is not None:
+    if args.features is None and args.max_keypoints is not None:
         raise UsageError("--max-keypoints goes with --features")
-    if args.map is None and args.board is None:
+    if args.features is None and args.map is None and args.board is None:
         raise UsageError("give --map, --board or --features")
+    if not is_fleet(args):
+        alone = argparse.Namespace(**vars(args), images=args.recordings[0])
+        if args.features is None:
+            detect_one(alone)
+        else:
+            detect_features.run(alone)
+        return
+    if args.features is not None:
+        raise UsageError("--features takes one recording")
+    find_map(args)  # refuses wrong ones before there are workers
+    many.detect(args)
+
+
+def detect_one(args: argparse.Namespace) -> Recorded:
+    """Detect in the images of one recording, and say what came of it."""
     marker_map = find_map(args)
     notices: Counter[str] = Counter()
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
@@ -80,6 +95,7 @@ def run(args: argparse.Namespace) -> None:
     tell_next(args)
     if args.timing:
         _tell_times(recorded.images, *detector.seconds)
+    return recorded
 
 
 def _tell_times(images: int, seconds: float, in_opencv: float) -> None:

@@ -26,6 +26,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import NODE_NAME
 
 POSES, TWISTS, RESULT, BRIDGED = "poses.txt", "twists.txt", "result", "bridged.txt"
+VIEW = "view.rrd"
 """What replay writes into its output directory."""
 
 
@@ -52,7 +53,7 @@ def fresh(out: Path, overwrite: bool) -> Iterator[None]:
 
 
 def _remove_results(out: Path) -> None:
-    for name in (POSES, TWISTS, BRIDGED):
+    for name in (POSES, TWISTS, BRIDGED, VIEW):
         (out / name).unlink(missing_ok=True)
     for path in written_names(out):
         path.unlink(missing_ok=True)

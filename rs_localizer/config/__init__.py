@@ -26,8 +26,10 @@ from rs_localizer.config.nodes import (
     MatchBy,
     Matching,
     NodeConfig,
+    OrientationCovariance,
     PoseTime,
     PublishTf,
+    Px4Odometry,
 )
 
 __all__ = [
@@ -43,8 +45,10 @@ __all__ = [
     "MatchBy",
     "Matching",
     "NodeConfig",
+    "OrientationCovariance",
     "PoseTime",
     "PublishTf",
+    "Px4Odometry",
     "VelocityPrior",
     "localizer_config",
     "type_of",

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import Array
@@ -14,6 +15,8 @@ from rs_localizer.features.selection import balanced
 
 # OpenCV's detectors fail on smaller images (px), in which there is nothing to find.
 _LEAST_SIDE = 16
+# Larger ones (px) are reduced, as COLMAP does: SIFT takes 250 bytes a pixel.
+_LONGEST_SIDE = 3200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +52,21 @@ class FeatureExtractor:
 
     def extract(self, image: Gray) -> Features:
         """The keypoints of an image (h,w)."""
+        height, width = image.shape
+        if max(height, width) <= _LONGEST_SIDE:
+            return self._extract(image)
+        ratio = _LONGEST_SIDE / max(height, width)
+        size = max(1, round(width * ratio)), max(1, round(height * ratio))
+        reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        found = self._extract(reduced)
+        scale = np.array([width / size[0], height / size[1]])
+        return replace(
+            found,
+            pixels=_single((found.pixels + 0.5) * scale - 0.5),
+            sizes=_single(found.sizes / ratio),
+        )
+
+    def _extract(self, image: Gray) -> Features:
         found: Sequence[Any] = ()
         descriptors = None
         if min(image.shape) >= _LEAST_SIDE:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -278,6 +279,10 @@ def test_bad_files_are_told_of_in_one_line(
     for data in (b"\x01", struct.pack("<Q", 1000), struct.pack("<Q", 1) + bytes(70)):
         (broken / "images.bin").write_bytes(data)
         refused("images.bin is truncated or damaged", reference_sfm=broken)
+    (broken / "images.bin").unlink()
+    for text, told in (("1 0 0 0 1 0 0\n\n", "expected ID QW QX"), ("#\n", "has no images")):
+        (broken / "images.txt").write_text(text)
+        refused(told, reference_sfm=broken)
     assert localize(files, "-p", "readout:=1") == 2
     assert localize(files, "--row", "third") == 2
 
@@ -286,6 +291,6 @@ def test_without_h5py_it_says_what_to_install(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = make(tmp_path, motions(1))
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    monkeypatch.setitem(sys.modules, "h5py", None)
     assert localize(files) == 1
-    assert "h5py" in capsys.readouterr().err
+    assert "h5py is not installed: pip install h5py (the extra hloc" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.features import methods
+from rs_localizer.features import extraction, methods
 from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.features.methods import FeatureError, root_descriptors
 
@@ -47,6 +47,19 @@ def test_blobs_are_found_in_their_middle(kind: str, blobs: Any) -> None:
     assert len(errors) > 40
     # OpenCV's own SIFT is 0.25 px off to the right and down.
     assert np.abs(np.median(errors, axis=0)).max() < 0.02
+
+
+def test_large_images_are_reduced_and_their_keypoints_are_not(
+    blobs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extraction, "_LONGEST_SIDE", 250)
+    image, middles = blobs
+    found = FeatureExtractor("sift", 1000).extract(image)
+    off = found.pixels[:, None] - middles
+    errors = off[np.arange(len(found)), np.linalg.norm(off, axis=2).argmin(1)]
+    errors = errors[np.linalg.norm(errors, axis=1) < 1.0]
+    assert len(errors) > 30
+    assert np.abs(np.median(errors, axis=0)).max() < 0.05
 
 
 @pytest.mark.parametrize("kind", KINDS)
