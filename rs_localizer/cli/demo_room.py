@@ -35,9 +35,9 @@ _CAMERA = Camera(
     320, 240, np.array([[250.0, 0.0, 159.5], [0.0, 250.0, 119.5], [0.0, 0.0, 1.0]]),
     readout_time=0.03,
 )  # fmt: skip
-_SENSOR = ImageSettings(exposure=0.005, noise=2.0)
+_SENSOR = ImageSettings(noise=2.0)
 _KEYPOINTS = 300
-_WALK, _FLIGHT = Piece(28.0, 11.8, 15.0), Piece(40.0, 8.0, 15.0)
+_WALK, _FLIGHT = Piece(28.0, 11.8, 15.0), Piece(40.0, 8.0, 10.0)
 _EFFORT = Effort(adjusted=60)
 
 

@@ -129,5 +129,6 @@ def localized_picture(
             xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half),
         )  # fmt: skip
         axes.set_title("its way" if near else "the room from above")
-    figure.axes[0].legend(frameon=False, loc="upper right", markerscale=2.0)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
     return figure

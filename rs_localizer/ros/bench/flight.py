@@ -113,8 +113,8 @@ class Flight:
         self._detected: set[int] = set()
         self.heard: dict[str, dict[int, Any]] = {topic: {} for topic in KINDS}
         self.arrivals: dict[int, float] = {}  # of poses, time.monotonic() by stamp
-        for topic, kind in KINDS.items():
-            self._node.create_subscription(kind, topic, self._listener(self.heard[topic]), _QOS)
+        for answer, kind in KINDS.items():
+            self._node.create_subscription(kind, answer, self._listener(self.heard[answer]), _QOS)
         self._node.create_subscription(
             PointCloud2, topic, lambda m: self._detected.add(stamp_ns(m)), _QOS
         )
