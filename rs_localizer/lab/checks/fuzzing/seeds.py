@@ -82,6 +82,18 @@ def camera_info(*, plain: bool = False) -> SimpleNamespace:
     return message
 
 
+def imu() -> SimpleNamespace:
+    """A reading of gyroscope and accelerometer."""
+    turn, force = {"x": 0.1, "y": -0.2, "z": 0.3}, {"x": 0.2, "y": -9.7, "z": 0.4}
+    return SimpleNamespace(
+        header=_header("imu"),
+        angular_velocity=SimpleNamespace(**turn),
+        angular_velocity_covariance=[1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4],
+        linear_acceleration=SimpleNamespace(**force),
+        linear_acceleration_covariance=[0.0] * 9,
+    )
+
+
 @cache
 def _flight() -> tuple[Map, list[SimulatedFrame]]:
     """A small world and some frames of a fast camera."""

@@ -16,6 +16,7 @@ from rs_localizer.io.calibration.files import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.images import read_compressed_image, read_image
+from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import read_keypoints, read_map
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
@@ -105,6 +106,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "keypoints": Target(_messages(keypoints), read_keypoints, message),
         "map_points": Target(_messages(landmarks), read_map, message),
         "camera_info": Target(_messages((seeds.camera_info(),)), _read_camera, message),
+        "imu": Target(_messages((seeds.imu(),)), read_imu, message),
         "image": Target(_messages(pictures), read_image, message),
         "image/compressed": Target(
             _bytes([seeds.compressed(suffix) for suffix in (".png", ".jpg")]),

@@ -1,0 +1,146 @@
+"""Stamps that are off, an IMU that is turned and late, vibration, every scan direction at once.
+
+The world is the test's own: SciPy's rotations, a motion of sines, and a pinhole camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.config import Imu, NodeConfig
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.imu import read_imu
+from rs_localizer.io.outputs import Localized
+from rs_localizer.io.transforms.rigid import Transform, make_transform
+from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.pipeline.frames import FrameLocalizer
+
+Array = NDArray[np.float64]
+
+START_NS = 1_000_000_000_000
+WIDTH, HEIGHT, FOCAL, CENTRE = 640, 480, 450.0, np.array([320.0, 240.0])
+READOUT_TIME, STAMP_OFFSET, IMU_OFFSET = 0.03, 0.005, 0.007  # s
+RATE, IMU_RATE, FRAMES, SETTLED = 30.0, 400.0, 45, 20
+VIBRATION, FREQUENCY = np.radians(0.3), 2.0 * np.pi * 60.0
+CAMERA_FROM_IMU = Rotation.from_euler("xyz", [40, -70, 120], degrees=True)
+BIAS = np.array([0.004, -0.006, 0.005])  # rad/s
+# The camera looks along x of the map, whose z is up.
+FORWARD = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+ROW_TIME: dict[str, Callable[[Array], Array]] = {
+    "top_to_bottom": lambda p: p[:, 1] / (HEIGHT - 1) - 0.5,
+    "bottom_to_top": lambda p: 0.5 - p[:, 1] / (HEIGHT - 1),
+    "left_to_right": lambda p: p[:, 0] / (WIDTH - 1) - 0.5,
+    "right_to_left": lambda p: 0.5 - p[:, 0] / (WIDTH - 1),
+}
+
+
+def map_from_camera(t: Array) -> Rotation:
+    hand = [0.3 * np.sin(2.1 * t), 0.35 * np.cos(1.7 * t), 0.25 * np.sin(2.9 * t)]
+    shaken = [np.sin(FREQUENCY * t), 0.6 * np.cos(FREQUENCY * t), 0.3 * np.sin(FREQUENCY * t + 1)]
+    return FORWARD * Rotation.from_rotvec(np.stack(hand, -1) + VIBRATION * np.stack(shaken, -1))
+
+
+def position(t: Array) -> Array:
+    way: Array = np.stack([0.2 * np.sin(1.3 * t), 0.3 * np.sin(1.9 * t), 0.2 * np.cos(1.1 * t)], -1)
+    return way
+
+
+def turn_rate(t: Array, step: float = 1e-5) -> Array:
+    turn = map_from_camera(t - step).inv() * map_from_camera(t + step)
+    rate: Array = turn.as_rotvec() / (2.0 * step)
+    return rate
+
+
+def velocity(t: Array, step: float = 1e-5) -> Array:
+    way = (position(t + step) - position(t - step)) / (2.0 * step)
+    seen: Array = map_from_camera(t).inv().apply(way)
+    return seen
+
+
+def cloud(seconds: float, direction: str, rng: np.random.Generator) -> object:
+    """Eighty points, a tenth of them wrong, of the image with this stamp."""
+    pixels = rng.uniform([0.0, 0.0], [WIDTH - 1, HEIGHT - 1], (80, 2))
+    middle = seconds + STAMP_OFFSET + 0.5 * READOUT_TIME
+    seen = middle + READOUT_TIME * ROW_TIME[direction](pixels)
+    rays = np.c_[(pixels - CENTRE) / FOCAL, np.ones(80)] * rng.uniform(2.0, 8.0, (80, 1))
+    points = map_from_camera(seen).apply(rays) + position(seen)
+    pixels[:8] = rng.uniform([0.0, 0.0], [WIDTH - 1, HEIGHT - 1], (8, 2))
+    rows = np.empty(80, [(name, "<f8") for name in "xyzuv"])
+    for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
+        rows[name] = column
+    for name in "uv":
+        rows[name] += rng.normal(scale=0.3, size=80)
+    return make_cloud(make_message, START_NS + round(1e9 * seconds), "map", rows)
+
+
+def measured(stamp_ns: int, rate: Array) -> SimpleNamespace:
+    """A sensor_msgs/Imu without accelerometer and covariances."""
+    stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    nothing = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id="imu"),
+        orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=np.zeros(9),
+        angular_velocity=SimpleNamespace(**dict(zip("xyz", map(float, rate), strict=True))),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=nothing,
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+@pytest.mark.parametrize("direction", ROW_TIME)
+def test_pose_and_twist_are_right_whatever_is_turned_or_late(
+    direction: str, make_camera_info: Callable[..., SimpleNamespace]
+) -> None:
+    tree = TransformTree()
+    mounting = Transform(CAMERA_FROM_IMU.as_matrix(), np.array([0.1, 0.2, 0.3]))
+    transform = make_transform(make_message, 0, "camera", "imu", mounting)
+    tree.add(make_message("tf2_msgs/msg/TFMessage", transforms=[transform]), static=True)
+    config = NodeConfig(
+        readout_time=READOUT_TIME,
+        scan_direction=direction,
+        stamp_offset=STAMP_OFFSET,
+        imu=Imu(time_offset=IMU_OFFSET, estimate_time_offset=False),
+    )
+    localizer = FrameLocalizer(config, transforms=tree)
+    K = np.array([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]])
+    localizer.calibrate(read_camera_info(make_camera_info(k=K.ravel())))
+    rng = np.random.default_rng(1)
+    heard, off = -0.8, []
+    for index in range(FRAMES):
+        seconds = index / RATE
+        while heard < seconds + 0.15:
+            now = np.array(heard)
+            noise = rng.normal(scale=2e-4 * np.sqrt(IMU_RATE), size=3)
+            rate = CAMERA_FROM_IMU.inv().apply(turn_rate(now)) + BIAS + noise
+            stamp_ns = START_NS + round(1e9 * (heard - IMU_OFFSET))
+            localizer.imu.add(read_imu(measured(stamp_ns, rate)))
+            heard += 1.0 / IMU_RATE
+        found = localizer.localize(cloud(seconds, direction, rng))
+        assert isinstance(found, Localized), found
+        assert found.twist is not None
+        then = np.array(1e-9 * (found.stamp_ns - START_NS))
+        turn = Rotation.from_matrix(found.pose.rotation) * map_from_camera(then).inv()
+        place, rates = found.pose.position - position(then), found.twist.angular - turn_rate(then)
+        speed = found.twist.linear - velocity(then)
+        pose, twist = np.r_[place, turn.as_rotvec()], np.r_[speed, rates]
+        lengths = [np.linalg.norm(error) for error in (turn.as_rotvec(), place, rates, speed)]
+        surprise = pose @ np.linalg.solve(found.pose.covariance, pose)
+        off.append([*lengths, surprise, twist @ np.linalg.solve(found.twist.covariance, twist)])
+    assert localizer.imu.state is not None
+    assert localizer.imu.state.share > 0.8
+    orientation, metres, angular, linear = np.median(off[SETTLED:], axis=0)[:4]
+    assert np.degrees(orientation) < 0.1
+    assert metres < 0.003
+    # The stamp lies 5 ms before the first row, and the vibration turns at 113 deg/s.
+    assert np.degrees(angular) < 10.0
+    assert linear < 0.1  # m/s
+    assert np.all(np.mean(off[SETTLED:], axis=0)[4:] < 9.0)  # six are expected
