@@ -14,6 +14,7 @@ from rs_localizer.cli import UsageError
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
 from rs_localizer.cli.detect import add_board_arguments, find_map
+from rs_localizer.cli.node_settings import add_settings, settings_of
 from rs_localizer.cli.shots import file_shots
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
@@ -39,7 +40,6 @@ from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
-from rs_localizer.settings import build, load_params_file, parse_assignment
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
@@ -77,15 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
     )
-    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: ROS 2 params file")
-    parser.add_argument(
-        "-p",
-        dest="assignments",
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="one setting; scan_direction gives the axis (its reverse is tried as well)",
-    )
+    add_settings(parser, "scan_direction gives the axis (its reverse is tried as well)")
     topics = parser.add_argument_group("topics of a bag (default: found by name and type)")
     add_topics(topics, but=(IMU,))
     topics.add_argument("--image", metavar="TOPIC")
@@ -133,11 +125,7 @@ def run(args: argparse.Namespace) -> None:
 def _config(args: argparse.Namespace) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    try:
-        values = {} if args.params is None else load_params_file(args.params)
-        return build(values | dict(map(parse_assignment, args.assignments)))
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    return settings_of(args)
 
 
 def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
