@@ -69,7 +69,7 @@ class Localizer:
     def warm_up(self) -> None:
         """Compile every kernel that :meth:`localize` may need, or load it from the cache."""
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
-        count = max(60, self.config.min_inliers)
+        count = max(160, self.config.min_inliers)
         pixels = np.random.default_rng(0).uniform(0.3, 0.7, (count, 2)) * self.camera.size
         rays = np.nan_to_num(self.camera.rays(pixels))
         depth = 2.0 + np.arange(count) % 3

@@ -13,19 +13,23 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.io.yaml_text import YamlError, load_yaml
 
 NODE_NAME = "rs_localizer"
 DETECTOR_NAME = "marker_detector"
-# The settings of each node.
-_NODES: dict[Kind, str] = {NodeConfig: NODE_NAME, DetectorConfig: DETECTOR_NAME}
+FEATURES_NAME = "feature_detector"
+NODES: dict[Kind, str] = {
+    NodeConfig: NODE_NAME,
+    DetectorConfig: DETECTOR_NAME,
+    FeatureConfig: FEATURES_NAME,
+}
 # Parameters that every ROS 2 node may have; they say nothing about poses.
 _FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")
 
 
-Kind = type[NodeConfig] | type[DetectorConfig]
-Config = TypeVar("Config", NodeConfig, DetectorConfig)
+Kind = type[NodeConfig] | type[DetectorConfig] | type[FeatureConfig]
+Config = TypeVar("Config", NodeConfig, DetectorConfig, FeatureConfig)
 _found: dict[Kind, dict[str, Setting]] = {}
 
 
@@ -120,7 +124,7 @@ def load_params_file(path: Path, kind: Kind = NodeConfig) -> dict[str, Any]:
     except (YamlError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
     values: dict[str, Any] = {}
-    node = _NODES[kind]
+    node = NODES[kind]
     blocks = list(_blocks(tree, "", node))
     for name, parameters in blocks:
         if not isinstance(parameters, dict):

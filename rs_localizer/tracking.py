@@ -31,7 +31,7 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.refine import step_between
+from rs_localizer.estimation.refine import inverted, step_between
 from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -221,10 +221,9 @@ def _surprise(prior: Prior, found: Estimate) -> float:
     """
     assert prior.motion is not None
     assert prior.covariance is not None
-    scale = 1.0 / np.sqrt(np.diag(prior.covariance))
-    information = np.linalg.inv(prior.covariance * np.outer(scale, scale)) * np.outer(scale, scale)
+    information = inverted(prior.covariance)
     motion = found.beside_turn()
     step = step_between(state_in(prior.motion, np.zeros(3)), state_in(motion, np.zeros(3)))
     posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
-    expected = PARAMETERS - float(np.einsum("ij,ji->", information, posterior))
+    expected = PARAMETERS - float(np.sum(information * posterior))
     return float(step @ information @ step) / max(expected, 1.0)

@@ -302,12 +302,12 @@ def test_config_and_settings_exclude_each_other():
 
 
 def test_warming_up_compiles_all_that_a_frame_needs():
-    from rs_localizer.estimation import refine, residuals, scoring
+    from rs_localizer.estimation import packing, refine, residuals, scoring
 
     cam = camera()
     localizer = rsl.Localizer(cam, solver="joint")
     localizer.warm_up()
-    kernels = [refine.refine, residuals.pack, residuals.squared_errors, residuals.set_weights,
+    kernels = [refine.refine, packing.pack, residuals.squared_errors, packing.weighted,
                scoring.best_models, scoring.optimize]  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]
     points, pixels, inliers = frame(cam, Path(0), 40, 0.5, 0.2)

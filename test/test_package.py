@@ -107,7 +107,12 @@ def test_declared_commands_can_be_imported(wheel: zipfile.ZipFile) -> None:
     declared = ConfigParser()
     declared.read_string(metadata(wheel, "entry_points.txt"))
     assert declared.sections() == ["console_scripts"]
-    assert set(declared["console_scripts"]) == {"localizer", "marker_detector", "rs_localizer"}
+    assert set(declared["console_scripts"]) == {
+        "localizer",
+        "marker_detector",
+        "feature_detector",
+        "rs_localizer",
+    }
     for name, value in declared["console_scripts"].items():
         assert callable(EntryPoint(name, value, "console_scripts").load()), value
 

@@ -7,7 +7,13 @@ from typing import Any
 
 import pytest
 
-from rs_localizer.config import DetectorConfig, NodeConfig, VelocityPrior, localizer_config
+from rs_localizer.config import (
+    DetectorConfig,
+    FeatureConfig,
+    NodeConfig,
+    VelocityPrior,
+    localizer_config,
+)
 from rs_localizer.settings import (
     SettingsError,
     build,
@@ -44,12 +50,18 @@ def test_the_shipped_file_names_all_choices() -> None:
         assert all(choice in line for choice in setting.choices), name
 
 
-def test_the_detectors_file_holds_exactly_its_defaults_and_choices() -> None:
-    path = SHIPPED.with_name("marker_detector.yaml")
-    values = load_params_file(path, DetectorConfig)
-    known = settings(DetectorConfig)
+@pytest.mark.parametrize(
+    ("file", "kind"),
+    [("marker_detector.yaml", DetectorConfig), ("feature_detector.yaml", FeatureConfig)],
+)
+def test_the_detectors_files_hold_exactly_their_defaults_and_choices(
+    file: str, kind: type[DetectorConfig] | type[FeatureConfig]
+) -> None:
+    path = SHIPPED.with_name(file)
+    values = load_params_file(path, kind)
+    known = settings(kind)
     assert values == {name: setting.default for name, setting in known.items()}
-    assert build(values, DetectorConfig) == DetectorConfig()
+    assert build(values, kind) == kind()
     lines = [line.strip() for line in path.read_text().splitlines()]
     for name, setting in known.items():
         line = next(line for line in lines if line.startswith(f"{name}:"))

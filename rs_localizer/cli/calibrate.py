@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
-from rs_localizer.cli.detect import add_board_arguments, find_map
-from rs_localizer.cli.node_settings import add_settings, settings_of
+from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
+from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.shots import file_shots
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
@@ -49,11 +50,12 @@ from rs_localizer.trajectory.observe import Observed, in_order
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "recording",
+        "recordings",
         type=Path,
+        nargs="+",
         metavar="RECORDING",
         help="a bag of correspondences or keypoints; or, with --map or --board, images: a video, "
-        "a folder, a bag",
+        "a folder, a bag; several: see many recordings",
     )
     above = number(0.0, above=True)
     parser.add_argument(
@@ -82,9 +84,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_topics(topics, but=(IMU,))
     topics.add_argument("--image", metavar="TOPIC")
     parser.add_argument(
-        "--out", type=Path, metavar="FILE.yaml", help="parameters for node and replay --params"
+        "--out",
+        type=Path,
+        metavar="FILE.yaml",
+        help="parameters for node and replay --params; of many recordings, a directory",
     )
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="directory for pictures")
+    parser.add_argument(
+        "--plots",
+        type=Path,
+        metavar="DIR",
+        help="directory for pictures; of many recordings, its name in the folder of each",
+    )
+    add_fleet_arguments(parser)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +109,15 @@ class _Source:
 
 
 def run(args: argparse.Namespace) -> None:
+    if is_fleet(args):
+        given_settings(args)  # refuses wrong ones before there are workers
+        many.calibrate(args)
+    else:
+        calibrate_one(argparse.Namespace(**vars(args), recording=args.recordings[0]))
+
+
+def calibrate_one(args: argparse.Namespace) -> Calibration:
+    """Calibrate with one recording, and say what was found."""
     config = _config(args)
     source = _read(args, config)
     intrinsics, camera = args.intrinsics or source.camera is None, source.camera
@@ -120,12 +140,13 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(refusal)
     if args.out is not None:
         _write(found, args.out, intrinsics, config)
+    return found
 
 
 def _config(args: argparse.Namespace) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    return settings_of(args)
+    return given_settings(args)
 
 
 def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:

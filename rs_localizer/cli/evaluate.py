@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rs_localizer.cli import UsageError, many
+from rs_localizer.cli.fleet import add_fleet_arguments
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
@@ -42,8 +45,22 @@ def _offset_argument(text: str) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = "TUM text, a directory of replay, or a recording"
-    parser.add_argument("estimate", type=Path, metavar="EST", help=source)
-    parser.add_argument("truth", type=Path, metavar="TRUTH", help=source)
+    parser.add_argument(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="EST",
+        help=f"{source}; then TRUTH, another one, unless --truths has that of many",
+    )
+    parser.add_argument(
+        "--truths",
+        type=Path,
+        metavar="DIR",
+        help="of many estimates: the directory that holds the truth of each, by the same name",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="of many estimates: directory for the results"
+    )
     parser.add_argument("--twists", type=Path, metavar="FILE", help="estimated twists as text")
     parser.add_argument("--truth-twists", type=Path, metavar="FILE", help="true twists as text")
     topics = parser.add_argument_group("topics of recordings (default: the only one of the type)")
@@ -70,10 +87,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also ATE and RPE, after alignment by positions and orientations (needs evo)",
     )
-    parser.add_argument("--plot", type=Path, metavar="DIR", help="draw trajectories and errors")
+    parser.add_argument(
+        "--plot",
+        type=Path,
+        metavar="DIR",
+        help="draw trajectories and errors; of many estimates, its name in the folder of each",
+    )
+    add_fleet_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> None:
+    if args.truths is not None:
+        many.evaluate(args)
+        return
+    if len(args.recordings) != 2:
+        raise UsageError("give EST and TRUTH, or estimates and --truths DIR")
+    if args.out is not None or args.workers is not None or args.scheduler is not None:
+        raise UsageError("--out, --workers and --scheduler go with --truths")
+    estimate, truth = args.recordings
+    evaluate_one(argparse.Namespace(**vars(args), estimate=estimate, truth=truth))
+
+
+def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
+    """Compare one estimate with its truth; print and draw it."""
     estimate = _read(args.estimate, args.pose_topic, args.twist_topic, args.twists)
     truth = _read(args.truth, args.truth_pose_topic, args.truth_twist_topic, args.truth_twists)
     found = estimate_offset(estimate.poses, truth.poses)
@@ -103,6 +139,7 @@ def run(args: argparse.Namespace) -> None:
         _print_ate(estimate.poses, truth.poses, tolerance_ns)
     if args.plot is not None:
         _plot(args.plot, estimate.poses, truth.poses, poses, twists)
+    return poses, twists
 
 
 def _offset(given: str, found: TimeOffset | None) -> float:
@@ -189,15 +226,20 @@ def _read(
     return found if twists is None else Motions(found.poses, read_twists(twists))
 
 
-def _print_table(poses: Errors, twists: Errors | None) -> None:
+def named_errors(poses: Errors, twists: Errors | None) -> list[tuple[str, Array]]:
+    """The errors (n,) of each quantity by its name and unit."""
     rows = [("position (m)", poses.linear), ("orientation (deg)", poses.angular)]
     if twists is not None:
         rows += [
             ("angular velocity (deg/s)", twists.angular),
             ("linear velocity (m/s)", twists.linear),
         ]
+    return rows
+
+
+def _print_table(poses: Errors, twists: Errors | None) -> None:
     print(f"{'error':26}{'count':>8}{'median':>11}{'mean':>11}{'95 %':>11}{'largest':>11}")
-    for name, errors in rows:
+    for name, errors in named_errors(poses, twists):
         print(_row(name, summarize(errors)))
 
 

@@ -84,6 +84,18 @@ COMMANDS = {
         "what a map of landmarks holds; one file from another: COLMAP, PLY, NPZ",
         "rs_localizer map convert sparse/0 map.npz",
     ),
+    "watch": Command(
+        "rs_localizer.cli.watch",
+        "how a live localizer is: rate, pose, speeds, deviations, state; refreshed in place",
+        "rs_localizer watch front/rs_localizer",
+    ),
+    "localize-hloc": Command(
+        "rs_localizer.cli.localize_hloc",
+        "poses and velocities of what hloc has matched, with the rolling shutter",
+        "rs_localizer localize-hloc --reference-sfm sfm --queries queries.txt "
+        "--retrieval pairs.txt --features features.h5 --matches matches.h5 --results poses.txt "
+        "-p readout_time:=0.03",
+    ),
     "warm": Command(
         "rs_localizer.cli.warm",
         "compile all kernels now, for images and installers; the first start is then as any other",

@@ -11,7 +11,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, many
+from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
+from rs_localizer.cli.replay_exports import add_export_arguments, write_exports
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -24,6 +26,7 @@ from rs_localizer.cli.replay_result import (
 )
 from rs_localizer.cli.replay_ros import play
 from rs_localizer.cli.replay_summary import Tally, print_summary
+from rs_localizer.cli.replay_view import add_view_arguments, check_view, open_viewer, write_file
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
@@ -46,7 +49,11 @@ from rs_localizer.settings import build, load_params_file, parse_assignment
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "bag", type=Path, metavar="BAG", help="rosbag2 (MCAP, sqlite3) or ROS 1 bag"
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="rosbag2 (MCAP, sqlite3) or ROS 1 bag; several: see many recordings",
     )
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
     add_topics(topics)
@@ -61,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR",
         help=f"directory to create, for {POSES} (TUM), {TWISTS} and the bag {RESULT} "
-        "(default: BAG_replay)",
+        "(default: RECORDING_replay)",
     )
     offline.add_argument("--overwrite", action="store_true", help="replace an earlier result")
     offline.add_argument(
@@ -87,6 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="one motion through all images, from those before and after each; images without a "
         f"pose are bridged where their neighbours determine them, and listed in {BRIDGED}",
     )
+    add_export_arguments(offline)
     offline.add_argument("--storage", choices=list(STORAGES), default="mcap")
     graph = parser.add_argument_group("through the ROS graph")
     graph.add_argument(
@@ -101,48 +109,72 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="times real time, with --ros (default: 1); with --smooth: samples of the motion, Hz "
         "(default: one for each image)",
     )
+    add_view_arguments(parser)
+    add_fleet_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> None:
     _check_usage(args)
-    if not is_bag(args.bag) and (pictures := holds_images(args.bag)):
-        raise ValueError(f"{args.bag} {pictures}, not matches: first {_detect_command(args.bag)}")
-    named = given_topics(args)
+    check_view(args)
+    if is_fleet(args):
+        many.replay(args, settings_of(args))
+        return
+    recording: Path = args.recordings[0]
     if args.ros:
-        with open_bag(args.bag) as bag:
+        _refuse_images(recording)
+        with open_bag(recording) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
-            topics = None if only_images else find_topics(bag, named)
+            topics = None if only_images else find_topics(bag, given_topics(args))
             play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return
+    out = args.out or Path(f"{recording.resolve().with_suffix('').name}_replay")
+    replay_one(args, recording, out)
+
+
+def settings_of(args: argparse.Namespace) -> NodeConfig:
+    """The settings that the arguments give; refuses those that cannot be."""
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
-    config = _config(args.params, args.assignments + given)
+    return _config(args.params, args.assignments + given)
+
+
+def _refuse_images(recording: Path) -> None:
+    if not is_bag(recording) and (pictures := holds_images(recording)):
+        raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
+
+
+def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool = True) -> Tally:
+    """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
+    _refuse_images(recording)
+    config = settings_of(args)
     notices: Counter[str] = Counter()
-    with open_bag(args.bag) as bag:
+    with open_bag(recording) as bag:
         if image_topics(bag) and not has_frames(bag):
             raise ValueError(
-                f"{args.bag} holds images, not matches: first {_detect_command(args.bag)}"
+                f"{recording} holds images, not matches: first {_detect_command(recording)}"
             )
-        topics = find_topics(bag, named)
+        topics = find_topics(bag, given_topics(args))
         if args.no_imu or config.imu.use == ImuUse.NONE:
             topics = topics.without(IMU)
         elif IMU not in topics.of and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with --imu")
         if topics.lacks_map and not config.map_file:
-            raise ValueError(f"{args.bag} has {topics.frames} and no map; give one with --map")
+            raise ValueError(f"{recording} has {topics.frames} and no map; give one with --map")
         transforms = find_transforms(bag, topics, config)
         localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
         localizer.load_map()
         if args.smooth and config.readout_time == 0.0:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
-        out = args.out or Path(f"{args.bag.resolve().with_suffix('').name}_replay")
         with fresh(out, args.overwrite):
-            _hint(args.bag, args.params)
+            _hint(recording, args.params)
             tally = _replay(bag, topics, localizer, notices, out, args)
-        _tell(tally, config, out)
+            write_file(args, bag, topics, localizer, tally, out)
+        _tell(tally, config, out, timed)
+        open_viewer(args, bag, topics, localizer, tally)
         if not tally.frames:
             raise ValueError(
                 f"no frame of {bag.path} was localized; of the last one, {tally.last_refusal}"
             )
+    return tally
 
 
 def _detect_command(path: Path) -> str:
@@ -152,7 +184,8 @@ def _detect_command(path: Path) -> str:
     seen = shlex.quote(f"{path.resolve().with_suffix('').name}_seen")
     return (
         f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {seen} (or --board "
-        f"6x4 --square 0.03 instead of --map), then: rs_localizer replay {seen}"
+        "6x4 --square 0.03, or --features sift, instead of --map), then: rs_localizer replay "
+        f"{seen}"
     )
 
 
@@ -171,16 +204,20 @@ def _check_usage(args: argparse.Namespace) -> None:
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
     if not args.ros:
+        if args.rate is not None and args.nerfstudio:
+            raise UsageError("--nerfstudio is of images, --rate of samples between them")
         if args.rate is not None and not args.smooth:
             raise UsageError(
                 "--rate goes with --ros or --smooth; offline replay runs at full speed"
             )
         return
+    if is_fleet(args):
+        raise UsageError("--ros plays one recording, and needs no workers")
     given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
-    if any(given):
+    if any((*given, args.rows, args.nerfstudio)):
         raise UsageError(
-            "--out, --overwrite, --params, --map, --smooth and -p are for offline replay; with "
-            "--ros the running node has the settings and publishes the result"
+            "--out, --overwrite, --params, --map, --row, --nerfstudio, --smooth and -p are for "
+            "offline replay; with --ros the running node has the settings and publishes the result"
         )
 
 
@@ -241,11 +278,12 @@ def _replay(
     tally.seconds = time.perf_counter() - start
     tally.imu = localizer.imu.state
     tally.repeated = write_texts(out, tally.written, localizer.config)
+    write_exports(args, bag, localizer, tally.written, out)
     return tally
 
 
-def _tell(tally: Tally, config: NodeConfig, out: Path) -> None:
-    print_summary(tally, config)
+def _tell(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
+    print_summary(tally, config, timed)
     moving = any(frame.twist for frame in tally.written)
     if tally.frames and not moving:
         print(f"no twists: {_why_no_twists(config)}")

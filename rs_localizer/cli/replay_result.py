@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rs_localizer.cli.replay_exports import written_names
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
@@ -25,6 +26,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import NODE_NAME
 
 POSES, TWISTS, RESULT, BRIDGED = "poses.txt", "twists.txt", "result", "bridged.txt"
+VIEW = "view.rrd"
 """What replay writes into its output directory."""
 
 
@@ -51,8 +53,10 @@ def fresh(out: Path, overwrite: bool) -> Iterator[None]:
 
 
 def _remove_results(out: Path) -> None:
-    for name in (POSES, TWISTS, BRIDGED):
+    for name in (POSES, TWISTS, BRIDGED, VIEW):
         (out / name).unlink(missing_ok=True)
+    for path in written_names(out):
+        path.unlink(missing_ok=True)
     shutil.rmtree(out / RESULT, ignore_errors=True)
 
 

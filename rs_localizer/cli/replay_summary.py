@@ -13,6 +13,7 @@ from rs_localizer.cli.replay_result import BRIDGED
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.image_clock import readout_fault
 from rs_localizer.io.outputs import Localized
+from rs_localizer.offline.fleet.task import Figures
 from rs_localizer.offline.smoothed import SmoothedFrames
 from rs_localizer.pipeline.imu import ImuState
 from rs_localizer.pipeline.reasons import explained
@@ -44,8 +45,27 @@ class Tally:
         return self.smoothed.frames if self.smoothed else self.frames
 
 
-def print_summary(tally: Tally, config: NodeConfig) -> None:
-    """Print it as a table, the reasons of refusals explained below."""
+def figures(tally: Tally) -> Figures:
+    """What the summary of many recordings says of this one."""
+    estimates = [frame.estimate for frame in tally.frames]
+    return {
+        "frames": tally.total,
+        "localized": len(estimates),
+        "residual (px)": float(np.median([estimate.residual_rms for estimate in estimates])),
+        "inliers": float(np.median([np.count_nonzero(it.inliers) for it in estimates])),
+        "with twist": sum(frame.twist is not None for frame in tally.frames),
+        "mostly refused for": next((reason for reason, _ in tally.refused.most_common(1)), ""),
+    }
+
+
+def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
+    """Print it as a table, the reasons of refusals explained below.
+
+    Args:
+        tally: what became of the frames.
+        config: the settings.
+        timed: whether to say how fast, which is never the same twice.
+    """
     frames = tally.frames
     rows: list[tuple[str, str]] = [("frames", str(tally.total)), ("localized", str(len(frames)))]
     rows += [(f"  refused: {reason}", str(n)) for reason, n in tally.refused.most_common()]
@@ -60,7 +80,8 @@ def print_summary(tally: Tally, config: NodeConfig) -> None:
     ):
         rows += [(name, str(count))] if count else []
     rows += _quality(frames, config) + _inertial(tally.imu)
-    rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
+    if timed:
+        rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
     if tally.smoothed:
         rows += _smoothing(tally.smoothed)
     for name, text in rows:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 
 from rs_localizer.config import NodeConfig
+from rs_localizer.core.lanes import shipped
 from rs_localizer.core.lanes.jit import cache_directory
 from rs_localizer.markers import detection
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -45,4 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
             except RuntimeWarning as warning:
                 raise OSError(str(warning)) from warning
             print(f"{name:20} {time.monotonic() - started:6.1f} s", flush=True)
-    print(f"kernels are in {cache_directory()}")
+    places = f"{cache_directory()}"
+    if shipped.FOLDER.is_dir():
+        places = f"{shipped.FOLDER}, and what it has not for this CPU in {places}"
+    print(f"kernels are in {places}")

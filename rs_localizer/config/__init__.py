@@ -7,6 +7,12 @@ ranges here are what users see in ``ros2 param describe``.
 from rs_localizer.config.declared import (
     type_of,
 )
+from rs_localizer.config.detectors import (
+    DetectorConfig,
+    FeatureConfig,
+    FeatureKind,
+    ImageTransport,
+)
 from rs_localizer.config.method import (
     Acceleration,
     LocalizerConfig,
@@ -15,21 +21,23 @@ from rs_localizer.config.method import (
 )
 from rs_localizer.config.nodes import (
     LONGEST_READOUT_TIME,
-    DetectorConfig,
-    ImageTransport,
     Imu,
     ImuUse,
     MatchBy,
     Matching,
     NodeConfig,
+    OrientationCovariance,
     PoseTime,
     PublishTf,
+    Px4Odometry,
 )
 
 __all__ = [
     "LONGEST_READOUT_TIME",
     "Acceleration",
     "DetectorConfig",
+    "FeatureConfig",
+    "FeatureKind",
     "ImageTransport",
     "Imu",
     "ImuUse",
@@ -37,8 +45,10 @@ __all__ = [
     "MatchBy",
     "Matching",
     "NodeConfig",
+    "OrientationCovariance",
     "PoseTime",
     "PublishTf",
+    "Px4Odometry",
     "VelocityPrior",
     "localizer_config",
     "type_of",

@@ -25,6 +25,21 @@ class PublishTf(StrEnum):
     MAP_TO_ODOM = "map_to_odom"
 
 
+class OrientationCovariance(StrEnum):
+    """What the covariances of published orientations are about."""
+
+    FIXED_AXES = "fixed_axes"
+    ROLL_PITCH_YAW = "roll_pitch_yaw"
+
+
+class Px4Odometry(StrEnum):
+    """Axes of the world in which PX4 gets its external vision, if it does."""
+
+    NONE = "none"
+    FRD = "frd"
+    NED = "ned"
+
+
 class MatchBy(StrEnum):
     """What keypoints and landmarks are compared by."""
 
@@ -189,6 +204,19 @@ class NodeConfig(LocalizerConfig):
         "map_to_odom: REP-105, needs odometry on TF",
         choices=tuple(choice.value for choice in PublishTf),
     )
+    orientation_covariance: str = setting(
+        OrientationCovariance.FIXED_AXES.value,
+        "What covariances of poses are about; fixed_axes: rotations about those of the map, as "
+        "REP-103 has it; roll_pitch_yaw: these angles, as robot_localization reads them",
+        choices=tuple(choice.value for choice in OrientationCovariance),
+    )
+    px4_odometry: str = setting(
+        Px4Odometry.NONE.value,
+        "External vision of PX4 on ~/vehicle_odometry; frd: the map has z up; ned: it has x east, "
+        "y north, z up; needs px4_msgs and base_frame",
+        choices=tuple(choice.value for choice in Px4Odometry),
+        fixed=True,
+    )
     transform_tolerance: float = setting(
         0.2,
         "How long to wait for a transform that is not there yet, and how far map_to_odom is "
@@ -223,56 +251,13 @@ class NodeConfig(LocalizerConfig):
         for name in ("odom_frame", "map_frame"):
             if not getattr(self, name):
                 raise ValueError(f"{name} must not be empty")
+        if self.px4_odometry != Px4Odometry.NONE and not self.base_frame:
+            raise ValueError(
+                f"px4_odometry {self.px4_odometry} needs base_frame, a body with x forward, y left "
+                "and z up: PX4 would take the camera's axes for its own"
+            )
+        fixed = self.orientation_covariance == OrientationCovariance.FIXED_AXES
+        if self.px4_odometry != Px4Odometry.NONE and not fixed:
+            raise ValueError("px4_odometry needs orientation_covariance fixed_axes")
         if self.base_frame == self.odom_frame:
             raise ValueError(f"base_frame and odom_frame are both {self.odom_frame!r}")
-
-
-class ImageTransport(StrEnum):
-    """Which image topic the marker detector listens to."""
-
-    AUTO = "auto"
-    RAW = "raw"
-    COMPRESSED = "compressed"
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorConfig:
-    """Settings of the marker detector."""
-
-    marker_map: str = setting(
-        "", "File of the marker map; rs_localizer markers make writes one with the prints"
-    )
-    min_side: float = setting(
-        10.0,
-        "Markers with a shorter side than this, in px, are left out",
-        minimum=0.0,
-        maximum=10000.0,
-    )
-    transport: str = setting(
-        ImageTransport.AUTO.value,
-        "Topic of the images; auto: image if it has a publisher, otherwise image/compressed",
-        choices=tuple(transport.value for transport in ImageTransport),
-        read_only=True,
-    )
-    readout_time: float = setting(
-        0.0,
-        "Only for the debug image: time from the first to the last row, in s, as the localizer's",
-        minimum=0.0,
-        maximum=0.2,
-    )
-    scan_direction: str = setting(
-        ScanDirection.TOP_TO_BOTTOM.value,
-        "Only for the debug image: direction in which the shutter moves, as the localizer's",
-        choices=tuple(direction.value for direction in ScanDirection),
-    )
-    stamp_offset: float = setting(
-        0.0,
-        "Only for the debug image: time from header.stamp to the middle of the exposure of the "
-        "first row, in s, as the localizer's",
-        minimum=-10.0,
-        maximum=10.0,
-    )
-    autostart: bool = setting(True, "Configure and activate the node at start", read_only=True)
-
-    def __post_init__(self) -> None:
-        check(self)

@@ -242,7 +242,7 @@ class Camera:
         rays = np.full(sensor.shape, np.nan)
         if np.any(usable):
             rays[usable] = self._undistort(sensor[usable])
-        back, jacobian = self._distort(rays)
+        back, jacobian = self.distort(rays)
         lost = ~(np.abs(back - pixels).max(axis=1) < _ROUND_TRIP_TOLERANCE)
         rays[lost] = np.nan
         return rays, jacobian
@@ -251,11 +251,11 @@ class Camera:
         """Raw pixels (n,2) of points (n,3) in the camera frame; NaN behind the camera."""
         points = np.asarray(points, float)
         depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-        return self._distort(points[:, :2] / depth[:, None])[0]
+        return self.distort(points[:, :2] / depth[:, None])[0]
 
     def pixel_jacobian(self, rays: Array) -> Array:
         """Derivatives (n,2,2) of the raw pixel by the ray at rays (n,2)."""
-        return self._distort(np.asarray(rays, float))[1]
+        return self.distort(np.asarray(rays, float))[1]
 
     def inside(self, pixels: Array) -> NDArray[np.bool_]:
         """Which raw pixels (n,2) lie in the delivered image."""
@@ -273,7 +273,7 @@ class Camera:
             rays = cv2.undistortPoints(points, K, D, criteria=_UNDISTORT_CRITERIA)
         return np.asarray(rays[:, 0], np.float64)
 
-    def _distort(self, rays: Array) -> tuple[Array, Array]:
+    def distort(self, rays: Array) -> tuple[Array, Array]:
         """Raw pixels (n,2) of rays (n,2), and their derivatives (n,2,2) by the ray."""
         count = len(rays)
         if len(self.D) == 0 or count == 0:

@@ -96,6 +96,8 @@ def log(matrix: Array) -> Array:
 def hat(vector: Array) -> Array:
     """Skew matrices (..., 3, 3) with ``hat(v) @ x == cross(v, x)`` of vectors (..., 3)."""
     vector = np.asarray(vector, float)
+    if vector.ndim == 1:
+        return _hat(vector)
     matrix = np.zeros((*vector.shape, 3))
     matrix[..., 0, 1], matrix[..., 0, 2] = -vector[..., 2], vector[..., 1]
     matrix[..., 1, 0], matrix[..., 1, 2] = vector[..., 2], -vector[..., 0]
@@ -108,9 +110,29 @@ def right_jacobian(vector: Array) -> Array:
 
     ``exp(a + d) = exp(a) exp(right_jacobian(a) d)`` to first order.
     """
-    _, second, third = coefficients(float(vector @ vector))
-    cross = hat(vector)
-    jacobian: Array = np.eye(3) - second * cross + third * cross @ cross
+    return _right_jacobian(np.asarray(vector, float))
+
+
+@kernel
+def _hat(vector: Array) -> Array:
+    matrix = np.zeros((3, 3))
+    matrix[0, 1], matrix[0, 2] = -vector[2], vector[1]
+    matrix[1, 0], matrix[1, 2] = vector[2], -vector[0]
+    matrix[2, 0], matrix[2, 1] = -vector[1], vector[0]
+    return matrix
+
+
+@kernel
+def _right_jacobian(vector: Array) -> Array:
+    x, y, z = vector[0], vector[1], vector[2]
+    _, second, third = coefficients(x * x + y * y + z * z)
+    jacobian = np.empty((3, 3))
+    jacobian[0, 0] = 1.0 - third * (y * y + z * z)
+    jacobian[1, 1] = 1.0 - third * (x * x + z * z)
+    jacobian[2, 2] = 1.0 - third * (x * x + y * y)
+    jacobian[0, 1], jacobian[1, 0] = third * x * y + second * z, third * x * y - second * z
+    jacobian[0, 2], jacobian[2, 0] = third * x * z - second * y, third * x * z + second * y
+    jacobian[1, 2], jacobian[2, 1] = third * y * z + second * x, third * y * z - second * x
     return jacobian
 
 

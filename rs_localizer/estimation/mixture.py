@@ -17,7 +17,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
 from rs_localizer.estimation.mirror import mirrored
-from rs_localizer.estimation.model_error import Examined, examine
+from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, Posterior, fit
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside, slower_terms
@@ -90,6 +90,15 @@ class Inliers:
             self.field_sizes, self.field_prior,
         )  # fmt: skip
         return found
+
+    def gain_of_shaking(self, state: Array, terms: PriorTerms, degree: int) -> float:
+        """Logarithm of how much better shaking, up to a degree, explains the errors than none."""
+        observations = self.observations
+        gain: float = gain_of_shaking(
+            observations.packed, state, observations.row_time_gradient, observations.rays,
+            self.inliers, terms, degree, self.freedom, self.noise,
+        )  # fmt: skip
+        return gain
 
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> Mode:
         """The Gaussian about the best motion of a typical speed."""

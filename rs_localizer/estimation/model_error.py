@@ -17,9 +17,15 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.shake import FIRST_DEGREE
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import Columns, columns_of, with_prior
-from rs_localizer.estimation.evidence import Sizes, sizes_of
+from rs_localizer.estimation.evidence import (
+    Sizes,
+    evidence_of_sizes,
+    project_out,
+    sizes_of,
+)
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
@@ -33,6 +39,8 @@ _CHANCE = 1.5
 _MOST_SHARED = 0.9
 # Of the diagonal: what nothing determines has an inverse.
 RIDGE = 1.0 + 1e-14
+# Sizes of shaking to try, as parts of the deviation to which a frame tells its coefficients.
+_TRIED = np.array([1e-3, 0.3, 0.6, 1.2, 2.5, 10.0])
 
 
 @kernel
@@ -187,3 +195,41 @@ def examine(
     shared = shared_errors(errors, rays, inliers) if sizes.no_field < _NO_FIELD else 0.0
     determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
     return Examined(step, covariance, sizes, agreement, shared, determined)
+
+
+@kernel
+def gain_of_shaking(
+    data: Array, state: Array, gradient: Array, rays: Array, inliers: BoolArray,
+    prior: PriorTerms, degrees: int, freedom: float, noise: float,
+) -> float:  # fmt: skip
+    """How much better shaking of some size, alike at all degrees, explains the errors than none.
+
+    The logarithm of the ratio of their likelihoods, by one linear solve; errors of map and lens
+    count as shaking, too.
+
+    Args:
+        data, state, ...: as of :func:`examine`; degrees of the shaking, 2 at least.
+    """
+    count = len(rays)
+    errors, by_motion, by_turn, tau = linearized(data, count, state, gradient, np.zeros((count, 6)))
+    columns = columns_of(errors, by_motion, by_turn, tau, rays, inliers, degrees, False)
+    columns = with_prior(columns, prior, state, noise)
+    found = project_out(
+        columns.products, columns.with_errors, columns.squared_errors, columns.shake
+    )
+    known = 0.0
+    for i in range(columns.shake):
+        size = _size_of(i // 3)
+        found.with_errors[i] /= size
+        for j in range(i + 1):
+            found.products[i, j] /= size * _size_of(j // 3)
+        known += found.products[i, i]
+    typical = noise * np.sqrt(columns.shake / known)
+    evidence, _ = evidence_of_sizes(found, typical * _TRIED, freedom, noise)
+    gain: float = np.max(evidence) - evidence[0]
+    return gain
+
+
+@kernel
+def _size_of(polynomial: int) -> float:
+    return (3.0 / (FIRST_DEGREE + polynomial)) ** 2

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.estimation.residuals import pack, row_paces, squared_errors, thin
+from rs_localizer.estimation.packing import pack, thin
+from rs_localizer.estimation.residuals import row_paces, squared_errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,10 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.packing import weighted
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import inverted, refine, smallest_eigenvalue
-from rs_localizer.estimation.residuals import set_weights, squared_errors
+from rs_localizer.estimation.refine import EXPECTED_NOISE, inverted, refine, smallest_eigenvalue
+from rs_localizer.estimation.residuals import squared_errors
 
 # Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
 # distributed errors); the threshold is widened for them at most twofold.
@@ -144,7 +145,7 @@ def _rounds(
         the parameters that the points decide (the prior takes its part of them).
     """
     # From the wide side: a start that fits few points well would see little noise and keep few.
-    state, gate, noise, freedom = start, WIDEST_GATE * threshold, 0.5 * threshold, 0.0
+    state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
     cost = 0.0
     errors = squared_errors(data, count, state, gradient)
     weights = np.empty(count)
@@ -152,16 +153,22 @@ def _rounds(
     for _ in range(_ROUNDS):
         for i in range(count):
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
-        set_weights(data, weights)
         state, information, cost, _ = refine(
-            data, state, gradient, _NO_SCALE, 0.0, prior, noise, 2, _ITERATIONS, _TOLERANCE
+            weighted(data, weights),
+            state,
+            gradient,
+            _NO_SCALE,
+            0.0,
+            prior,
+            noise,
+            2,
+            _ITERATIONS,
+            _TOLERANCE,
         )
         errors = squared_errors(data, count, state, gradient)
         freedom = decided(information, prior, noise)
         noise = noise_deviation(errors, gate, freedom)
         gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
-    weights[:] = 1.0
-    set_weights(data, weights)
     return state, information, cost, errors, noise, gate, freedom
 
 
@@ -199,9 +206,8 @@ def fit(
     observations: Observations, start: Array, inliers: BoolArray, prior: PriorTerms, noise: float
 ) -> tuple[Array, Array, float, bool]:
     """Refine a state (24,) on some of the points (see :func:`.refine.refine`)."""
-    set_weights(observations.packed, inliers.astype(np.float64))
     fitted: tuple[Array, Array, float, bool] = refine(
-        observations.packed,
+        weighted(observations.packed, inliers.astype(np.float64)),
         start,
         observations.row_time_gradient,
         _NO_SCALE,
@@ -212,5 +218,4 @@ def fit(
         _ITERATIONS,
         _TOLERANCE,
     )
-    set_weights(observations.packed, np.ones(len(observations)))
     return fitted

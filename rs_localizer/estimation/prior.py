@@ -18,6 +18,12 @@ from rs_localizer.core.state import (
 _LEAST_DEVIATION = 1e-9
 # Numbers whose squares are finite.
 _MOST = 1e100
+_OF_MOTION = (
+    "rotation", "translation", "angular_velocity", "linear_velocity",
+    "angular_acceleration", "linear_acceleration",
+)  # fmt: skip
+# Least eigenvalue of a covariance scaled to a unit diagonal.
+_LEAST_EIGENVALUE = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,18 +80,18 @@ class Prior:
 
 
 def _check_motion(motion: Motion) -> None:
-    for name in (
-        "rotation", "translation", "angular_velocity", "linear_velocity",
-        "angular_acceleration", "linear_acceleration",
-    ):  # fmt: skip
+    for name in _OF_MOTION:
         shape = (3, 3) if name == "rotation" else (3,)
         if np.shape(getattr(motion, name)) != shape:
             raise ValueError(
                 f"the prior motion's {name} must be of shape {shape}, "
                 f"got {np.shape(getattr(motion, name))}"
             )
-        if not np.all(np.abs(getattr(motion, name)) < _MOST):
-            raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
+    # All at once: each frame has one.
+    numbers = np.concatenate([np.ravel(getattr(motion, name)) for name in _OF_MOTION])
+    if not np.abs(numbers).max() < _MOST:
+        name = next(n for n in _OF_MOTION if not np.all(np.abs(getattr(motion, n)) < _MOST))
+        raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
     rotation = np.asarray(motion.rotation)
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if off > 1e-6 or np.linalg.det(rotation) < 0.0:
@@ -98,14 +104,19 @@ def _check_covariance(covariance: Array) -> None:
     known = ~np.isinf(np.diag(covariance))
     if not np.any(known):
         return  # everything is free: the motion is only a first guess
-    block = covariance[np.ix_(known, known)]
+    block = covariance if np.all(known) else covariance[np.ix_(known, known)]
     if not np.all(np.isfinite(block)):
         raise ValueError("covariance must be finite where its diagonal is")
-    scale = np.sqrt(np.abs(np.diag(block)))
-    if not np.all(np.abs(block - block.T) <= 1e-6 * np.outer(scale, scale)):
+    variances = np.diag(block)
+    scale = np.sqrt(np.abs(np.outer(variances, variances)))
+    if not np.all(np.abs(block - block.T) <= 1e-6 * scale):
         raise ValueError("covariance must be symmetric")
-    if not np.all(scale > 0.0) or np.linalg.eigvalsh(block / np.outer(scale, scale))[0] < 1e-12:
-        raise ValueError("covariance must be positive definite")
+    try:
+        if not np.all(variances > 0.0):
+            raise np.linalg.LinAlgError
+        np.linalg.cholesky(block / scale - _LEAST_EIGENVALUE * np.eye(len(block)))
+    except np.linalg.LinAlgError:
+        raise ValueError("covariance must be positive definite") from None
 
 
 def state_in(motion: Motion, centre: Array) -> Array:

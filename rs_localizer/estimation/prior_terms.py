@@ -154,6 +154,8 @@ def _unit(vector: ArrayLike) -> Array:
 
 def _inverse(covariance: Array) -> Array:
     """Information (18,18) of a covariance, zero for parameters of infinite variance."""
+    if len(covariance) == PARAMETERS and np.isfinite(covariance).all():
+        return np.asarray(np.linalg.inv(covariance), np.float64)
     information = np.zeros((PARAMETERS, PARAMETERS))
     known = np.flatnonzero(np.isfinite(np.diag(covariance)))
     block = np.ix_(known, known)

@@ -59,36 +59,40 @@ class Candidate:
 NOTHING = Candidate(np.zeros(STATE_SIZE), math.inf)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Draws:
+    """Where samples come from, and how many there may be."""
+
+    rotations: Sequence[Array]  # (3,3) to start from, in turn
+    pools: Sequence[Pool]
+    confidence: float
+    most: int
+    random: Random
+
+
 def search(
-    observations: Observations,
-    hypotheses: Hypotheses,
-    rotations: Sequence[Array],
-    pools: Sequence[Pool],
-    start: Candidate,
-    confidence: float,
-    max_samples: int,
-    random: Random,
+    observations: Observations, hypotheses: Hypotheses, draws: Draws, start: Candidate
 ) -> Candidate:
-    """The best optimised hypothesis of up to ``max_samples`` minimal samples.
+    """The best optimised hypothesis of up to ``draws.most`` minimal samples.
 
     Blocks take the initial rotations in turn and draw equally from all pools. The search stops
     when the chance that no sample so far held inliers alone, at the inlier ratios of the best
-    *optimised* motion, is below ``1 - confidence``: minimal models see too few of the inliers to
-    count them (a six-point model sees a tenth). Only models that beat all minimal ones before are
-    optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). The samples of ``start`` count: a search
-    goes on from where another stopped.
+    *optimised* motion, is below ``1 - draws.confidence``: minimal models see too few of the inliers
+    to count them (a six-point model sees a tenth). Only models that beat all minimal ones before
+    are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). The samples of ``start`` count: a
+    search goes on from where another stopped.
     """
-    usable = [pool for pool in pools if len(pool.points) >= hypotheses.sample_size]
+    usable = [pool for pool in draws.pools if len(pool.points) >= hypotheses.sample_size]
     best = start
     inliers = _inliers(observations, best, hypotheses.final_scale)
     drawn, blocks = [start.samples // max(len(usable), 1)] * len(usable), 0
     no_fit, best_gain = len(observations) * hypotheses.score_scale**2, 0.0
-    while usable and (left := max_samples - sum(drawn)) > 0:
+    while usable and (left := draws.most - sum(drawn)) > 0:
         samples = np.empty((min(hypotheses.block, left), hypotheses.sample_size), dtype=np.int64)
-        _draw(observations, usable, drawn, random, samples)
+        _draw(observations, usable, drawn, draws.random, samples)
         models = np.empty((hypotheses.solutions, MODEL_SIZE, len(samples)))
         blocks += 1
-        rotation = rotations[blocks % len(rotations)]
+        rotation = draws.rotations[blocks % len(draws.rotations)]
         hypotheses.solve(
             observations.points, observations.rays, observations.tau, samples,
             rotation[None], models,
@@ -106,7 +110,7 @@ def search(
         if cost < best.cost:
             best = Candidate(state, cost)
             inliers = _inliers(observations, best, hypotheses.final_scale)
-        if _missed(inliers, usable, drawn, hypotheses.sample_size) < 1.0 - confidence:
+        if _missed(inliers, usable, drawn, hypotheses.sample_size) < 1.0 - draws.confidence:
             break
     return Candidate(best.state, best.cost, sum(drawn))
 

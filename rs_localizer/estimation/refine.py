@@ -16,6 +16,9 @@ from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.residuals import normal_equations
 
+EXPECTED_NOISE = 0.5
+"""Standard deviation of the noise before it is measured, in inlier thresholds."""
+
 _MOST_DAMPING = 1e8
 # Pivots of a matrix of unit diagonal below this are rounding errors.
 _SINGULAR = 1e-15
@@ -219,44 +222,60 @@ def anneal(
 
 
 @kernel
-def inverted(matrix: Array) -> Array:
-    """Inverse of a symmetric positive definite matrix by Cholesky; NaN where it is none.
+def half_inverse(matrix: Array) -> tuple[Array, Array, bool]:
+    """Lower triangle ``H`` and scales ``s`` of a symmetric positive definite matrix's inverse,
+    ``diag(s) H^T H diag(s)``, and whether it is one; by Cholesky.
 
     Scaled to a unit diagonal first, so that units do not matter, nor parameters that a prior holds.
     """
     size = len(matrix)
-    inverse = np.empty((size, size))
-    scale = np.empty(size)
+    scale, factor = np.empty(size), np.empty((size, size))
     half = np.zeros((size, size))  # inverse of the factor
-    factor = np.empty((size, size))
-    inverse[:] = np.nan
     for i in range(size):
         if not matrix[i, i] > 0.0:
-            return inverse
+            return half, scale, False
         scale[i] = 1.0 / np.sqrt(matrix[i, i])
     for i in range(size):
+        own = factor[i]
         for j in range(i + 1):
+            other = factor[j]
             total = matrix[i, j] * scale[i] * scale[j]
             for k in range(j):
-                total -= factor[i, k] * factor[j, k]
+                total -= own[k] * other[k]
             if i > j:
-                factor[i, j] = total / factor[j, j]
+                own[j] = total * half[j, j]
             elif total > _SINGULAR:
-                factor[i, i] = np.sqrt(total)
+                own[i] = np.sqrt(total)
             else:
-                return inverse
-        half[i, i] = 1.0 / factor[i, i]
+                return half, scale, False
+        row, inverse = half[i], 1.0 / own[i]
+        for k in range(i):  # along the rows, for the sake of the caches
+            above = half[k]
+            for j in range(k + 1):
+                row[j] -= own[k] * above[j]
         for j in range(i):
-            total = 0.0
-            for k in range(j, i):
-                total += factor[i, k] * half[k, j]
-            half[i, j] = -total * half[i, i]
+            row[j] *= inverse
+        row[i] = inverse
+    return half, scale, True
+
+
+@kernel
+def inverted(matrix: Array) -> Array:
+    """Inverse of a symmetric positive definite matrix; NaN where it is none."""
+    half, scale, found = half_inverse(matrix)
+    size = len(matrix)
+    inverse = np.zeros((size, size)) if found else np.full((size, size), np.nan)
+    if not found:
+        return inverse
+    for k in range(size):
+        row = half[k]
+        for i in range(k + 1):
+            total, factor = inverse[i], row[i]
+            for j in range(i + 1):
+                total[j] += factor * row[j]
     for i in range(size):
         for j in range(i + 1):
-            total = 0.0
-            for k in range(i, size):
-                total += half[k, i] * half[k, j]
-            inverse[i, j] = total * scale[i] * scale[j]
+            inverse[i, j] *= scale[i] * scale[j]
             inverse[j, i] = inverse[i, j]
     return inverse
 

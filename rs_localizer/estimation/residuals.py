@@ -1,6 +1,6 @@
 """Reprojection errors of many points under one motion, and their normal equations.
 
-Points lie ``LANES`` at a time in the lanes, see :func:`pack`; a motion is a state of
+Points lie in lanes (:mod:`rs_localizer.estimation.packing`); a motion is a state of
 :mod:`rs_localizer.core.state`. What a point's error is stands in
 :mod:`rs_localizer.estimation.view`.
 """
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced, traced_sums
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
@@ -101,52 +101,6 @@ def _summing(parameters: int, tiles: list[list[tuple[int, int]]]) -> Any:
 
 _sums = _summing(MOTION_PARAMETERS, _TILES)
 _closer_sums = _summing(PARAMETERS, _CLOSER_TILES)
-
-
-@kernel
-def pack(points: Array, rays: Array, tau: Array, by_ray: Array) -> Array:
-    """Points in lanes: (blocks, values, LANES) of points (n,3), rays (n,2), row times (n,) and
-    derivatives of the pixel by the ray (n,2,2). The last block is filled up with weight zero.
-    """
-    count = len(points)
-    blocks = (count + LANES - 1) // LANES
-    data = np.empty((blocks, POINT_SIZE * LANES))
-    for block in range(blocks):
-        row = data[block]
-        for lane in range(LANES):
-            i = min(block * LANES + lane, count - 1)
-            for k in range(3):
-                row[k * LANES + lane] = points[i, k]
-            row[3 * LANES + lane] = rays[i, 0]
-            row[4 * LANES + lane] = rays[i, 1]
-            row[5 * LANES + lane] = tau[i]
-            for k in range(4):
-                row[(6 + k) * LANES + lane] = by_ray[i, k // 2, k % 2]
-            row[10 * LANES + lane] = 1.0 if block * LANES + lane < count else 0.0
-    return data
-
-
-@kernel
-def thin(data: Array, chosen: IntArray) -> Array:
-    """Only the chosen ones of the packed points, packed anew."""
-    count = len(chosen)
-    blocks = (count + LANES - 1) // LANES
-    thinned = np.empty((blocks, POINT_SIZE * LANES))
-    for place in range(blocks * LANES):
-        i = chosen[min(place, count - 1)]
-        for k in range(POINT_SIZE):
-            value = data[i // LANES, k * LANES + i % LANES]
-            if k == POINT_SIZE - 1 and place >= count:
-                value = 0.0
-            thinned[place // LANES, k * LANES + place % LANES] = value
-    return thinned
-
-
-@kernel
-def set_weights(data: Array, weights: Array) -> None:
-    """Give the packed points their weights (n,): 1 or 0."""
-    for i in range(len(weights)):
-        data[i // LANES, 10 * LANES + i % LANES] = weights[i]
 
 
 @kernel

@@ -10,7 +10,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.observing import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
-from rs_localizer.estimation.ransac import NOTHING, Candidate, Hypotheses, search
+from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses, search
+from rs_localizer.estimation.refine import EXPECTED_NOISE
 from rs_localizer.estimation.sampling import Pool
 from rs_localizer.estimation.scoring import optimize
 from rs_localizer.solvers.table import Solver, find_solver
@@ -129,16 +130,9 @@ class MotionSearch:
         hypotheses = self._hypotheses(
             find_solver("p3p"), _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
         )
-        return search(
-            observed.observations,
-            hypotheses,
-            [np.eye(3)],
-            _pools(observed, among),
-            before,
-            self._config.confidence,
-            most,
-            observed.random,
-        )
+        pools = _pools(observed, among)
+        draws = Draws([np.eye(3)], pools, self._config.confidence, most, observed.random)
+        return search(observed.observations, hypotheses, draws, before)
 
     def _motion(
         self, observed: Observed, start: Candidate, most: int, before: Candidate | None = None
@@ -155,16 +149,10 @@ class MotionSearch:
         hypotheses = self._hypotheses(
             self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, observed.terms
         )
-        return search(
-            observed.observations,
-            hypotheses,
-            [start.state[:9].reshape(3, 3)],
-            [Pool(near), *_pools(observed, np.arange(len(observed.observations)))],
-            before,
-            self._config.confidence,
-            most,
-            observed.random,
-        )
+        rotations = [start.state[:9].reshape(3, 3)]
+        pools = [Pool(near), *_pools(observed, np.arange(len(observed.observations)))]
+        draws = Draws(rotations, pools, self._config.confidence, most, observed.random)
+        return search(observed.observations, hypotheses, draws, before)
 
     def _hypotheses(
         self,
@@ -194,7 +182,7 @@ class MotionSearch:
             score_scale=score_scale,
             final_scale=final_scale,
             prior=terms,
-            noise=0.5 * self._config.inlier_threshold,
+            noise=EXPECTED_NOISE * self._config.inlier_threshold,
         )
 
     def optimize(
@@ -209,7 +197,7 @@ class MotionSearch:
             first_scale,
             self._config.inlier_threshold,
             terms,
-            0.5 * self._config.inlier_threshold,
+            EXPECTED_NOISE * self._config.inlier_threshold,
         )
         return Candidate(optimized, cost)
 

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
 from rs_localizer.estimation.evidence import Sizes
@@ -28,7 +28,7 @@ from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside
 from rs_localizer.estimation.refine import apply_step, inverted
-from rs_localizer.estimation.shaking import AGREEMENT, follow
+from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, follow
 
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part.
@@ -38,6 +38,11 @@ _LITTLE_OF_THE_PRIOR = 0.05
 # readout. What they find, or what neighbouring rows agree on beside them, is followed closer.
 _SHAKE_DEGREE = 6
 _SHAKING = 0.05
+# Logarithm of the odds that shaking of any degree must gain where only neighbouring rows agree; and
+# agreement of which a frame would be refused (:mod:`.acceptance`) if nothing mended it.
+_GAIN, _CERTAIN = 0.1, 3.0
+# Where points are fewer, two for each of the coefficients, such a gain hides in their noise.
+_ENOUGH_POINTS = 2 * 3 * (DEGREES[-1] - 1)
 # More points than this only take time.
 _MOST_POINTS = 2500
 _MOST_SHARED = 0.9  # correlation of neighbours
@@ -93,17 +98,16 @@ def _settled(
             frame = Inliers(observations, best, terms, assumed)
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
-    seems_to_shake = sizes.no_shake < _SHAKING or examined.agreement > AGREEMENT
-    if (
-        assumed.rolling
-        and seems_to_shake
-        and not mirrored_fits
-        and not _rather_rests(frame, best, examined)
-    ):
+    may_shake = assumed.rolling and not mirrored_fits
+    seems_to_shake = may_shake and _seems_to_shake(frame, best, examined)
+    if seems_to_shake and not _rather_rests(frame, best, examined):
         shaken = _followed(frame, best, sizes, threshold)
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
             return shaken
-    frame.worth = _worth(examined.shared)
+    shared = examined.shared
+    if may_shake and not seems_to_shake and examined.agreement > AGREEMENT:
+        shared = max(shared, _correlation(examined.agreement, best.inliers))
+    frame.worth = _worth(shared)
     # What the frame says of it: where it says nothing, the probability is the one assumed.
     seen = max(1.0 - sizes.no_field / FIELD_PRIOR[0], 0.0)
     frame.odds += seen * math.log(DISTRUST)
@@ -124,6 +128,25 @@ def _settled(
     return found
 
 
+def _seems_to_shake(frame: Inliers, best: Posterior, examined: Examined) -> bool:
+    """Whether the camera may shake by so much that it has to be followed.
+
+    One frame in twenty has neighbours that agree by chance. To follow it takes several times as
+    long as all the rest and finds nothing, as one linear solve tells.
+    """
+    agree = examined.agreement > AGREEMENT
+    if agree and best.inliers.sum() >= _ENOUGH_POINTS:
+        gain = frame.gain_of_shaking(best.state, frame.terms, DEGREES[-1])
+        agree = gain > _GAIN or examined.agreement > _CERTAIN
+    return agree or examined.sizes.no_shake < _SHAKING
+
+
+def _correlation(agreement: float, inliers: BoolArray) -> float:
+    """Correlation of neighbours among so many inliers (n,) that agree by standard deviations."""
+    correlation = max(agreement, 0.0) / math.sqrt(2.0 * max(inliers.sum(), 1))
+    return min(correlation, _MOST_SHARED)
+
+
 def _rather_rests(frame: Inliers, best: Posterior, examined: Examined) -> bool:
     """Whether a camera at rest, with a map or a lens that is a little off, explains as much."""
     if not frame.assumed.may_rest:
@@ -140,14 +163,11 @@ def _rather_rests(frame: Inliers, best: Posterior, examined: Examined) -> bool:
 def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -> Posterior | None:
     """The posterior of a camera that shakes; None if it cannot be followed."""
     observations = frame.observations
-    shaken = follow(
-        observations, best.state, best.inliers, frame.terms, sizes.noise, sizes.shake,
-        frame.assumed.shake, threshold,
-    )  # fmt: skip
+    scales = Scales(sizes.noise, sizes.shake, frame.assumed.shake, threshold)
+    shaken = follow(observations, best.state, best.inliers, frame.terms, scales)
     if shaken is None:
         return None
-    correlation = max(shaken.agreement, 0.0) / math.sqrt(2.0 * max(shaken.inliers.sum(), 1))
-    worth = _worth(min(correlation, _MOST_SHARED))
+    worth = _worth(_correlation(shaken.agreement, shaken.inliers))
     return replace(
         best,
         state=shaken.state,

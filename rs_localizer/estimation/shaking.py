@@ -3,32 +3,33 @@
 The turn beside the motion is a sum of polynomials of the row time
 (:mod:`rs_localizer.estimation.model_error`), each with a size of its own that the frame tells: a
 vibration has a frequency, and the polynomials near it are large (automatic relevance determination:
-MacKay, "Bayesian nonlinear modeling for the prediction competition", 1994; here by expectation
-maximization, with sizes that neighbouring degrees share).
+MacKay, "Bayesian nonlinear modeling for the prediction competition", 1994; see
+:mod:`rs_localizer.estimation.shake_sizes`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import basis_sizes, shake_at
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import columns_of
-from rs_localizer.estimation.model_error import RIDGE, neighbours_agree
+from rs_localizer.estimation.model_error import neighbours_agree
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.shake_sizes import sizes_and_step
 
-# Degrees to try, until neighbouring rows no longer agree: twelve follow a cycle and a half in one
-# readout, twenty-two six.
-_DEGREES = (12, 22)
+DEGREES = (12, 22)
+"""To try, until neighbouring rows no longer agree: twelve follow a cycle and a half in one readout,
+twenty-two six."""
 # Errors whose neighbours agree more than this are not followed, in standard deviations.
 AGREEMENT = 1.7
 # Points within so many times the largest error of an inlier may belong to the scene.
@@ -37,8 +38,6 @@ _FEWEST = 12  # points that shaking could be told from
 _MOST_COEFFICIENTS = 1.0  # for each point, which gives two equations
 _STEPS = 3
 _INLIER_ROUNDS = 3
-_SIZE_ROUNDS = 8
-_DOUBT = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +51,16 @@ class Shaken:
     agreement: float  # of what is left, see :func:`neighbours_agree`
     squared_errors: Array  # (n,) px^2
     inliers: BoolArray  # (n,)
+    sizes: Array  # (k,) mean squares of the coefficients
+
+
+class Scales(NamedTuple):
+    """First estimates, and limits."""
+
+    noise: float  # px
+    size: float  # rad, of the coefficients
+    least_size: float  # rad, that is always possible
+    threshold: float  # px, least gate of inliers
 
 
 def follow(
@@ -59,27 +68,28 @@ def follow(
     start: Array,
     inliers: BoolArray,
     terms: PriorTerms,
-    noise: float,
-    size: float,
-    least_size: float,
-    threshold: float,
+    scales: Scales,
 ) -> Shaken | None:
     """Fit motion and shaking together, and choose the inliers anew: those of a motion without
     shaking are the points that it happens to pass by.
 
     Args:
         start: state (24,), the best without shaking.
-        threshold: px, least gate of inliers.
 
     None where the fit leaves what can be computed.
-        noise: px, a first estimate.
-        size, least_size: rad, of the coefficients: a first estimate, and what is always possible.
     """
+    noise, size, least_size, threshold = scales
     best = None
-    for degrees in _DEGREES:
+    for degrees in DEGREES:
         if 3 * degrees > _MOST_COEFFICIENTS * np.count_nonzero(inliers):
             break
-        found = _fit(observations, start, inliers, terms, noise, size, least_size, degrees)
+        # At first all are thought to be as large as each other, whatever the size of their
+        # polynomials.
+        first = Shaken(
+            start, np.zeros((degrees - 1, 3)), np.empty((0, 0)), noise, 0.0, np.empty(0), inliers,
+            (size / basis_sizes(degrees)) ** 2,
+        )  # fmt: skip
+        found = _fit(observations, first, inliers, terms, least_size, _STEPS)
         for _ in range(_INLIER_ROUNDS):
             if found is None:
                 return best
@@ -87,10 +97,7 @@ def follow(
             chosen = found.squared_errors < gate * gate
             if np.array_equal(chosen, found.inliers):
                 break
-            found = _fit(
-                observations, found.state, chosen, terms, found.noise, size, least_size, degrees,
-                found.coefficients,
-            )  # fmt: skip
+            found = _fit(observations, found, chosen, terms, least_size, 1)
         if found is None:
             return best
         best = found
@@ -101,23 +108,19 @@ def follow(
 
 def _fit(
     observations: Observations,
-    start: Array,
+    start: Shaken,
     inliers: BoolArray,
     terms: PriorTerms,
-    noise: float,
-    size: float,
     least_size: float,
-    degrees: int,
-    coefficients: Array | None = None,
+    steps: int,
 ) -> Shaken | None:
-    state = start
-    if coefficients is None:
-        coefficients = np.zeros((degrees - 1, 3))
-    # At first all are thought to be as large as each other, whatever the size of their polynomials.
-    sizes = (size / basis_sizes(degrees)) ** 2
+    """The fit near another one, of its degrees, with these inliers (n,); after so many steps."""
+    state, coefficients, noise = start.state, start.coefficients, start.noise
+    sizes = start.sizes.copy()
+    degrees = len(coefficients) + 1
     count = len(observations)
     covariance = np.empty((0, 0))
-    for _ in range(_STEPS):
+    for _ in range(steps):
         errors, by_motion, by_turn, tau = linearized(
             observations.packed,
             count,
@@ -132,7 +135,7 @@ def _fit(
             return None
         information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
         add_prior(*terms, state, 1.0, information, slope)
-        step, covariance, noise = _sizes_and_step(
+        step, covariance, noise = sizes_and_step(
             columns.products, columns.with_errors, columns.squared_errors,
             2.0 * np.count_nonzero(inliers), information, slope, coefficients, noise,
             least_size, sizes,
@@ -155,74 +158,4 @@ def _fit(
     lengths = np.sqrt(np.where(near, np.maximum(squared, 1e-300), 1.0))
     clipped = errors * np.minimum(1.0, gate / lengths)[:, None]
     agreement = neighbours_agree(clipped, observations.tau, observations.rays, near)
-    return Shaken(state, coefficients, covariance, noise, agreement, squared, inliers)
-
-
-@kernel
-def _sizes_and_step(
-    products: Array, with_errors: Array, squared_errors: float, equations: float,
-    information: Array, slope: Array, coefficients: Array, noise: float, least_size: float,
-    sizes: Array,
-) -> tuple[Array, Array, float]:  # fmt: skip
-    """Step (m,) of motion and coefficients, covariance, and noise; ``sizes`` (k,) are updated."""
-    count = len(with_errors)
-    held = coefficients.ravel()
-    step, covariance = np.zeros(count), np.zeros((count, count))
-    matrix, right = np.empty((count, count)), np.empty(count)
-    found = np.empty(len(sizes))
-    for round_ in range(_SIZE_ROUNDS):
-        weight = 1.0 / (noise * noise)
-        for i in range(count):
-            for j in range(count):
-                matrix[i, j] = weight * products[i, j]
-            right[i] = weight * with_errors[i]
-        for i in range(PARAMETERS):
-            for j in range(PARAMETERS):
-                matrix[i, j] += information[i, j]
-            right[i] -= slope[i]
-        # The sizes are estimates of few coefficients; the covariance allows for that.
-        doubt = _DOUBT if round_ == _SIZE_ROUNDS - 1 else 1.0
-        for k in range(PARAMETERS, count):
-            precision = 1.0 / (doubt * sizes[(k - PARAMETERS) // 3])
-            matrix[k, k] += precision
-            right[k] -= precision * held[k - PARAMETERS]
-        for i in range(count):
-            matrix[i, i] *= RIDGE
-        covariance = inverted(matrix)
-        for i in range(count):
-            along = 0.0
-            for j in range(count):
-                along += covariance[i, j] * right[j]
-            step[i] = along
-        if round_ == _SIZE_ROUNDS - 1:
-            break
-        # Expected squares of the coefficients, and of the errors.
-        for k in range(len(sizes)):
-            total = 0.0
-            for axis in range(3):
-                place = PARAMETERS + 3 * k + axis
-                total += (held[3 * k + axis] + step[place]) ** 2 + covariance[place, place]
-            found[k] = total / 3.0
-        _share(found, least_size * least_size, sizes)
-        left, freedom = squared_errors, equations
-        for i in range(count):
-            left -= 2.0 * step[i] * with_errors[i]
-            for j in range(count):
-                left += step[i] * step[j] * products[i, j]
-                freedom -= weight * covariance[i, j] * products[i, j]
-        noise = np.sqrt(max(left, 1e-8 * equations) / max(freedom, 1.0))
-    return step, covariance, noise
-
-
-@kernel
-def _share(found: Array, least: float, sizes: Array) -> None:
-    """Mean squares of the neighbouring degrees, even and odd alike."""
-    count = len(found)
-    for k in range(count):
-        total, weights = 0.0, 0.0
-        for shift in range(-2, 3):
-            if 0 <= k + shift < count:
-                weight = 3.0 - abs(shift)
-                total += weight * found[k + shift]
-                weights += weight
-        sizes[k] = total / weights + least
+    return Shaken(state, coefficients, covariance, noise, agreement, squared, inliers, sizes)

@@ -80,6 +80,15 @@ class Image:
     pixels: Gray  # (h,w)
 
 
+def read_any_image(message: Any) -> Image:
+    """Read a sensor_msgs/Image or CompressedImage.
+
+    Raises:
+        MessageError: when it cannot be read, saying what was found.
+    """
+    return read_compressed_image(message) if hasattr(message, "format") else read_image(message)
+
+
 def read_image(message: Any) -> Image:
     """Read a sensor_msgs/Image.
 

@@ -39,13 +39,20 @@ def write_frame(
     ids: NDArray[np.int64],
 ) -> None:
     """Camera info and correspondences of an image: points (n,3), raw pixels (n,2), ids (n,)."""
+    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
+    cloud = make_correspondences(stamp_ns, points, pixels, ids)
+    bag.write(CORRESPONDENCES_TOPIC, cloud, stamp_ns)
+
+
+def make_correspondences(
+    stamp_ns: int, points: Array, pixels: Array, ids: NDArray[np.int64]
+) -> Any:
+    """A sensor_msgs/PointCloud2 of points (n,3), raw pixels (n,2) and ids (n,)."""
     rows = np.empty(len(points), _ROW)
     for column, name in enumerate("xyz"):
         rows[name] = points[:, column]
     rows["u"], rows["v"], rows["id"] = pixels[:, 0], pixels[:, 1], ids
-    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, stamp_ns), stamp_ns)
-    cloud = make_cloud(make_message, stamp_ns, MAP_FRAME, rows)
-    bag.write(CORRESPONDENCES_TOPIC, cloud, stamp_ns)
+    return make_cloud(make_message, stamp_ns, MAP_FRAME, rows)
 
 
 def write_image(bag: BagWriter, topic: str, stamp_ns: int, encoding: str, data: bytes) -> None:

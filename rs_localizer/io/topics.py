@@ -21,6 +21,7 @@ POSE_WITH_COVARIANCE = "pose_with_covariance"
 TWIST_WITH_COVARIANCE = "twist_with_covariance"
 ODOMETRY = "odometry"
 INLIERS = "inliers"
+VEHICLE_ODOMETRY = "vehicle_odometry"
 DEBUG_IMAGE = "debug_image"
 COMPRESSED_DEBUG_IMAGE = "debug_image/compressed"
 # Of everybody.

@@ -92,7 +92,7 @@ def record(
         DetectError: when no image shows anything, or images and calibration differ in size.
     """
     tally = _Tally(detector.map)
-    cameras = _Cameras(options.scan_direction)
+    cameras = Cameras(options.scan_direction)
     with whole(out), BagWriter(out, options.storage) as bag:
         for shot in shots:
             if isinstance(shot, Carried):
@@ -103,7 +103,7 @@ def record(
                 tally.refuse(shot.image)
             else:
                 detected = detector.detect(shot.image)
-                tally.add(cameras.of(shot, detected), detected)
+                tally.add(cameras.of(shot, shot.image), detected)
                 if len(detected.detections.ids):
                     _write(bag, shot, detected, options.with_images)
                 if tally.images == _PATIENCE and tally.are_few:
@@ -215,14 +215,19 @@ class _RollingFit:
         return lambda some: project_rolling(camera, found.at_rows, some)[0]
 
 
-class _Cameras:
+class Cameras:
     """The camera of each image; mostly that of the one before."""
 
     def __init__(self, scan_direction: str) -> None:
         self._scan_direction = scan_direction
         self._last: tuple[Calibration, Camera] | None = None
 
-    def of(self, shot: Shot, detected: Detected) -> Camera:
+    def of(self, shot: Shot, image: Image) -> Camera:
+        """Of one image.
+
+        Raises:
+            DetectError: when its camera_info cannot be used, or is of another size.
+        """
         try:
             calibration = read_camera_info(shot.camera_info)
             if self._last is None or self._last[0] != calibration:
@@ -230,7 +235,7 @@ class _Cameras:
         except MessageError as error:
             raise DetectError(f"the camera_info cannot be used: {error}") from error
         camera = self._last[1]
-        height, width = detected.image.pixels.shape
+        height, width = image.pixels.shape
         if (width, height) != camera.size:
             raise DetectError(
                 f"the images are of {width}x{height}, the calibration is for "

@@ -14,13 +14,12 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
-from rs_localizer.io.images import Image
+from rs_localizer.io.images import Image, read_any_image
 from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.video import read_video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
-from rs_localizer.pipeline.images import read
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -81,7 +80,8 @@ def from_files(files: list[Path], camera: Camera, clock: ImageClock) -> Iterator
         seconds, nanoseconds = divmod(now, 10**9)
         stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
         header = SimpleNamespace(stamp=stamp, frame_id=CAMERA_FRAME)
-        found = read(SimpleNamespace(header=header, format=name, data=data))
+        message = SimpleNamespace(header=header, format=name, data=data)
+        found = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
         if isinstance(found, Refusal):
             found = Refusal(found.reason, f"{file.name}: {found.detail}")
         yield _shot(found, camera, data, name, now)
@@ -162,7 +162,7 @@ def from_bag(
         elif topic in carried:
             yield Carried(topic, recorded_ns, as_tf2(message))
         else:
-            image = read(message)
+            image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
             compressed = message if hasattr(message, "format") else None
             info = latest
             if camera is not None:  # the image knows its frame, on which transforms hang

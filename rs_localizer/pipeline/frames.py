@@ -113,6 +113,7 @@ class FrameLocalizer:
     def warm_up(self) -> None:
         """Compile all that the present settings need, from points to messages."""
         self._method.warm_up()
+        self.readout_watch.warm_up(self._method.camera)
 
     def calibrate(self, calibration: Calibration) -> None:
         """Use this calibration from the next frame on.

@@ -15,13 +15,13 @@ from rs_localizer.config import DetectorConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.io.clouds import make_cloud
-from rs_localizer.io.images import Image, read_compressed_image, read_image
-from rs_localizer.io.messages import Make, MessageError
+from rs_localizer.io.images import Image, read_any_image
+from rs_localizer.io.messages import Make
 from rs_localizer.markers.detection import Detections, MarkerDetector, warm_up
 from rs_localizer.markers.map_check import MapCheck
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
+from rs_localizer.pipeline.refusal import Notify, Refusal, read_or_refuse, unheard
 
 # Single precision is what RViz shows: 3e-5 px at the rim of an image, and 0.1 mm at the end of a
 # map of a kilometre. Larger ones (georeferenced) need more.
@@ -36,21 +36,11 @@ class Detected:
 
     image: Image
     detections: Detections
-    map_frame: str
+    map: MarkerMap
     row: np.dtype[Any]  # of the cloud
 
     def __bool__(self) -> Literal[True]:
         return True
-
-
-def read(message: Any) -> Image | Refusal:
-    """A sensor_msgs/Image or CompressedImage; ``bad_image`` if it cannot be read."""
-    try:
-        if hasattr(message, "format"):
-            return read_compressed_image(message)
-        return read_image(message)
-    except MessageError as error:
-        return Refusal(Reason.BAD_IMAGE, str(error))
 
 
 def correspondences(detected: Detected, make: Make) -> Any:
@@ -61,7 +51,7 @@ def correspondences(detected: Detected, make: Make) -> Any:
         rows[name] = found.points[:, column]
     rows["u"], rows["v"] = found.pixels[:, 0], found.pixels[:, 1]
     rows["score"], rows["id"] = found.scores, found.ids
-    return make_cloud(make, detected.image.stamp_ns, detected.map_frame, rows)
+    return make_cloud(make, detected.image.stamp_ns, detected.map.map_frame, rows)
 
 
 def _row_type(points: Array) -> np.dtype[Any]:
@@ -110,7 +100,7 @@ class FrameDetector:
 
     def take(self, message: Any) -> Detected | Refusal:
         """Look for markers in a sensor_msgs/Image or CompressedImage."""
-        image = read(message)
+        image = read_or_refuse(read_any_image, message, Reason.BAD_IMAGE)
         return image if isinstance(image, Refusal) else self.detect(image)
 
     def detect(self, image: Image) -> Detected:
@@ -131,4 +121,4 @@ class FrameDetector:
                 self._notice(Notice.WRONG_MAP, fault)
             elif len(found.ids):
                 self._agreed += 1
-        return Detected(image, found, self.map.map_frame, self._row)
+        return Detected(image, found, self.map, self._row)

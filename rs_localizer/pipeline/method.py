@@ -73,4 +73,5 @@ class Method:
         so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
         twist_at(_STILL, 0.5, 1.0)
         so3.log(np.eye(3))
+        so3.exp_many(np.zeros((1, 3)))  # of the watch over the readout time
         matching.warm_up()

@@ -68,7 +68,7 @@ def pose_at(estimate: Estimate, tau: float) -> Pose:
     jacobian[_ANGULAR, ANGULAR_ACCELERATION] = 0.5 * tau * tau * by_angle
     if estimate.turn is not None:
         map_from_then = map_from_then @ estimate.turn.at(tau)[0]
-    jacobian[_ANGULAR, PARAMETERS:] = np.kron(values, map_from_then)
+    jacobian[_ANGULAR, PARAMETERS:] = _by_polynomials(values, map_from_then)
     covariance = _propagate(jacobian, estimate.joint_covariance)
     if estimate.turn is not None:
         late = estimate.turn.delay * rotation.T @ estimate.turn.late(tau)[0]
@@ -100,9 +100,9 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
         known, rate = estimate.turn.at(tau)
         late = estimate.turn.delay * estimate.turn.late(tau)[1]
         own = np.outer(late, late) + estimate.turn.rate_noise**2 * np.eye(3)
-    jacobian[_LINEAR, PARAMETERS:] = np.kron(values, so3.hat(linear) @ known)
-    by_shake = np.kron(values, so3.hat(angular - rate) @ known)
-    jacobian[_ANGULAR, PARAMETERS:] = np.kron(rates, known) + by_shake
+    jacobian[_LINEAR, PARAMETERS:] = _by_polynomials(values, so3.hat(linear) @ known)
+    by_shake = _by_polynomials(values, so3.hat(angular - rate) @ known)
+    jacobian[_ANGULAR, PARAMETERS:] = _by_polynomials(rates, known) + by_shake
     covariance = _propagate(jacobian / readout_time, estimate.joint_covariance)
     turned, changed = _beyond_rows(estimate, tau)
     own = own + changed * np.eye(3)
@@ -130,14 +130,20 @@ def with_timing(pose: Pose, twist: Twist, deviation: float, delay: float) -> tup
 
 
 def _shaking(estimate: Estimate, tau: float) -> tuple[Array, Array]:
-    """The polynomials of the shaking at ``tau``, and their rates, each as a row (1,k)."""
+    """The polynomials (k,) of the shaking at ``tau``, and their rates (k,)."""
     count = (len(estimate.joint_covariance) - PARAMETERS) // 3
     values, rates = np.empty(count), np.empty(count)
     if count:
         shake_basis(within_rows(tau), count + 1, values, rates)
     if tau != within_rows(tau):  # it stays as it was
         rates[:] = 0.0
-    return values[None], rates[None]
+    return values, rates
+
+
+def _by_polynomials(values: Array, matrix: Array) -> Array:
+    """``matrix`` (3,3) times each of the values (k,), side by side (3,3 k)."""
+    side_by_side: Array = (matrix[:, None, :] * values[:, None]).reshape(3, -1)
+    return side_by_side
 
 
 def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import NodeConfig, OrientationCovariance
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
@@ -15,6 +15,7 @@ from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.clock import published_moment
 from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
 from rs_localizer.pipeline.refusal import Refusal, Waiting
+from rs_localizer.pipeline.roll_pitch_yaw import about_angles
 from rs_localizer.solvers.table import find_solver
 
 
@@ -48,7 +49,16 @@ def of_camera(
 def of_body(
     localized: Localized, config: NodeConfig, transforms: Transforms
 ) -> Localized | Refusal:
-    """The same of ``base_frame``, from that of the camera."""
+    """The same of ``base_frame``, from that of the camera, with the covariance that is wanted."""
+    found = _mounted(localized, config, transforms)
+    if found and config.orientation_covariance == OrientationCovariance.ROLL_PITCH_YAW:
+        return replace(found, pose=about_angles(found.pose))
+    return found
+
+
+def _mounted(
+    localized: Localized, config: NodeConfig, transforms: Transforms
+) -> Localized | Refusal:
     base = config.base_frame
     if base in ("", localized.body_frame):
         return localized

@@ -13,11 +13,15 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.solvers.table import find_solver
-from rs_localizer.trajectory.online import REVERSED, MeasuredReadout, ReadoutMonitor
+from rs_localizer.trajectory.measured_readout import MeasuredReadout, Measurement
+from rs_localizer.trajectory.online import REVERSED, ReadoutMonitor, warm_up
 
 # Frames from one measurement to the next: few at first, more when there is more to compute.
 _AT_FIRST, _LATER = 5, 30
 _GROWTH = 0.1
+# Triples at which a measurement may look while one frame is localized, if that is not less than a
+# round of it: a third of a millisecond.
+_SHARE = 300
 # A value is adopted when it is known to this share of itself, by so many frames.
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
@@ -35,15 +39,21 @@ class ReadoutWatch:
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
         self._monitor = ReadoutMonitor()
+        self._under_way: Measurement | None = None
         self._frames, self._next = 0, _AT_FIRST
         self._said = False
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
         self.fault = ""  # how that contradicts the setting, in one sentence
 
+    def warm_up(self, camera: Camera) -> None:
+        """Compile what frames of this camera need."""
+        warm_up(camera)
+
     def reset(self) -> None:
         """Forget all frames."""
         self._monitor.reset()
+        self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
         self._said, self.measured, self.fault = False, None, ""
 
@@ -68,6 +78,7 @@ class ReadoutWatch:
             found = self._measure(camera, time_ns, estimate, cloud)
         except np.linalg.LinAlgError:  # a frame that says nothing must not stop the next ones
             self._monitor.reset()
+            self._under_way = None
             return config
         if found is None:
             return config
@@ -85,10 +96,16 @@ class ReadoutWatch:
     ) -> MeasuredReadout | None:
         self._monitor.add(time_ns, camera, estimate, cloud.points, cloud.pixels)
         self._frames += 1
-        if self._frames < self._next:
+        if self._frames >= self._next:
+            self._next += min(max(_AT_FIRST, round(_GROWTH * self._frames)), _LATER)
+            self._under_way = self._monitor.measurement()
+        if self._under_way is None:
             return None
-        self._next += min(max(_AT_FIRST, round(_GROWTH * self._frames)), _LATER)
-        return self._monitor.measure()
+        self._under_way.advance(_SHARE)
+        if not self._under_way.done:
+            return None
+        found, self._under_way = self._under_way.found, None
+        return found
 
     def _adopt(self, config: NodeConfig, found: MeasuredReadout) -> NodeConfig:
         value = abs(found.readout_time)

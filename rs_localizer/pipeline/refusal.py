@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from rs_localizer.core.reasons import ImuReason, Notice, Reason
+from rs_localizer.io.messages import MessageError
+
+Read = TypeVar("Read")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,3 +40,11 @@ Notify = Callable[[Notice | ImuReason, str], None]
 
 def unheard(notice: Notice | ImuReason, text: str) -> None:
     """Tell nobody."""
+
+
+def read_or_refuse(read: Callable[[Any], Read], message: Any, reason: Reason) -> Read | Refusal:
+    """What is read of a message; refused for this reason if it cannot be."""
+    try:
+        return read(message)
+    except MessageError as error:
+        return Refusal(reason, str(error))

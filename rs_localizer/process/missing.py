@@ -13,7 +13,15 @@ _UBUNTU = {
     "yaml": "python3-yaml",
 }
 _ONLY_PIP = ("numba", "rosbags")
-_PIP = {"PIL": "Pillow", "cv2": "opencv-python-headless", "yaml": "PyYAML"}
+# Of what only some commands need: the extra that brings it.
+_EXTRAS = {
+    "dask": "fleet",
+    "distributed": "fleet",
+    "h5py": "hloc",
+    "pycolmap": "mapping",
+    "rerun": "view",
+}
+_PIP = {"PIL": "Pillow", "cv2": "opencv-python-headless", "rerun": "rerun-sdk", "yaml": "PyYAML"}
 
 
 def explain(error: ImportError) -> str:
@@ -31,6 +39,11 @@ def explain(error: ImportError) -> str:
         return (
             f"the Python package {name} is not installed: pip install {name} (beside Ubuntu's ROS "
             f'with --break-system-packages, and "numpy<2" to keep its NumPy)'
+        )
+    if name in _EXTRAS:
+        return (
+            f"the Python package {name} is not installed: pip install {_PIP.get(name, name)} (the "
+            f"extra {_EXTRAS[name]} of rs_localizer)"
         )
     return f"{_one_line(error)}; source a ROS 2 workspace, or install it with pip (docs/install.md)"
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.settings import Kind, settings
+from rs_localizer.settings import NODES, Kind, settings
 
 PACKAGE = "rs_localizer"
+# Drivers by their package, and their executables; both publish image_raw and camera_info.
+DRIVERS = {"v4l2_camera": "v4l2_camera_node", "usb_cam": "usb_cam_node_exe"}
 
 
 def share(*path: str) -> PathJoinSubstitution:
@@ -115,3 +117,77 @@ def common_arguments() -> list[DeclareLaunchArgument]:
         argument("rviz", "false", "start RViz with a view of the node's outputs, too"),
         *setting_arguments(),
     ]
+
+
+def from_camera(kind: Kind, params_argument: str, nodes: Callable[[Any], list[Node]]) -> list[Any]:
+    """From images to poses: arguments for a camera, a detector and the localizer, and their nodes.
+
+    Args:
+        kind: the detector's settings.
+        params_argument: the launch argument that names its params file.
+        nodes: to start, when the launch context knows the arguments.
+    """
+    common = common_arguments()
+    known = {item.name for item in common}
+    name = NODES[kind]
+    return [
+        argument(
+            "camera",
+            "none",
+            "driver to start: v4l2_camera or usb_cam; none: one that runs already",
+        ),
+        argument("calibration", "", "URL of the camera's calibration, for the driver"),
+        argument("image", "image_raw", "topic of the raw images (never rectified ones)"),
+        argument("camera_info", "camera_info", "topic of the calibration"),
+        argument(params_argument, share("config", f"{name}.yaml"), f"parameters of {name}"),
+        *common,
+        *(item for item in setting_arguments(kind) if item.name not in known),
+        OpaqueFunction(function=nodes),
+    ]
+
+
+def camera_driver(configurations: Mapping[str, str]) -> list[Node]:
+    """The driver, if it is asked for; nothing has been started when it is refused."""
+    package = configurations["camera"]
+    if package == "none":
+        return []
+    if package not in DRIVERS:
+        raise RuntimeError(f"camera must be one of none, {', '.join(DRIVERS)}; got {package!r}")
+    need_package(package, f"camera:={package}")
+    url = ParameterValue(configurations["calibration"], value_type=str)
+    time = {key: value for key, value in given(configurations).items() if key == "use_sim_time"}
+    return [
+        Node(
+            package=package,
+            executable=DRIVERS[package],
+            name="camera",
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[{"camera_info_url": url} | time],
+            output="screen",
+        )
+    ]
+
+
+def detector(name: str, params_file: str, parameters: Mapping[str, Any]) -> Node:
+    """A node that looks at the camera's images; its executable has its name.
+
+    Args:
+        name: of the node.
+        params_file: the launch argument that names its params file.
+        parameters: those that were given besides.
+    """
+    image = LaunchConfiguration("image")
+    return Node(
+        package=PACKAGE,
+        executable=name,
+        name=name,
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[LaunchConfiguration(params_file), dict(parameters)],
+        remappings=[
+            ("image", image),
+            ("image/compressed", [image, "/compressed"]),
+            ("camera_info", LaunchConfiguration("camera_info")),
+        ],
+        arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
+        output="screen",
+    )

@@ -31,13 +31,26 @@ def marker_detector(args: list[str] | None = None) -> int:
     """Run the marker detector likewise."""
 
     def load() -> Run:
-        from rs_localizer.ros.detector.node import MarkerDetectorNode
+        from rs_localizer.ros.detector.markers import MarkerDetectorNode
         from rs_localizer.ros.node.run import run
         from rs_localizer.settings import DETECTOR_NAME
 
         return functools.partial(run, MarkerDetectorNode, DETECTOR_NAME)
 
     return _guarded("marker_detector", load, args)
+
+
+def feature_detector(args: list[str] | None = None) -> int:
+    """Run the feature detector likewise."""
+
+    def load() -> Run:
+        from rs_localizer.ros.detector.features import FeatureDetectorNode
+        from rs_localizer.ros.node.run import run
+        from rs_localizer.settings import FEATURES_NAME
+
+        return functools.partial(run, FeatureDetectorNode, FEATURES_NAME)
+
+    return _guarded("feature_detector", load, args)
 
 
 def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:

@@ -14,7 +14,7 @@ def answer(name: str, words: Sequence[str]) -> str | None:
     """The text that is asked for; None when a node is to start.
 
     Args:
-        name: ``localizer`` or ``marker_detector``.
+        name: of the executable.
         words: arguments of the command line.
     """
     own = list(words)
@@ -26,12 +26,13 @@ def answer(name: str, words: Sequence[str]) -> str | None:
 
 
 def _help(name: str) -> str:
-    from rs_localizer.config import DetectorConfig, NodeConfig
+    from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
     from rs_localizer.settings import settings
 
     kind, what = {
         "localizer": (NodeConfig, "Poses and velocities from correspondences or keypoints."),
         "marker_detector": (DetectorConfig, "Correspondences from images of markers and boards."),
+        "feature_detector": (FeatureConfig, "Keypoints with descriptors from images."),
     }[name]
     lines = [
         f"usage: ros2 run rs_localizer {name} --ros-args [-p NAME:=VALUE] [--params-file FILE]",

@@ -258,7 +258,7 @@ def test_faults_end_the_command(
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        ((), "give either --map or --board"),
+        ((), "give --map, --board or --features"),
         (("--board", "6x4"), "--board needs --square"),
         (("--board", "six", "--square", "1"), "--board must be of the form 6x4, got 'six'"),
         (("--board", "1x1", "--square", "1"), "--board: a board needs 3x3 inner corners"),

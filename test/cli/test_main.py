@@ -71,7 +71,7 @@ def test_help_imports_no_command() -> None:
         ([], "the following arguments are required: COMMAND"),
         (["fly"], "invalid choice: 'fly'"),
         (["--nonsense"], "COMMAND"),
-        (["replay"], "the following arguments are required: BAG"),
+        (["replay"], "the following arguments are required: RECORDING"),
         (["replay", "bag", "--nonsense"], "unrecognized arguments: --nonsense"),
         (["replay", "bag", "--storage", "tape"], "invalid choice: 'tape'"),
     ],

@@ -12,7 +12,7 @@ import pages
 import pytest
 
 from rs_localizer.cli.main import COMMANDS
-from rs_localizer.config import DetectorConfig
+from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.settings import parse_assignment, settings
 
 LINES = sorted({(page, line) for page in pages.NAMES for line in pages.shell(page)})
@@ -65,7 +65,12 @@ def test_launch_files_exist(page: str, line: str) -> None:
         return
     code = (pages.ROOT / "launch" / file).read_text()
     code += (pages.ROOT / "rs_localizer" / "ros" / "launching.py").read_text()
-    known = {*settings(), *settings(DetectorConfig), *re.findall(r"\"(\w+)\"", code)}
+    known = {
+        *settings(),
+        *settings(DetectorConfig),
+        *settings(FeatureConfig),
+        *re.findall(r"\"(\w+)\"", code),
+    }
     if file == "two_cameras.launch.py":  # which puts these names together
         known |= {"left", "right", "left_params_file", "right_params_file"}
     assert {word.partition(":=")[0] for word in arguments if not word.startswith("--")} <= known, (

@@ -60,4 +60,4 @@ def test_the_tree_of_the_architecture_is_that_of_the_package() -> None:
     (tree,) = pages.fenced("docs/architecture.md", "text")
     named = {line.split()[0].rstrip("/") for line in tree.splitlines()[1:]}
     parts = {path.name for path in (pages.ROOT / "rs_localizer").iterdir()}
-    assert named == {name for name in parts if name not in ("__pycache__", "py.typed")}
+    assert named == {name for name in parts if name not in ("__pycache__", "compiled", "py.typed")}

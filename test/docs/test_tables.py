@@ -13,7 +13,7 @@ import pages
 import pytest
 
 from rs_localizer.cli.main import COMMANDS
-from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.localizer.feed import Feed
@@ -22,8 +22,9 @@ from rs_localizer.solvers.table import SOLVERS, find_solver
 
 PACKAGE = pages.ROOT / "rs_localizer"
 OF_NODES: list[tuple[Kind, set[str]]] = [
-    (NodeConfig, {page for page in pages.NAMES if page != "docs/detector.md"}),
+    (NodeConfig, {*pages.NAMES} - {"docs/detector.md", "docs/features.md"}),
     (DetectorConfig, {"docs/detector.md"}),
+    (FeatureConfig, {"docs/features.md"}),
 ]
 
 
@@ -142,7 +143,7 @@ def spelled(node: ast.AST, module: ModuleType) -> str:
     ("node", "heading"),
     [
         ("localizer", "## States of the localizer"),
-        ("detector", "## States of the marker detector"),
+        ("detector", "## States of the detectors"),
     ],
 )
 def test_every_state_is_explained(node: str, heading: str) -> None:

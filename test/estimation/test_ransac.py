@@ -5,7 +5,7 @@ import pytest
 
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior_terms import motion_terms
-from rs_localizer.estimation.ransac import NOTHING, Candidate, Hypotheses, search
+from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses, search
 from rs_localizer.estimation.sampling import Pool, generator
 
 IDENTITY = np.eye(3)
@@ -53,9 +53,8 @@ def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotation
         solve=solver, sample_size=6, solutions=1, block=50, score_scale=8.0, final_scale=2.0,
         prior=motion_terms((0.0, 0.0), (0.0, 0.0)), noise=1.0,
     )  # fmt: skip
-    return search(
-        observations, hypotheses, rotations, pools, start, confidence, max_samples, generator(seed)
-    )
+    draws = Draws(rotations, pools, confidence, max_samples, generator(seed))
+    return search(observations, hypotheses, draws, start)
 
 
 def everything(observations):

@@ -6,8 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.estimation.model_error import gain_of_shaking
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.shaking import _share, follow
+from rs_localizer.estimation.shake_sizes import _share, sizes_and_step
+from rs_localizer.estimation.shaking import Scales, follow
 from rs_localizer.localizer import assumptions
 from rs_localizer.solvers.table import find_solver
 
@@ -47,7 +49,7 @@ def shaken(seed, size, count=100, outliers=0):
 
 def followed(observations, state, inliers=None, size=0.003):
     inliers = np.ones(len(observations), dtype=bool) if inliers is None else inliers
-    return follow(observations, state, inliers, TERMS, 0.5, size, ASSUMED.shake, 2.0)
+    return follow(observations, state, inliers, TERMS, Scales(0.5, size, ASSUMED.shake, 2.0))
 
 
 def turns(state, coefficients):
@@ -120,3 +122,58 @@ def test_sizes_are_shared_among_neighbouring_degrees(count):
     middle = slice(2, -2)
     expected = np.convolve(found, weights)[middle] / np.convolve(np.ones(count), weights)[middle]
     np.testing.assert_allclose(sizes, expected + 0.25)
+
+
+def gain(observations, state):
+    return gain_of_shaking(
+        observations.packed, state, observations.row_time_gradient, observations.rays,
+        np.ones(len(observations), dtype=bool), TERMS, 22, 2.0 * len(observations) - 12.0, NOISE,
+    )  # fmt: skip
+
+
+def test_one_linear_solve_tells_whether_shaking_may_be_there():
+    """A tenth of a pixel of noise, and swings of as much about all axes."""
+    still = [gain(*shaken(seed, 0.0, count=250)[:2]) for seed in range(20)]
+    assert min(still) >= 0.0
+    assert np.mean(np.array(still) > 0.1) < 0.3
+    for seed in range(5):
+        observations, state, _ = shaken(seed, 0.0005, count=250)
+        assert gain(observations, state) > 5.0
+
+
+def plain_sizes_and_step(columns, errors, prior, sizes, noise, least):
+    """Expectation maximization by whole matrices, at coefficients of zero."""
+    products, right = columns.T @ columns, columns.T @ errors
+
+    def solved(doubt):
+        known = np.diag(np.concatenate([np.zeros(18), np.repeat(1.0 / (doubt * sizes), 3)]))
+        known[:18, :18] += prior
+        covariance = np.linalg.inv(products / noise**2 + known)
+        return covariance @ right / noise**2, covariance
+
+    for _ in range(7):
+        step, covariance = solved(1.0)
+        squares = (step**2 + np.diag(covariance))[18:].reshape(-1, 3).mean(axis=1)
+        left = np.sum((errors - columns @ step) ** 2)
+        noise = np.sqrt(left / (len(errors) - np.trace(covariance @ products) / noise**2))
+        sizes = np.empty_like(squares)
+        _share(squares, least**2, sizes)
+    return *solved(2.0), noise, sizes
+
+
+def test_sizes_step_and_noise_are_those_of_plain_matrices():
+    rng = np.random.default_rng(4)
+    columns = rng.normal(size=(160, 18 + 3 * 11))
+    columns[:, :18] *= 10.0 ** rng.uniform(-2.0, 2.0, 18)
+    errors = columns[:, 18:30] @ rng.normal(size=12) + 0.5 * rng.normal(size=160)
+    prior = np.diag(rng.uniform(0.0, 1.0, 18))
+    sizes = np.full(11, 0.5)
+    expected = plain_sizes_and_step(columns, errors, prior, sizes.copy(), 1.0, 0.01)
+    step, covariance, noise = sizes_and_step(
+        columns.T @ columns, columns.T @ errors, errors @ errors, 160.0, prior, np.zeros(18),
+        np.zeros((11, 3)), 1.0, 0.01, sizes,
+    )  # fmt: skip
+    np.testing.assert_allclose(step, expected[0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(covariance, expected[1], rtol=1e-6, atol=1e-12)
+    assert noise == pytest.approx(expected[2], rel=1e-8)
+    np.testing.assert_allclose(sizes, expected[3], rtol=1e-7)

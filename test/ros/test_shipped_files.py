@@ -16,7 +16,7 @@ import rclpy
 import yaml
 from rclpy.context import Context
 
-from rs_localizer.config import DetectorConfig
+from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.ros.localizer.feed import Feed
@@ -138,6 +138,8 @@ def parameters(description: list[Piece], executable: str) -> dict[str, Any]:
 
 
 MAP = {"markers.launch.py": {"marker_map": "wall.yaml"}}
+LOCALIZING = ["localizer.launch.py", "markers.launch.py", "features.launch.py"]
+DETECTORS = {"markers.launch.py": DetectorConfig, "features.launch.py": FeatureConfig}
 
 
 @pytest.mark.parametrize("file", [path.name for path in (ROOT / "launch").glob("*.launch.py")])
@@ -163,16 +165,16 @@ def test_every_input_can_be_remapped(describe: Describe) -> None:
     assert launched.options["name"] == NODE_NAME
 
 
-@pytest.mark.parametrize("file", ["localizer.launch.py", "markers.launch.py"])
+@pytest.mark.parametrize("file", LOCALIZING)
 def test_arguments_that_are_not_given_change_nothing(describe: Describe, file: str) -> None:
     assert parameters(describe(file, **MAP.get(file, {})), "localizer") == {}
 
 
-@pytest.mark.parametrize("file", ["localizer.launch.py", "markers.launch.py"])
+@pytest.mark.parametrize("file", LOCALIZING)
 def test_every_setting_can_be_given(describe: Describe, file: str) -> None:
     names = {name for name in settings() if "." not in name}
-    if file == "markers.launch.py":
-        names |= set(settings(DetectorConfig))
+    if file in DETECTORS:
+        names |= set(settings(DETECTORS[file]))
     assert names | {"use_sim_time"} <= declared(describe(file, **MAP.get(file, {})))
     given = {
         "readout_time": "2e-2", "seed": "3", "tracking": "False", "map_frame": "1",
@@ -202,6 +204,19 @@ def test_the_detector_knows_the_localizers_shutter(describe: Describe, tmp_path:
         "min_side": 12.0, "use_sim_time": True,
     }  # fmt: skip
     assert parameters(description, "localizer") == {"stamp_offset": 0.005, "use_sim_time": True}
+
+
+def test_features_and_localizer_share_the_camera(describe: Describe) -> None:
+    chosen = {"features": "orb", "max_keypoints": "500", "map_file": "map.npz", "image": "eye"}
+    description = describe("features.launch.py", **chosen, use_sim_time="true")
+    launched = node(description, "feature_detector")
+    assert dict(launched.options["remappings"]).keys() == {
+        "image", "image/compressed", "camera_info",
+    }  # fmt: skip
+    assert parameters(description, "feature_detector") == {
+        "features": "orb", "max_keypoints": 500, "use_sim_time": True,
+    }  # fmt: skip
+    assert parameters(description, "localizer") == {"map_file": "map.npz", "use_sim_time": True}
 
 
 def test_markers_need_a_map(describe: Describe, tmp_path: Path) -> None:

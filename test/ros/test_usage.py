@@ -8,13 +8,18 @@ import sys
 import pytest
 
 import rs_localizer
-from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.ros.usage import answer
 from rs_localizer.settings import settings
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), [("localizer", NodeConfig), ("marker_detector", DetectorConfig)]
+    ("name", "kind"),
+    [
+        ("localizer", NodeConfig),
+        ("marker_detector", DetectorConfig),
+        ("feature_detector", FeatureConfig),
+    ],
 )
 def test_help_names_every_parameter_with_its_default(name: str, kind: type) -> None:
     text = answer(name, ["--help"])
@@ -23,7 +28,7 @@ def test_help_names_every_parameter_with_its_default(name: str, kind: type) -> N
     for parameter, one in settings(kind).items():
         assert f"\n  {parameter}: " in text
         assert one.description in text
-    assert "\n  readout_time: 0.0\n" in text
+    assert "\n  autostart: True\n" in text
 
 
 @pytest.mark.parametrize("words", [[], ["--ros-args", "-p", "x:=--help"], ["-p", "seed:=1"]])

@@ -12,7 +12,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
-from rs_localizer.trajectory.online import MeasuredReadout, ReadoutMonitor
+from rs_localizer.trajectory.measured_readout import MeasuredReadout
+from rs_localizer.trajectory.online import ReadoutMonitor
 
 READOUT = 0.03
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.node_settings import add_settings, settings_of
+from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     if args.out.suffix not in WRITERS:
         raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
-    config = settings_of(args)
+    config = given_settings(args)
     if args.out.exists() and not args.overwrite:
         raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.node_settings import add_settings, settings_of
+from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.shots import shots_of
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     if args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
-    config, markers = settings_of(args), _markers(args)
+    config, markers = given_settings(args), _markers(args)
     origin = _origin(args, markers)
     if args.out.exists() and not args.overwrite:
         raise ValueError(f"{args.out} exists; choose another --out, or --overwrite")

@@ -17,6 +17,8 @@ from typing import Any, Self, TypeVar, cast
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
+from rs_localizer.core.lanes import old_caches, shipped
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 if importlib.util.find_spec("scipy") is None:  # Numba would say so in the first kernel, and not why
@@ -91,7 +93,8 @@ class _Locator:
         names = function.__module__.split(".")
         part = names[1] if len(names) > 1 else ""
         self._py_file = file  # Numba's name, for its warnings
-        self._directory = cache_directory() / _digest(part, _PACKAGE) / function.__module__
+        self.folder = Path(_digest(part, _PACKAGE), function.__module__)
+        self._directory = cache_directory() / self.folder
         self._line = function.__code__.co_firstlineno
 
     @classmethod
@@ -100,6 +103,7 @@ class _Locator:
 
     def ensure_cache_path(self) -> None:
         self._directory.mkdir(parents=True, exist_ok=True)
+        old_caches.remove_others(self._directory.parent)
 
     def get_cache_path(self) -> str:
         return str(self._directory)
@@ -146,19 +150,41 @@ class _Cache(FunctionCache):
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
-        self._cache_file: _File = _File(
-            self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp()
-        )
+        locator = self._impl.locator
+        name, stamp = self._impl.filename_base, locator.get_source_stamp()
+        self._cache_file: _File = _File(self._cache_path, name, stamp)
+        self._shipped = _File(str(shipped.FOLDER / locator.folder), name, stamp)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
+        """What came with the package, so that a machine's users get the same bits, else theirs."""
+        found = self._load_shipped(signature, target)
+        return self._load_own(signature, target) if found is None else found
+
+    def _load_own(self, signature: Any, target: Any) -> Any:
         try:
-            return super().load_overload(signature, target)
+            found = super().load_overload(signature, target)
+            if found is not None:
+                old_caches.mark(Path(self._cache_path).parent)
+            return found
         except (*_DAMAGE, pickle.UnpicklingError) as error:
             _say(f"damaged files are compiled anew ({self._cache_file._index_path}: {error!r})")
             with contextlib.suppress(OSError):  # saving says what is wrong with the folder
                 self._cache_file.remove()
         except OSError:
             pass
+        return None
+
+    def _load_shipped(self, signature: Any, target: Any) -> Any:
+        if not shipped.FOLDER.is_dir():
+            return None
+        target.refresh()  # or the code would call a runtime that is not there yet
+        try:
+            for key in shipped.keys(self._index_key(signature, target.codegen())):
+                found = self._shipped.load(key)
+                if found is not None:
+                    return self._impl.rebuild(target, found)
+        except (*_DAMAGE, pickle.UnpicklingError, OSError) as error:
+            _say(f"what came with the package is damaged ({shipped.FOLDER}: {error!r})")
         return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:

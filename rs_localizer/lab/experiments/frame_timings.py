@@ -9,7 +9,8 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.ransac import NOTHING, Hypotheses, search
+from rs_localizer.estimation.ransac import NOTHING, Draws, Hypotheses, search
+from rs_localizer.estimation.refine import EXPECTED_NOISE
 from rs_localizer.estimation.sampling import Pool, generator
 from rs_localizer.lab.experiments.competitors import robust_subjects
 from rs_localizer.lab.experiments.plain_ransac import observe
@@ -73,16 +74,16 @@ def _all_samples(observations: Observations, rotation: Array, config: LocalizerC
 
     threshold = config.inlier_threshold
     terms, _ = assumptions(camera(), config, solver)
+    never_sure = 1.0
     search(
         observations,
         Hypotheses(
             solve, solver.sample_size, solver.solutions, _BLOCK, 4.0 * threshold, threshold,
-            terms, 0.5 * threshold,
+            terms, EXPECTED_NOISE * threshold,
         ),
-        [rotation],
-        [Pool(np.arange(len(observations)))],
+        Draws(
+            [rotation], [Pool(np.arange(len(observations)))], never_sure, _HYPOTHESES,
+            generator(config.seed),
+        ),
         NOTHING,
-        1.0,  # never sure enough to stop
-        _HYPOTHESES,
-        generator(config.seed),
     )  # fmt: skip

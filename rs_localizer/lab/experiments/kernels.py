@@ -7,15 +7,10 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
+from rs_localizer.estimation.packing import pack, weighted
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import refine
-from rs_localizer.estimation.residuals import (
-    normal_equations,
-    pack,
-    set_weights,
-    squared_errors,
-    truncated_cost,
-)
+from rs_localizer.estimation.refine import EXPECTED_NOISE, refine
+from rs_localizer.estimation.residuals import normal_equations, squared_errors, truncated_cost
 from rs_localizer.estimation.scoring import optimize, state_of_model
 
 
@@ -62,7 +57,7 @@ def refine_frames(
 ) -> Array:
     """Local optimisation and final refinement of the Localizer on all points: states (h,24)."""
     states = np.full((len(models), STATE_SIZE), np.nan)
-    noise = 0.5 * threshold
+    noise = EXPECTED_NOISE * threshold
     for i in range(len(models)):
         if np.isnan(models[i, 0]):
             continue
@@ -75,8 +70,8 @@ def refine_frames(
             continue
         errors = squared_errors(data, points.shape[1], state, gradient)
         gate = 4.0 * threshold * threshold
-        set_weights(data, np.where(errors < gate, 1.0, 0.0))
-        state, _, _, _ = refine(data, state, gradient, 1e6, 0.0, prior, noise, 2, 10, 1e-6)
+        inliers = weighted(data, np.where(errors < gate, 1.0, 0.0))
+        state, _, _, _ = refine(inliers, state, gradient, 1e6, 0.0, prior, noise, 2, 10, 1e-6)
         states[i] = state
     return states
 

@@ -1,1 +1,1 @@
-"""The node ``marker_detector``."""
+"""The nodes that look at images: ``marker_detector`` and ``feature_detector``."""

@@ -7,16 +7,24 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import CameraInfo
 
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice, Reason
-from rs_localizer.io.camera_info import Calibration
+from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.io.images import Image
 from rs_localizer.io.messages import MessageError, stamp_ns
-from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.io.topics import CAMERA_INFO, ODOMETRY, POSE
 from rs_localizer.markers.overlay import CameraPath, Picture, draw_detections, draw_world
 from rs_localizer.markers.poses import rotation_of_quaternion
 from rs_localizer.pipeline.images import Detected
+from rs_localizer.ros.node.inputs import LATCHED, Topic
+from rs_localizer.ros.node.refusals import Refusals
+from rs_localizer.ros.node.worker import Worker
+from rs_localizer.settings import NODE_NAME
 
 # Images that wait for a pose; those without one are shown without cubes.
 _WAITING = 3
@@ -25,7 +33,9 @@ _PATIENCE = 10
 # Poses that wait for an image.
 _MOST_POSES = 100
 
-Show = Callable[[Detected, Picture], None]
+_POSE, _ODOMETRY = f"{NODE_NAME}/{POSE}", f"{NODE_NAME}/{ODOMETRY}"
+
+Show = Callable[[Image, Picture], None]
 
 
 class DebugPictures:
@@ -40,17 +50,17 @@ class DebugPictures:
         self._show = show
         self._notice = notice
         self._calibration: Calibration | None = None
-        self._waiting: deque[tuple[Detected, MarkerMap]] = deque()
+        self._waiting: deque[Detected] = deque()
         self._poses: dict[int, CameraPath] = {}  # without a twist, by stamp
         self._unanswered = _PATIENCE
 
-    def add(self, detected: Detected, marker_map: MarkerMap, config: DetectorConfig) -> None:
+    def add(self, detected: Detected, config: DetectorConfig) -> None:
         """Take an image; the oldest that still waits is shown as it is."""
-        self._waiting.append((detected, marker_map))
+        self._waiting.append(detected)
         self._unanswered += 1
         while len(self._waiting) > (_WAITING if self._unanswered <= _PATIENCE else 0):
             oldest = self._waiting.popleft()
-            self._finish(oldest, self._pose_of(oldest[0], config), config)
+            self._finish(oldest, self._pose_of(oldest, config), config)
         for stamp in [s for s in self._poses if s < detected.image.stamp_ns - 10**9]:
             del self._poses[stamp]
 
@@ -78,7 +88,7 @@ class DebugPictures:
         twist = message.twist.twist
         path = _path(message, message.pose.pose, _vector(twist.linear), _vector(twist.angular))
         for item in self._waiting:
-            if self._belongs(path, item[0], config):
+            if self._belongs(path, item, config):
                 while self._waiting[0] is not item:
                     self._finish(self._waiting.popleft(), None, config)
                 self._finish(self._waiting.popleft(), path, config)
@@ -94,16 +104,13 @@ class DebugPictures:
         found = (path for path in self._poses.values() if self._belongs(path, detected, config))
         return next(found, None)
 
-    def _finish(
-        self, item: tuple[Detected, MarkerMap], path: CameraPath | None, config: DetectorConfig
-    ) -> None:
-        detected, marker_map = item
+    def _finish(self, detected: Detected, path: CameraPath | None, config: DetectorConfig) -> None:
         picture = draw_detections(detected.image.pixels, detected.detections)
         camera = self._camera(config)
         if path is not None and camera is not None:
             first_row_ns = detected.image.stamp_ns + round(1e9 * config.stamp_offset)
-            draw_world(picture, detected.detections, marker_map, camera, path, first_row_ns)
-        self._show(detected, picture)
+            draw_world(picture, detected.detections, detected.map, camera, path, first_row_ns)
+        self._show(detected.image, picture)
 
     def _camera(self, config: DetectorConfig) -> Camera | None:
         if self._calibration is None:
@@ -123,3 +130,35 @@ def _path(message: Any, pose: Any, linear: Any, angular: Any) -> CameraPath:
     q = pose.orientation
     rotation = rotation_of_quaternion([q.x, q.y, q.z, q.w])
     return CameraPath(stamp_ns(message), _vector(pose.position), rotation, linear, angular)
+
+
+def picture_topics(
+    worker: Worker[Any, Any], pictures: DebugPictures, refusals: Refusals
+) -> dict[str, Topic]:
+    """What the pictures need besides the images: the calibration, and the localizer's answers.
+
+    Args:
+        worker: gets the updates, called in the thread of the inputs.
+        pictures: of the worker.
+        refusals: told of messages that cannot be used.
+    """
+
+    def take_camera_info(message: CameraInfo) -> None:
+        try:
+            calibration = read_camera_info(message)
+        except MessageError as error:
+            refusals.notice(Reason.BAD_CAMERA_INFO, str(error))
+            return
+        worker.update(CAMERA_INFO, lambda _: pictures.take_camera_info(calibration))
+
+    def take_pose(message: PoseStamped) -> None:
+        worker.update(POSE, lambda _: pictures.take_pose(message))
+
+    def take_odometry(message: Odometry) -> None:
+        worker.update(ODOMETRY, lambda work: pictures.take_odometry(message, work.config))
+
+    return {
+        CAMERA_INFO: Topic(CameraInfo, take_camera_info, LATCHED),
+        _POSE: Topic(PoseStamped, take_pose),
+        _ODOMETRY: Topic(Odometry, take_odometry),
+    }

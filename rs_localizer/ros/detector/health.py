@@ -1,9 +1,10 @@
-"""How the marker detector is: a level, one sentence, and the numbers by readable names."""
+"""How a node that looks at images is: a level, one sentence, and numbers by readable names."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from rs_localizer.ros.node.health import (
     SOME,
@@ -21,14 +22,18 @@ from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import WINDOW, Summary
 
 
-@dataclass(frozen=True, slots=True)
-class Sight:
+class Sight(Protocol):
     """What is told of the last image."""
 
-    markers: int  # of the map
-    boards: int
-    corners: int
-    unknown: int  # markers that are not in the map
+    @property
+    def text(self) -> str:
+        """In one sentence."""
+        ...
+
+    @property
+    def values(self) -> dict[str, str]:
+        """By readable names."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +41,7 @@ class Condition:
     """What the node knows of itself."""
 
     life_cycle: str  # label of the state
+    output: str  # what it publishes
     wanted: bool  # whether somebody listens
     silence: Mapping[str, Silence]  # of the image topics
     oddities: Mapping[str, str] = field(default_factory=dict)  # noticed lately, by name
@@ -51,12 +57,7 @@ def diagnose(condition: Condition, summary: Summary[Sight]) -> Health:
         **milliseconds("Latency", summary.latency),
     }
     if summary.last is not None:
-        values |= {
-            "Markers": str(summary.last.markers),
-            "Boards": str(summary.last.boards),
-            "Corners": str(summary.last.corners),
-            "Markers not in the map": str(summary.last.unknown),
-        }
+        values |= summary.last.values
     values |= {
         "Images received": str(sum(summary.received.values())),
         "Images done": str(summary.answered),
@@ -71,7 +72,7 @@ def _judge(condition: Condition, summary: Summary[Sight]) -> Judgement:
     if (idle := out_of_service(condition.life_cycle)) is not None:
         return idle
     if not condition.wanted:
-        return Level.OK, "idle", "nobody listens to the correspondences or the debug image"
+        return Level.OK, "idle", f"nobody listens to the {condition.output} or the debug image"
     causes = [f"{item.topic}: {item.cause}" for item in condition.silence.values() if item.cause]
     if causes or not condition.silence:
         state = f"{WAITING} images"
@@ -92,13 +93,4 @@ def _judge(condition: Condition, summary: Summary[Sight]) -> Judgement:
     if condition.oddities:
         return Level.WARN, "detecting", told(condition.oddities)
     last = summary.last
-    if last is None:
-        return Level.OK, "detecting", "no image has been looked at yet"
-    if last.corners == 0:
-        return Level.OK, "detecting", "the last image shows nothing of the map"
-    return (
-        Level.OK,
-        "detecting",
-        f"{last.corners} corners of {last.markers} markers"
-        + (f" and {last.boards} boards" if last.boards else ""),
-    )
+    return Level.OK, "detecting", "no image has been looked at yet" if last is None else last.text

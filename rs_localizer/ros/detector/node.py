@@ -1,101 +1,151 @@
-"""The node ``marker_detector``: images in; correspondences with a marker map out.
+"""A node that looks at images: images in, a cloud for each of them out.
 
 It listens to images only while somebody listens to it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from rclpy.clock import Clock, ClockType
 from rclpy.timer import Timer
+from sensor_msgs.msg import CompressedImage, Image
 
-from rs_localizer.config import DetectorConfig, ImageTransport
+from rs_localizer.config import DetectorConfig, FeatureConfig, ImageTransport
 from rs_localizer.core.reasons import Notice
+from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
-from rs_localizer.pipeline.images import Detected, FrameDetector
-from rs_localizer.ros.detector.debug import DebugPictures
-from rs_localizer.ros.detector.feed import FOR_PICTURES, IMAGES, Feed, Work
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.ros.detector.health import Condition, Sight, diagnose
-from rs_localizer.ros.detector.outputs import DetectorOutputs
+from rs_localizer.ros.detector.outputs import ImageOutputs, Show
 from rs_localizer.ros.node.health import Health
+from rs_localizer.ros.node.inputs import Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW
-from rs_localizer.settings import DETECTOR_NAME
+from rs_localizer.ros.node.worker import Worker
 
+# Types of the topics whose messages are looked at.
+_IMAGES = {IMAGE: Image, COMPRESSED_IMAGE: CompressedImage}
 # How often the node looks whether somebody listens, in s.
 _LOOK_PERIOD = 0.2
-# Notices that the diagnostics repeat.
-_ODD = ("wrong_map", "repeated_markers")
+
+Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
+Found = TypeVar("Found")
+Found_co = TypeVar("Found_co", covariant=True)
 
 
-def tell(detected: Detected) -> tuple[int, Sight]:
-    """Stamp of an image (ns), and what the statistics keep of it."""
-    found = detected.detections
-    sight = Sight(
-        markers=sum(int(item.known.sum()) for item in found.markers),
-        boards=len(found.boards),
-        corners=len(found.ids),
-        unknown=len(found.unknown),
-    )
-    return detected.image.stamp_ns, sight
+class Finder(Protocol[Found_co]):
+    """What looks at the images: the class that works offline, too."""
+
+    def take(self, message: Any) -> Found_co | Refusal:
+        """What a sensor_msgs/Image or CompressedImage shows."""
+        ...
+
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        ...
 
 
-class MarkerDetectorNode(ManagedNode[DetectorConfig, Work, Detected, Sight]):
-    """Looks for markers; see :class:`rs_localizer.ros.node.managed.ManagedNode`."""
+@dataclass(slots=True)
+class Work(Generic[Settings, Found]):
+    """What the worker alone touches."""
 
-    task = DETECTOR_NAME
+    finder: Finder[Found]
+    config: Settings
+    draw: Callable[[Found, Settings], None]  # makes the debug picture
+
+
+class ImageNode(
+    ManagedNode[Settings, Work[Settings, Found], Found, Sight], Generic[Settings, Found]
+):
+    """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
+
+    A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
+    :meth:`drawing` and :meth:`describe`, and :meth:`picture_topics` where it needs any.
+    """
+
     lack = Notice.NO_IMAGES
-    checked_at_start = False  # the map may come later: on_configure tells
+    output: ClassVar[str]  # topic of the clouds
+    odd: ClassVar[tuple[Notice, ...]] = ()  # notices that the diagnostics repeat
 
-    def __init__(self, **options: Any) -> None:
-        self._outputs: DetectorOutputs | None = None
-        self._feed: Feed | None = None
+    def __init__(
+        self,
+        name: str,
+        kind: Any,  # class of its settings, which mypy cannot follow to the base class
+        tell: Callable[[Found], tuple[int, Sight]],
+        **options: Any,
+    ) -> None:
+        self._outputs: ImageOutputs[Found] | None = None
+        self._topics: dict[str, Topic] = {}  # all that may be listened to
+        self._for_pictures: tuple[str, ...] = ()
         self._timer: Timer | None = None
         self._listening: tuple[str, ...] = ()
-        super().__init__(DETECTOR_NAME, DetectorConfig, tell, **options)
+        super().__init__(name, kind, tell, **options)
+
+    # -- what a node looks for ---------------------------------------------------------------
+
+    def make_finder(self, config: Settings) -> Finder[Found]:
+        """Raise ``ValueError`` for settings that cannot be used."""
+        raise NotImplementedError
+
+    def make_cloud(self, found: Found, make: Make) -> Any:
+        """The sensor_msgs/PointCloud2 of an image."""
+        raise NotImplementedError
+
+    def drawing(self, show: Show) -> Callable[[Found, Settings], None]:
+        """What makes debug pictures, which ``show`` takes, in the worker's thread."""
+        raise NotImplementedError
+
+    def picture_topics(self, worker: Worker[Work[Settings, Found], Found]) -> Mapping[str, Topic]:
+        """What else is listened to while somebody looks at the debug pictures."""
+        return {}
+
+    def describe(self, finder: Finder[Found]) -> str:
+        """What the node is active with, for the log."""
+        raise NotImplementedError
+
+    # -- as every managed node ---------------------------------------------------------------
 
     def kernels(self) -> Callable[[], None]:
         try:
-            return FrameDetector(self.config).warm_up
+            return self.make_finder(self.config).warm_up
         except ValueError:  # of which on_configure tells, at once
             return lambda: None
 
-    def check(self, config: DetectorConfig) -> None:
-        # Before it is configured, the map may still be missing.
-        if config.marker_map or self.worker is not None:
-            FrameDetector(config)
+    def check(self, config: Settings) -> None:
+        self.make_finder(config)
 
-    def open(self, config: DetectorConfig) -> None:
-        detector = FrameDetector(config, self.refusals.notice)
-        self._outputs = outputs = DetectorOutputs(self)
-        work = Work(detector, config, DebugPictures(outputs.show, self.refusals.notice))
+    def open(self, config: Settings) -> None:
+        finder = self.make_finder(config)
+        self._outputs = outputs = ImageOutputs(self, self.output, self.make_cloud)
+        work = Work(finder, config, self.drawing(outputs.show))
 
-        def publish(detected: Detected) -> None:
-            outputs.publish(detected)
+        def publish(found: Found) -> None:
+            outputs.publish(found)
             if outputs.pictures_wanted():
-                work.debug.add(detected, work.detector.map, work.config)
+                work.draw(found, work.config)
 
-        self._feed = Feed(self.employ(work, publish), self.refusals)
-        found = detector.map
-        self._map = (
-            f"{len(found.markers)} markers and {len(found.boards)} boards in {found.map_frame}"
-        )
+        worker = self.employ(work, publish)
+        further = self.picture_topics(worker)
+        self._for_pictures = tuple(further)
+        self._topics = {**_image_topics(worker), **further}
+        self._description = self.describe(finder)
 
     def close(self) -> None:
-        self._feed = None
+        self._topics = {}
         if self._outputs is not None:
             self._outputs.close()
             self._outputs = None
 
-    def begin(self, config: DetectorConfig) -> None:
+    def begin(self, config: Settings) -> None:
         assert self._outputs is not None
         self._timer = self.create_timer(
             _LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.get_logger().info(
-            f"active with {self._map}; listening to images while somebody listens to "
+            f"active with {self._description}; listening to images while somebody listens to "
             f"{' or '.join(self._outputs.topics)}"
         )
 
@@ -105,20 +155,21 @@ class MarkerDetectorNode(ManagedNode[DetectorConfig, Work, Detected, Sight]):
             self.destroy_timer(self._timer)
             self._timer = None
 
-    def change(self, config: DetectorConfig) -> None:
+    def change(self, config: Settings) -> None:
         if self.worker is not None:
             self.worker.update("settings", lambda work: self._change(work, config))
 
-    def _change(self, work: Work, config: DetectorConfig) -> None:
-        work.detector = FrameDetector(config, self.refusals.notice)
+    def _change(self, work: Work[Settings, Found], config: Settings) -> None:
+        work.finder = self.make_finder(config)
         work.config = config
 
     def examine(self) -> tuple[Health, str]:
         condition = Condition(
             life_cycle=self.state,
+            output=self.output,
             wanted=bool(self._listening),
-            silence={name: item for name, item in self.silence.items() if name in IMAGES},
-            oddities=self.refusals.recent(_ODD, WINDOW),
+            silence={name: item for name, item in self.silence.items() if name in _IMAGES},
+            oddities=self.refusals.recent(self.odd, WINDOW),
         )
         return diagnose(condition, self.statistics.summary()), ""
 
@@ -127,15 +178,13 @@ class MarkerDetectorNode(ManagedNode[DetectorConfig, Work, Detected, Sight]):
     def _look(self) -> None:
         """Listen to what is needed just now."""
         assert self._outputs is not None
-        assert self._feed is not None
         wanted: tuple[str, ...] = ()
         if self._outputs.pictures_wanted():
-            wanted = (*FOR_PICTURES, self._image_topic())
+            wanted = (*self._for_pictures, self._image_topic())
         elif self._outputs.clouds_wanted():
             wanted = (self._image_topic(),)
         if wanted != self._listening:
-            known = self._feed.topics()
-            self.listen({name: known[name] for name in wanted})
+            self.listen({name: self._topics[name] for name in wanted})
             self._listening = wanted
 
     def _image_topic(self) -> str:
@@ -143,7 +192,19 @@ class MarkerDetectorNode(ManagedNode[DetectorConfig, Work, Detected, Sight]):
         transport = self.config.transport
         if transport != ImageTransport.AUTO:
             return IMAGE if transport == ImageTransport.RAW else COMPRESSED_IMAGE
-        for topic in IMAGES:
+        for topic in _IMAGES:
             if self.count_publishers(self.resolve_topic_name(topic)):
                 return topic
         return self._listening[-1] if self._listening else IMAGE
+
+
+def _image_topics(worker: Worker[Work[Settings, Found], Found]) -> dict[str, Topic]:
+    """Both topics of images, whose messages go to the worker."""
+
+    def images(topic: str) -> Callable[[Any], None]:
+        def take(message: Any) -> None:
+            worker.process(topic, message, lambda work, image: work.finder.take(image))
+
+        return take
+
+    return {name: Topic(kind, images(name)) for name, kind in _IMAGES.items()}

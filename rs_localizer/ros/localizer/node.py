@@ -9,12 +9,12 @@ from typing import Any
 from rclpy.service import Service
 from std_srvs.srv import Trigger
 
-from rs_localizer.config import NodeConfig
+from rs_localizer.config import NodeConfig, Px4Odometry
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.ros.localizer import transforms
+from rs_localizer.ros.localizer import px4, transforms
 from rs_localizer.ros.localizer.answers import Answer, tell
 from rs_localizer.ros.localizer.broadcaster import Broadcaster
 from rs_localizer.ros.localizer.feed import Feed, described, warm_up
@@ -41,6 +41,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
         self._feed: Feed | None = None
         self._outputs: Outputs | None = None
+        self._px4: px4.Px4Output | None = None
         self._reset_service: Service | None = None
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
@@ -62,6 +63,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def check(self, config: NodeConfig) -> None:
         FrameLocalizer(config)
         transforms.check(config)
+        px4.check(config)
 
     def open(self, config: NodeConfig) -> None:
         frames = FrameLocalizer(config, self.refusals.notice, self._broadcaster.tf)
@@ -70,18 +72,26 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
             self.get_logger().info(described(frames.map))
         frames.warm_up()  # what has been set since they were compiled
         self._broadcaster.configure(config)
-        self._outputs = Outputs(
-            self, afterwards=lambda frame: self._broadcaster.publish(frame, frames.config)
-        )
+        if config.px4_odometry != Px4Odometry.NONE:
+            self._px4 = px4.Px4Output(self, frames)
+        self._outputs = Outputs(self, afterwards=lambda frame: self._send_on(frame, frames.config))
         self._localizer = frames
         worker = self.employ(frames, self._outputs.publish)
         say, needs_tf = self.get_logger().info, self._imu_came.trigger
         self._feed = Feed(worker, frames, self.refusals, say, needs_tf)
         self._reset_service = self.create_service(Trigger, "~/reset", self._reset)
 
+    def _send_on(self, frame: Localized, config: NodeConfig) -> None:
+        if self._px4 is not None:
+            self._px4.publish(frame)
+        self._broadcaster.publish(frame, config)
+
     def close(self) -> None:
         self._feed = self._localizer = None
         self._broadcaster.close()
+        if self._px4 is not None:
+            self._px4.close()
+            self._px4 = None
         if self._outputs is not None:
             self._outputs.close()
             self._outputs = None

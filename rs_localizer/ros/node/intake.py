@@ -16,7 +16,7 @@ from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.subscription import Subscription
 
-from rs_localizer.ros.node.errors import describe
+from rs_localizer.ros.node.refusals import describe
 
 # A context that is shut down by others wakes nobody: it is looked at this often, in ns.
 _CONTEXT_PERIOD = 200_000_000

@@ -15,11 +15,10 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from rs_localizer.ros.node import parameters
 from rs_localizer.ros.node.diagnostics import Diagnostics
-from rs_localizer.ros.node.errors import describe
 from rs_localizer.ros.node.health import Health
 from rs_localizer.ros.node.inputs import Inputs, Silence, Topic
 from rs_localizer.ros.node.lifecycle import RobustLifecycleNode
-from rs_localizer.ros.node.refusals import Refusals
+from rs_localizer.ros.node.refusals import Refusals, describe
 from rs_localizer.ros.node.statistics import Statistics
 from rs_localizer.ros.node.worker import State, Worker
 from rs_localizer.settings import Config

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -93,3 +94,9 @@ def _room_for(kind: str, kinds: dict[str, _Logged], now: float) -> str:
 
 def _more(silent: int) -> str:
     return f" ({silent} more since the last report)" if silent else ""
+
+
+def describe(error: Exception) -> str:
+    """An error that nobody foresaw, in one line: what, and where."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{error!r} in {where.name}, {where.filename}:{where.lineno}"

@@ -15,8 +15,8 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
 from rs_localizer.process.stopping import StopRequest
-from rs_localizer.ros.node.errors import describe
 from rs_localizer.ros.node.managed import ManagedNode
+from rs_localizer.ros.node.refusals import describe
 from rs_localizer.ros.node.worker import wait_for_workers
 
 # A waiting executor does not see signals: it looks up this often, in s.

@@ -15,8 +15,8 @@ from typing import Any, Generic, TypeVar
 
 from rs_localizer.core.reasons import Reason
 from rs_localizer.pipeline.refusal import Refusal, Waiting
-from rs_localizer.ros.node.errors import describe
 from rs_localizer.ros.node.mailbox import Mailbox, Update, Work
+from rs_localizer.ros.node.refusals import describe
 from rs_localizer.ros.node.statistics import Statistics
 
 State = TypeVar("State")

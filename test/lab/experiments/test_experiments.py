@@ -85,6 +85,8 @@ HELD = {
     "matching.localized",
     "matching.alike",
     "matching.scores",
+    "features.localized",
+    "features.better",
 }
 NOT_HELD = {
     "motion.r9p_ahead_noisy",
@@ -123,6 +125,7 @@ OPEN = {
     "robustness.points_20",
     "robustness.none_wrong",
     *(f"matching.{case}_rate" for case in ("id", "whole", "predicted")),
+    "features.orb_rate",
     "augmented-reality.plain",
     "augmented-reality.r9p",
     "augmented-reality.localized",

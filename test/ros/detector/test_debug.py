@@ -21,23 +21,21 @@ def image(second: int) -> Detected:
     seen = Detections(nothing[:, 0].astype(int), nothing, nothing[:, :2], nothing[:, 0],
                       (), (), (), ())  # fmt: skip
     pixels = np.zeros((20, 30), np.uint8)
-    return Detected(Image(second * 10**9, "camera", pixels), seen, "hall", np.dtype([]))
+    return Detected(Image(second * 10**9, "camera", pixels), seen, MAP, np.dtype([]))
 
 
 def test_without_a_localizer_an_image_is_shown_at_once() -> None:
     shown: list[int] = []
-    debug = DebugPictures(
-        lambda detected, _: shown.append(detected.image.stamp_ns // 10**9), lambda *_: None
-    )
+    debug = DebugPictures(lambda image, _: shown.append(image.stamp_ns // 10**9), lambda *_: None)
     config = DetectorConfig()
     for second in (1, 2):
-        debug.add(image(second), MAP, config)
+        debug.add(image(second), config)
     assert shown == [1, 2]
     # Poses come: images wait for theirs, but not for ever.
     debug.take_pose(PoseStamped())
     for second in range(3, 7):
-        debug.add(image(second), MAP, config)
+        debug.add(image(second), config)
     assert shown == [1, 2, 3]
     for second in range(7, 30):
-        debug.add(image(second), MAP, config)
+        debug.add(image(second), config)
     assert shown == list(range(1, 30))

@@ -10,24 +10,15 @@ from typing import Self
 import numpy as np
 from rclpy.serialization import serialize_message
 
-from rs_localizer import data
-from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.recording import CAMERA_FRAME, CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC
-from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.imu import ImuSettings, Lever, simulate_imu
-from rs_localizer.lab.simulation.imu_recording import make_imu
+from rs_localizer.lab.simulation.hand_held import CAMERA, HandHeld
 from rs_localizer.lab.simulation.recording import write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import RecordedMotion, TrueMotion, sampled_way
 from rs_localizer.ros.node.conversion import copy_message
 
-READOUT_TIME = 0.02
+READOUT_TIME = CAMERA.readout_time
 """s of the simulated camera."""
 
-_K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-_D = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
 # After these the motion starts over: a jump to which the tracker has to find again.
 _DIFFERENT = 500
 # Late enough for frames before the first one.
@@ -101,41 +92,25 @@ def simulated(
 
     With a rate (Hz) of its own there is an IMU, too, in the axes of the camera.
     """
-    motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
-    camera = Camera(640, 480, _K, _D, readout_time=READOUT_TIME)
-    world = room(sampled_way(motion).positions, np.random.default_rng(0), count=20_000)
-    start = motion.intervals_ns[0][0]
-    stamps = [start + round(k * 1e9 / rate) for k in range(different)]
-    settings = FrameSettings(points=points, noise=0.7, outliers=outliers, rate=rate)
+    flight = HandHeld(points, outliers, rate, different)
     infos: list[bytearray] = []
     clouds: list[bytearray] = []
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "frames"
         with BagWriter(path) as bag:
-            for frame in simulate_frames(camera, motion, world, settings, stamps_ns=stamps):
-                write_simulated(bag, camera, frame)
+            for frame in flight.simulate():
+                write_simulated(bag, CAMERA, frame)
         with open_bag(path) as recording:
             topics = (CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC)
             for topic, _, message in recording.messages(topics):
                 serialized = serialize_message(copy_message(message, message.__msgtype__))
                 (infos if topic == CAMERA_INFO_TOPIC else clouds).append(bytearray(serialized))
-    imus = _readings(motion, start, round(different / rate * imu_rate), imu_rate)
+    readings = flight.readings(imu_rate, CAMERA_FRAME) if imu_rate else ()
+    imus = [
+        bytearray(serialize_message(copy_message(message, message.__msgtype__)))
+        for _, message in readings
+    ]
     return Frames(rate, bytes(infos[0]), clouds, imus)
-
-
-def _readings(motion: TrueMotion, start_ns: int, count: int, rate: float) -> list[bytearray]:
-    if count == 0:
-        return []
-    settings = ImuSettings(rate=rate)
-    track = simulate_imu(motion, settings, Lever(np.eye(3), np.zeros(3)), np.random.default_rng(0))
-    first = int(np.searchsorted(track.times_ns, start_ns))
-    found = []
-    for i in range(first, first + count):
-        message = make_imu(
-            0, track.angular_velocities[i], track.specific_forces[i], settings, CAMERA_FRAME
-        )
-        found.append(bytearray(serialize_message(copy_message(message, message.__msgtype__))))
-    return found
 
 
 def _stamped(message: bytearray, stamp_ns: int) -> bytes:

@@ -1,0 +1,46 @@
+"""Looks into a wheel: what has to be in it, what must not be, and nothing of anybody else's.
+
+check_wheel.py path/to/rs_localizer-*.whl
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import zipfile
+
+# Patterns of which each has to match a file.
+WANTED = (
+    r"rs_localizer/py\.typed",
+    r"rs_localizer/data/webcam_chessboard/recording/rec\.mcap",
+    r"rs_localizer/data/webcam_chessboard/ATTRIBUTION\.md",
+    r".*\.dist-info/(licenses/)?LICENSE",
+    r".*\.data/data/share/rs_localizer/package\.xml",
+    r".*\.data/data/share/rs_localizer/config/rs_localizer\.yaml",
+    r".*\.data/data/share/rs_localizer/launch/localizer\.launch\.py",
+    r".*\.data/data/share/ament_index/resource_index/packages/rs_localizer",
+)
+# Where all files are.
+PLACES = r"(rs_localizer/|rs_localizer-[^/]+\.(dist-info|data/data/share)/).*"
+UNWANTED = r".*(__pycache__|\.pyc$|(^|/)tests?/|\.so$|\.orig$|~$)"
+
+
+def main() -> None:
+    names = zipfile.ZipFile(sys.argv[1]).namelist()
+    for pattern in WANTED:
+        assert any(re.fullmatch(pattern, name) for name in names), f"nothing like {pattern}"
+    for name in names:
+        assert re.fullmatch(PLACES, name), f"{name} is out of place"
+        assert not re.match(UNWANTED, name), f"{name} does not belong there"
+    attributed = {name.split("/")[2] for name in names if name.endswith("/ATTRIBUTION.md")}
+    data = {
+        parts[2]
+        for parts in (name.split("/") for name in names)
+        if parts[:2] == ["rs_localizer", "data"] and len(parts) > 3
+    }
+    assert data == attributed, f"data without its authors: {data - attributed}"
+    print(f"  {len(names)} files")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,218 @@
+"""``replay``, ``detect``, ``calibrate`` and ``evaluate`` of many recordings at once."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import fcntl
+import importlib.util
+import os
+import shutil
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from rs_localizer.cli import UsageError
+from rs_localizer.io.whole import told
+from rs_localizer.offline.fleet.cluster import Where, perform_all
+from rs_localizer.offline.fleet.identity import identity, program, read_marker
+from rs_localizer.offline.fleet.names import folder_names
+from rs_localizer.offline.fleet.summary import (
+    CSV,
+    DONE,
+    FAILED,
+    MARKDOWN,
+    OPEN,
+    PICTURE,
+    Row,
+    counted,
+    write_summary,
+)
+from rs_localizer.offline.fleet.task import PARTIAL, Kind, Outcome, Task, finished, readable
+from rs_localizer.process.arguments import integer
+
+# Arguments that say what to do with which recordings, and nothing of a result.
+_OF_THE_FLEET = ("recordings", "out", "workers", "scheduler", "overwrite")
+
+# Figures of a recording that are told while others are waited for.
+_TOLD = 5
+
+
+def add_fleet_arguments(parser: argparse.ArgumentParser) -> None:
+    """How many recordings are shared out."""
+    fleet = parser.add_argument_group(
+        "many recordings",
+        "Each goes into a folder of its own below --out; what is complete is not done again. Needs "
+        "Dask: pip install 'rs_localizer[fleet]'.",
+    )
+    fleet.add_argument(
+        "--workers",
+        type=integer(1),
+        metavar="N",
+        help="processes of this machine (default: one for each core)",
+    )
+    fleet.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="instead: the workers of a Dask scheduler, such as tcp://host:8786; they have to see "
+        "the same files",
+    )
+
+
+def is_fleet(args: Namespace) -> bool:
+    """Whether there are many recordings, or one is to be treated as many."""
+    return len(args.recordings) > 1 or args.workers is not None or args.scheduler is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What one command does with many recordings."""
+
+    kind: Kind
+    # What a result depends on beside the recording and the settings.
+    inputs: Callable[[Path], Sequence[Path]]
+    # Whether results of other settings are replaced; None: the command has no such option.
+    overwrite: bool | None = None
+
+
+def run_fleet(args: Namespace, plan: Plan) -> None:
+    """Do all recordings that are not done yet, and write the summary.
+
+    Raises:
+        UsageError: for options that do not go together.
+        ValueError: when results of other settings are in the way, or some recordings fail.
+    """
+    if args.out is None:
+        raise UsageError("many recordings need --out DIR, for a folder of each")
+    if args.workers is not None and args.scheduler is not None:
+        raise UsageError("--workers are of this machine; give it or --scheduler")
+    _need_dask()
+    out = args.out.resolve()
+    tasks = _tasks(args, plan, out)
+    _check(tasks, plan)
+    with told(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with only_one(out):
+        rows = {task.name: Row(task.recording, task.name, OPEN, {}) for task in tasks}
+        try:
+            _work(tasks, Where(args.scheduler, args.workers), rows)
+        finally:
+            shutil.rmtree(out / PARTIAL, ignore_errors=True)
+            _find_finished(tasks, rows)
+            write_summary(out, plan.kind.command, list(rows.values()))
+    print(f"written to {args.out}: {CSV}, {MARKDOWN}, {PICTURE}")
+    if failed := sum(row.state == FAILED for row in rows.values()):
+        raise ValueError(f"{failed} of {len(rows)} recordings failed; {args.out / CSV} says why")
+
+
+def _need_dask() -> None:
+    if importlib.util.find_spec("distributed") is None:
+        raise ValueError(
+            "many recordings need Dask, which is not installed: pip install 'rs_localizer[fleet]'"
+        )
+
+
+def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
+    recordings = list(dict.fromkeys(map(_absolute, args.recordings)))
+    kept = {name: value for name, value in vars(args).items() if name not in _OF_THE_FLEET}
+    arguments = Namespace(
+        **{name: _absolute(v) if isinstance(v, Path) else v for name, v in kept.items()}
+    )
+    settings = readable(arguments)
+    return [
+        Task(
+            plan.kind,
+            arguments,
+            recording,
+            out,
+            name,
+            identity(plan.kind.command, settings, [recording, *plan.inputs(recording)]),
+            program(),
+        )
+        for recording, name in zip(recordings, folder_names(recordings), strict=True)
+    ]
+
+
+def _absolute(path: Path) -> Path:
+    """Without "..", and with links as they are called."""
+    return Path(os.path.abspath(path))
+
+
+def _check(tasks: list[Task], plan: Plan) -> None:
+    """Refuse what would be overwritten, before hours of work."""
+    for task in tasks:
+        if not task.folder.exists() or finished(task) is not None:
+            continue
+        if read_marker(task.folder) is None:
+            raise ValueError(
+                f"{task.folder} exists and is no result of {plan.kind.command}; choose another "
+                "--out, or remove it"
+            )
+        if not plan.overwrite:
+            way_out = "remove it" if plan.overwrite is None else "--overwrite"
+            raise ValueError(
+                f"{task.folder} is a result of other settings, another recording or another "
+                f"version; choose another --out, or {way_out}"
+            )
+
+
+@contextlib.contextmanager
+def only_one(out: Path) -> Iterator[None]:
+    """Within ``with``, no other process writes results into a directory."""
+    with (out / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ValueError(f"another command is writing into {out}; wait for its end") from None
+        yield
+
+
+def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
+    started, busy = time.perf_counter(), 0.0
+    left = _find_finished(tasks, rows)
+    if before := len(tasks) - len(left):
+        print(f"{before} of {len(tasks)} recordings have been done before")
+    bar = tqdm(total=len(tasks), initial=before, unit="recording", disable=None)
+    with bar, contextlib.closing(perform_all(left, where)) as outcomes:
+        for outcome in outcomes:
+            rows[outcome.name] = row = _row(rows[outcome.name].recording, outcome)
+            busy += outcome.seconds
+            bar.update()
+            bar.write(f"{row.folder}: {_said(row)}")
+    wall = time.perf_counter() - started
+    print(f"{counted(list(rows.values()))}")
+    if left:
+        print(f"{wall:.1f} s for {busy:.1f} s of work")
+
+
+def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
+    """Enter what is complete on disk; the tasks of which nothing is known."""
+    left = []
+    for task in tasks:
+        if rows[task.name].state != OPEN:
+            continue
+        if (figures := finished(task)) is None:
+            left.append(task)
+        else:
+            rows[task.name] = Row(task.recording, task.name, DONE, figures)
+    return left
+
+
+def _row(recording: Path, outcome: Outcome) -> Row:
+    state = FAILED if outcome.figures is None else DONE
+    return Row(recording, outcome.name, state, outcome.figures or {}, outcome.reason)
+
+
+def _said(row: Row) -> str:
+    if row.state == FAILED:
+        return f"failed: {row.reason}"
+    said = [
+        f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in row.figures.items()
+        if value != ""
+    ]
+    return ", ".join(said[:_TOLD])

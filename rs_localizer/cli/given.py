@@ -1,0 +1,56 @@
+"""Settings of the method as commands are given them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rs_localizer.cli import UsageError
+from rs_localizer.config import NodeConfig
+from rs_localizer.settings import build, load_params_file, parse_assignment
+
+# Rows by name, as row times.
+_ROWS = {"first": -0.5, "middle": 0.0, "last": 0.5}
+
+
+def add_settings(
+    parser: argparse._ActionsContainer, which: str = "as after --ros-args; may be repeated"
+) -> None:
+    """``--params`` and ``-p``, for :func:`given_settings`; ``which`` says what matters."""
+    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: a ROS 2 params file")
+    parser.add_argument(
+        "-p",
+        dest="assignments",
+        action="append",
+        default=[],
+        metavar="NAME:=VALUE",
+        help=f"one setting: {which}",
+    )
+
+
+def given_settings(args: argparse.Namespace) -> NodeConfig:
+    """The settings of a params file, and single ones over them.
+
+    Raises:
+        UsageError: for what is no setting, or a wrong value.
+    """
+    try:
+        values = {} if args.params is None else load_params_file(args.params)
+        return build(values | dict(map(parse_assignment, args.assignments)))
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def row_time(text: str) -> float:
+    """A row by its name or by its time, for ``add_argument(type=...)``."""
+    if text in _ROWS:
+        return _ROWS[text]
+    try:
+        tau = float(text)
+    except ValueError:
+        tau = float("nan")
+    if not -0.5 <= tau <= 0.5:
+        raise argparse.ArgumentTypeError(
+            f"must be {', '.join(_ROWS)}, or a row time from -0.5 to 0.5; got {text!r}"
+        )
+    return tau

@@ -1,0 +1,169 @@
+"""Where the images of ``detect`` come from, by its arguments, and what is told of them."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shlex
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rs_localizer.cli import UsageError
+from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.io.bags import is_bag, open_bag
+from rs_localizer.io.calibration.files import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
+from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.io.video import has_times
+from rs_localizer.io.whole import told
+from rs_localizer.offline.image_sources import (
+    IMAGE_TYPES,
+    INFO_TYPE,
+    Carried,
+    Shot,
+    find_topic,
+    from_bag,
+    from_files,
+    from_video,
+    have_times,
+    image_files,
+)
+from rs_localizer.process.arguments import number
+from rs_localizer.settings import settings, write_parameters
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Images, as far as they are open."""
+
+    shots: Iterator[Shot] | Iterator[Shot | Carried]
+    total: int | None  # None: unknown
+    clock: ImageClock | None  # of images without times of their own
+
+
+def add_source_arguments(parser: argparse.ArgumentParser) -> None:
+    """The camera and the topics of a bag."""
+    camera = parser.add_argument_group("the camera")
+    camera.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help=f"{CALIBRATION_KINDS} (default: the bag's camera_info)",
+    )
+    longest = settings()["readout_time"].maximum or 0.0
+    camera.add_argument(
+        "--readout-time",
+        type=number(0.0, longest),
+        metavar="S",
+        help=f"seconds from the first row to the last: written to {PARAMETERS} beside the data, "
+        f"for replay --params (default: as in {PARAMETERS} of the bag)",
+    )
+    camera.add_argument(
+        "--scan-direction",
+        choices=[direction.value for direction in ScanDirection],
+        help=f"likewise (default: {ScanDirection.TOP_TO_BOTTOM})",
+    )
+    camera.add_argument(
+        "--rate",
+        type=number(0.0, above=True),
+        metavar="HZ",
+        help="images per second, instead of the presentation times of a video, or for files whose "
+        "names are not times in ns",
+    )
+    camera.add_argument(
+        "--start",
+        type=number(0.0),
+        metavar="S",
+        help="time of the first image of a video or folder (default: "
+        f"{DEFAULT_START_NS * 1e-9:g}, since ROS takes 0 for none; of names that are times, their "
+        "own)",
+    )
+    bag = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
+    bag.add_argument("--image", metavar="TOPIC")
+    bag.add_argument("--camera-info", metavar="TOPIC")
+
+
+@contextlib.contextmanager
+def opened(args: argparse.Namespace) -> Iterator[Source]:
+    """The images of a video, a bag or a folder.
+
+    Raises:
+        UsageError: for options that do not go with it, or that are missing.
+    """
+    if not is_bag(args.images):
+        yield _files(args)
+        return
+    for name in ("rate", "start"):
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
+    with open_bag(args.images) as bag:
+        camera = None if args.calibration is None else read_calibration(args.calibration)
+        topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
+        info = None
+        if camera is None:
+            info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
+        yield Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
+
+
+def _files(args: argparse.Namespace) -> Source:
+    clock = ImageClock(args.rate, None if args.start is None else round(args.start * 1e9))
+    for name in ("image", "camera_info"):
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
+    if args.calibration is None:
+        raise UsageError("a video or folder has no camera_info: give --calibration")
+    files = image_files(args.images) if args.images.is_dir() else None
+    if args.rate is None and files is not None and not have_times(files):
+        raise UsageError("the names of the files are not times in ns: give --rate")
+    if args.rate is None and files is None and not has_times(args.images):
+        raise UsageError("this video has no presentation times: give --rate")
+    camera: Camera = read_calibration(args.calibration)
+    if files is None:
+        return Source(from_video(args.images, camera, clock), None, clock)
+    return Source(from_files(files, camera, clock), len(files), clock)
+
+
+def write_shutter(args: argparse.Namespace) -> None:
+    """The shutter: as given, or as simulate writes it beside the images of a recording."""
+    beside = args.images / PARAMETERS
+    with told(args.out):
+        if args.readout_time is not None:
+            direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
+            write_parameters(args.out / PARAMETERS, args.readout_time, direction)
+        elif is_bag(args.images) and beside.exists():
+            shutil.copy(beside, args.out / PARAMETERS)
+
+
+def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
+    """Images that could not be read, and other messages that are kept."""
+    for detail in refused.values():
+        print(f"images that cannot be read are left out, the first one because {detail}")
+    if carried:
+        kept = ", ".join(f"{topic} ({count})" for topic, count in carried.items())
+        print(f"kept for replay: {kept}")
+
+
+def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: float) -> list[str]:
+    """Say where the times are from; what speaks against them, and against the readout time.
+
+    Args:
+        period: s from one image to the next.
+    """
+    faults = []
+    if clock is not None:
+        print(clock.told())
+        faults.append(clock.fault())
+    if args.readout_time is not None:
+        faults.append(readout_fault(args.readout_time, period))
+    return [fault for fault in faults if fault]
+
+
+def tell_next(args: argparse.Namespace, more: str = "") -> None:
+    """The command that makes poses of the recording, with further options."""
+    out = shlex.quote(str(args.out))
+    with_parameters = (args.out / PARAMETERS).exists()
+    shutter = f"--params {out}/{PARAMETERS}" if with_parameters else "-p readout_time:=SECONDS"
+    poses = shlex.quote(f"{args.out}_poses")
+    print(f"next: rs_localizer replay {out} {shutter}{more} --out {poses}")

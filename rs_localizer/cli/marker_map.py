@@ -1,0 +1,85 @@
+"""What to look for in images: a marker map, or a board on its own."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from rs_localizer.cli import UsageError
+from rs_localizer.markers.consistency import other_units
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Board, Chessboard, CircleGrid
+from rs_localizer.process.arguments import number
+
+_CHESSBOARD, _CIRCLES, _ASYMMETRIC = "chessboard", "circles", "asymmetric_circles"
+_INVERTED = "inverted_"
+_PATTERNS = [
+    inverted + kind for inverted in ("", _INVERTED) for kind in (_CHESSBOARD, _CIRCLES, _ASYMMETRIC)
+]
+# A board on its own is the map: its first corner is the origin, x along the rows, y from row to
+# row, z away from the viewer.
+_BOARD_AXES = np.diag([1.0, -1.0, -1.0])
+
+
+def add_board_arguments(parser: argparse._ActionsContainer) -> None:
+    """A board of its own instead of a map, for :func:`find_map`."""
+    parser.add_argument(
+        "--board",
+        metavar="6x4",
+        help="instead: a board, inner corners (or circles) along a row x rows",
+    )
+    parser.add_argument(
+        "--pattern",
+        choices=_PATTERNS,
+        help=f"of the board; inverted: white on black (default: {_CHESSBOARD})",
+    )
+    parser.add_argument(
+        "--square",
+        type=number(0.0, above=True),
+        metavar="M",
+        help="side of its squares in metres, or distance of its rows of circles",
+    )
+
+
+def find_map(args: argparse.Namespace) -> MarkerMap:
+    """The map that was given, or that of the board.
+
+    Raises:
+        UsageError: when it is neither, or both.
+    """
+    if (args.map is None) == (args.board is None):
+        raise UsageError("give either --map or --board")
+    if args.map is not None:
+        for name in ("square", "pattern"):
+            if getattr(args, name) is not None:
+                raise UsageError(f"--{name} goes with --board")
+        marker_map = read_marker_map(args.map)
+        for fault in other_units(marker_map):
+            print(f"warning: {args.map}: {fault}", file=sys.stderr)
+        return marker_map
+    if args.square is None:
+        raise UsageError("--board needs --square")
+    try:
+        columns, rows = (int(word) for word in args.board.split("x"))
+    except ValueError:
+        raise UsageError(f"--board must be of the form 6x4, got {args.board!r}") from None
+    pattern = args.pattern or _CHESSBOARD
+    inverted, kind = pattern.startswith(_INVERTED), pattern.removeprefix(_INVERTED)
+    try:
+        if kind == _CHESSBOARD:
+            board: Board = Chessboard(columns, rows, args.square, inverted=inverted)
+        else:
+            board = CircleGrid(columns, rows, args.square, kind == _ASYMMETRIC, inverted)
+    except ValueError as error:
+        raise UsageError(f"--board: {error}") from error
+    # The first corner to the origin.
+    pose = Pose(-_BOARD_AXES @ board.points[0], _BOARD_AXES)
+    marker_map = MarkerMap(boards=(replace(board, pose=pose),))
+    for fault in other_units(marker_map):
+        raise UsageError(f"--square: {fault}")
+    return marker_map

@@ -1,0 +1,42 @@
+"""``rs_localizer watch``: how a live localizer node is, on a terminal."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+
+from rs_localizer.process.arguments import number
+from rs_localizer.settings import NODE_NAME
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "node",
+        nargs="?",
+        default=f"/{NODE_NAME}",
+        metavar="NODE",
+        help="the localizer, with its namespace (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--every",
+        type=number(0.05),
+        metavar="S",
+        help="seconds from one look to the next (default: 0.2 on a terminal, else 1)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Write until Ctrl-C.
+
+    Raises:
+        ValueError: without ROS.
+    """
+    try:
+        watch = importlib.import_module("rs_localizer.ros.graph.watch").watch
+    except ImportError as error:
+        raise ValueError(
+            f"watch needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
+            "(docs/install.md)"
+        ) from error
+    watch(args.node, sys.stdout, args.every)

@@ -1,0 +1,102 @@
+"""Images -> keypoints with descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.features.methods import METHODS, Descriptors, FeatureError, Gray
+from rs_localizer.features.selection import balanced
+
+# OpenCV's detectors fail on smaller images (px), in which there is nothing to find.
+_LEAST_SIDE = 16
+# Larger ones (px) are reduced, as COLMAP does: SIFT takes 250 bytes a pixel.
+_LONGEST_SIDE = 3200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """The keypoints of an image, as a cloud holds them (float32)."""
+
+    pixels: Array  # (n,2) raw pixels, the centre of the first one at 0, 0 (COLMAP: 0.5, 0.5)
+    scores: Array  # (n,) higher is better
+    sizes: Array  # (n,) px, diameter of what is described
+    descriptors: Descriptors  # (n,d) SIFT: numbers; ORB and AKAZE: bits
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+class FeatureExtractor:
+    """Finds keypoints; the same image gives the same bits.
+
+    Args:
+        kind: ``sift``, ``orb`` or ``akaze``.
+        most: keypoints of an image.
+
+    Raises:
+        FeatureError: for another kind, or one that this OpenCV does not have.
+    """
+
+    def __init__(self, kind: str, most: int) -> None:
+        if kind not in METHODS:
+            raise FeatureError(f"features must be one of {', '.join(METHODS)}; got {kind!r}")
+        self._method = METHODS[kind]
+        self._most = most
+        self._detector = self._method.create(most)
+
+    def extract(self, image: Gray) -> Features:
+        """The keypoints of an image (h,w)."""
+        height, width = image.shape
+        if max(height, width) <= _LONGEST_SIDE:
+            return self._extract(image)
+        ratio = _LONGEST_SIDE / max(height, width)
+        size = max(1, round(width * ratio)), max(1, round(height * ratio))
+        reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        found = self._extract(reduced)
+        scale = np.array([width / size[0], height / size[1]])
+        return replace(
+            found,
+            pixels=_single((found.pixels + 0.5) * scale - 0.5),
+            sizes=_single(found.sizes / ratio),
+        )
+
+    def _extract(self, image: Gray) -> Features:
+        found: Sequence[Any] = ()
+        descriptors = None
+        if min(image.shape) >= _LEAST_SIDE:
+            if self._method.at_once:
+                found, descriptors = self._detector.detectAndCompute(image, None)
+                rows = self._choose(found, image)
+                found = [found[row] for row in rows]
+                descriptors = None if descriptors is None else descriptors[rows]
+            else:
+                found = self._detector.detect(image)
+                chosen = [found[row] for row in self._choose(found, image)]
+                # Some are too near the rim, and others change their places.
+                found, descriptors = self._detector.compute(image, chosen)
+        if descriptors is None:
+            found, descriptors = (), np.zeros((0, self._detector.descriptorSize()))
+        return Features(
+            _single(self._method.place(image, found)),
+            _single(np.array([keypoint.response for keypoint in found])),
+            _single(np.array([keypoint.size for keypoint in found])),
+            self._method.pack(descriptors),
+        )
+
+    def _choose(self, found: Sequence[Any], image: Gray) -> list[int]:
+        pixels = np.array([keypoint.pt for keypoint in found]).reshape(-1, 2)
+        scores = np.array([keypoint.response for keypoint in found])
+        height, width = image.shape
+        rows: list[int] = balanced(pixels, scores, (width, height), self._most).tolist()
+        return rows
+
+
+def _single(values: Array) -> Array:
+    """What is left of numbers in single precision."""
+    return values.astype(np.float32).astype(np.float64)

@@ -1,0 +1,124 @@
+"""THE list of the feature methods: how OpenCV finds their keypoints, and what it says of them.
+
+Thresholds are low, since the best keypoints of every part of the image are chosen afterwards: a
+dim corner shall have some, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.config import FeatureKind
+from rs_localizer.core.arrays import Array
+from rs_localizer.features.corners import refined
+
+Gray = NDArray[np.uint8]
+Descriptors = NDArray[np.uint8]  # (n,d)
+
+# Keypoints to choose from, as a multiple of those that are wanted, where OpenCV has to be told.
+_CHOICE = 4
+# COLMAP's threshold: its peak_threshold of 0.02 / 3 is OpenCV's before the division by layers.
+_SIFT_CONTRAST = 0.02
+# OpenCV takes pixel x of the doubled image for x / 2; it is (x + 0.5) / 2 - 0.5.
+_SIFT_OFFSET = -0.25
+# What COLMAP multiplies the square roots with, so that they fill a byte.
+_SIFT_SCALE = 512.0
+# Steps of brightness around a corner; ORB-SLAM (Mur-Artal et al., T-RO 2015) takes 20, or 7.
+_FAST_THRESHOLD = 10
+# Keypoints lie at least so far (px of their level) inside; the descriptor reaches 15 px.
+_ORB_EDGE = 19
+_ORB_LEVELS, _ORB_STEP = 8, 1.2
+# A quarter of OpenCV's.
+_AKAZE_THRESHOLD = 0.00025
+
+
+class FeatureError(ValueError):
+    """A method that this OpenCV does not have; the text says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One way to find keypoints and to describe them.
+
+    ``find`` and ``describe`` of OpenCV repeat much of each other's work. ``at_once`` says that to
+    describe all that is found costs less than that.
+    """
+
+    create: Callable[[int], Any]  # OpenCV's detector for this many keypoints
+    at_once: bool
+    place: Callable[[Gray, Sequence[Any]], Array]  # pixels (n,2) of keypoints, sub-pixel, unbiased
+    pack: Callable[[NDArray[Any]], Descriptors]  # OpenCV's descriptors (n,d) as they are sent
+
+
+def root_descriptors(descriptors: NDArray[Any]) -> Descriptors:
+    """SIFT as COLMAP has it: L1-normalised, square roots, times 512 in bytes.
+
+    Arandjelovic, Zisserman, *Three things everyone should know to improve object retrieval*, CVPR
+    2012. Euclidean distances of these numbers are Hellinger distances of the histograms.
+    """
+    values = descriptors.astype(np.float64)
+    sums = np.maximum(values.sum(axis=1, keepdims=True), 1e-12)
+    roots: Array = np.minimum(np.rint(_SIFT_SCALE * np.sqrt(values / sums)), 255.0)
+    return roots.astype(np.uint8)
+
+
+def _sift(_: int) -> Any:
+    return cv2.SIFT.create(contrastThreshold=_SIFT_CONTRAST)
+
+
+def _orb(count: int) -> Any:
+    return cv2.ORB.create(
+        _CHOICE * count,
+        scaleFactor=_ORB_STEP,
+        nlevels=_ORB_LEVELS,
+        edgeThreshold=_ORB_EDGE,
+        fastThreshold=_FAST_THRESHOLD,
+    )
+
+
+def _akaze(_: int) -> Any:
+    # OpenCV 5 has it in its contrib modules only, where an older one has none.
+    for module in (cv2, getattr(cv2, "xfeatures2d", None)):
+        if (akaze := getattr(module, "AKAZE", None)) is not None:
+            return akaze.create(threshold=_AKAZE_THRESHOLD)
+    raise FeatureError(
+        f"OpenCV {cv2.__version__} has no AKAZE: take sift or orb, or install "
+        f'"opencv-python-headless<5" or opencv-contrib-python-headless'
+    )
+
+
+def _points(keypoints: Sequence[Any]) -> Array:
+    return np.array([keypoint.pt for keypoint in keypoints], np.float64).reshape(-1, 2)
+
+
+def _sift_place(_: Gray, keypoints: Sequence[Any]) -> Array:
+    return _points(keypoints) + _SIFT_OFFSET
+
+
+def _orb_place(image: Gray, keypoints: Sequence[Any]) -> Array:
+    octaves = np.array([keypoint.octave for keypoint in keypoints], np.int64)
+    scale = _ORB_STEP**octaves
+    corners = np.rint(_points(keypoints) / scale[:, None]).astype(np.int64)
+    return refined(image, corners, octaves, _ORB_STEP)
+
+
+def _akaze_place(_: Gray, keypoints: Sequence[Any]) -> Array:
+    return _points(keypoints)
+
+
+def _as_it_is(descriptors: NDArray[Any]) -> Descriptors:
+    return np.ascontiguousarray(descriptors, np.uint8)
+
+
+METHODS: dict[str, Method] = {
+    FeatureKind.SIFT: Method(_sift, False, _sift_place, root_descriptors),
+    FeatureKind.ORB: Method(_orb, False, _orb_place, _as_it_is),
+    FeatureKind.AKAZE: Method(_akaze, True, _akaze_place, _as_it_is),
+}
+"""All methods by their name."""

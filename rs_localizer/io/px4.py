@@ -1,0 +1,88 @@
+"""A localized frame as PX4's external vision takes it: ``px4_msgs/msg/VehicleOdometry``.
+
+ROS has bodies whose x is forward, y left and z up (FLU), and maps whose z is up (REP-103, REP-105);
+PX4 has bodies of x forward, y right, z down (FRD) and worlds whose z is down. Both changes are
+rotations, so errors of rotations turn with the axes as velocities do. Of the covariances PX4 takes
+variances: of positions along the axes of its world, of orientations about those of the body, of
+velocities along the latter (PX4-Autopilot, msg/versioned/VehicleOdometry.msg).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.outputs import Localized, Twist
+
+TYPE = "px4_msgs/msg/VehicleOdometry"
+
+_FLIP = np.diag([1.0, -1.0, -1.0])  # FLU and FRD, either way
+# PX4's world from the map: its axes, and the message's number for them.
+_WORLDS = {
+    "frd": (_FLIP, 2),
+    "ned": (np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), 1),
+}
+WORLDS = tuple(_WORLDS)
+"""The map's z is up, and its x and y anywhere (``frd``), or east and north (``ned``)."""
+
+_BODY_FRD = 3  # the message's number for axes of the body
+_LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
+_UNKNOWN = np.full(3, np.nan, dtype=np.float32)
+
+
+def vehicle_odometry(frame: Localized, world: str, resets: int, now_ns: int) -> dict[str, Any]:
+    """The fields of the message.
+
+    Args:
+        frame: of a body with x forward, y left, z up (``base_frame``). Without a twist, velocities
+            are NaN, which is PX4's word for unknown.
+        world: of :data:`WORLDS`.
+        resets: how often poses have jumped so far; modulo 256.
+        now_ns: time of the message, of the same clock as the stamps.
+    """
+    world_from_map, pose_frame = _WORLDS[world]
+    pose = frame.pose
+    rotation = world_from_map @ pose.rotation @ _FLIP
+    x, y, z, w = so3.quaternion(np.ascontiguousarray(rotation))
+    body_from_map = _FLIP @ pose.rotation.T
+    return {
+        "timestamp": now_ns // 1000,
+        "timestamp_sample": frame.stamp_ns // 1000,
+        "pose_frame": pose_frame,
+        "position": _floats(world_from_map @ pose.position),
+        "q": _floats(np.array([w, x, y, z])),
+        "position_variance": _variances(pose.covariance[_LINEAR, _LINEAR], world_from_map),
+        "orientation_variance": _variances(pose.covariance[_ANGULAR, _ANGULAR], body_from_map),
+        "reset_counter": resets % 256,
+        "quality": _quality(frame),
+        **_velocities(frame.twist),
+    }
+
+
+def _velocities(twist: Twist | None) -> dict[str, Any]:
+    if twist is None:
+        names = ("velocity", "angular_velocity", "velocity_variance")
+        return {"velocity_frame": _BODY_FRD, **dict.fromkeys(names, _UNKNOWN)}
+    return {
+        "velocity_frame": _BODY_FRD,
+        "velocity": _floats(_FLIP @ twist.linear),
+        "angular_velocity": _floats(_FLIP @ twist.angular),
+        "velocity_variance": _variances(twist.covariance[_LINEAR, _LINEAR], _FLIP),
+    }
+
+
+def _quality(frame: Localized) -> int:
+    """Percent of the points that fit the pose, at least 1: PX4 takes 0 for invalid."""
+    return max(1, round(100.0 * float(np.mean(frame.estimate.inliers))))
+
+
+def _variances(covariance: Array, rotation: Array) -> Any:
+    """Along the axes to which a rotation turns."""
+    return _floats(np.einsum("ij,jk,ik->i", rotation, covariance, rotation))
+
+
+def _floats(values: Array) -> Any:
+    return values.astype(np.float32)

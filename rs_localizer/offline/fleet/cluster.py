@@ -1,0 +1,184 @@
+"""Tasks by Dask: on a cluster of this machine, or by a scheduler that runs already."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import time
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+from rs_localizer.offline.fleet.task import Outcome, Task, perform
+
+# How often a recording may take its worker with it until it counts as failed.
+_DEATHS = 3
+# How long a scheduler that is gone may take to come back, in s, and how often it is looked for.
+_PATIENCE, _PERIOD = 60.0, 1.0
+# How often in a row all tasks may be given out without a single outcome.
+_ROUNDS = 5
+_CONNECT_TIMEOUT = 5.0
+
+
+class ClusterError(ValueError):
+    """No workers; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Who does the work: a scheduler's workers, or so many processes of this machine."""
+
+    scheduler: str | None = None
+    workers: int | None = None  # None: one for each core
+
+    def processes(self, tasks: int) -> int:
+        """How many of this machine."""
+        return max(1, min(tasks, self.workers or len(os.sched_getaffinity(0))))
+
+
+def perform_all(tasks: Sequence[Task], where: Where) -> Generator[Outcome, None, None]:
+    """The outcome of each task, as they come; close the iterator to stop all.
+
+    A task whose worker is lost is done by another one, one whose scheduler is lost when it is back.
+
+    Raises:
+        ClusterError: when no scheduler answers.
+        ImportError: without Dask.
+    """
+    if not tasks:
+        return
+    _silence()
+    left = {task.name: task for task in tasks}
+    patience, idle = 0.0, 0
+    with _cluster(where, len(tasks)) as cluster:
+        while left:
+            before = len(left)
+            try:
+                yield from _all_done(left, cluster, patience)
+            except ClusterError as error:
+                if not patience:
+                    raise
+                yield from _given_up(left, str(error))
+                return
+            # What is left was lost on its way, or with the scheduler: who has done it, tells again.
+            patience, idle = _PATIENCE, idle + 1 if len(left) == before else 0
+            if idle == _ROUNDS:
+                yield from _given_up(left, "the scheduler never answers with its result")
+                return
+
+
+def _given_up(left: Iterable[str], reason: str) -> Iterator[Outcome]:
+    return (Outcome(name, None, reason) for name in left)
+
+
+def _cluster(where: Where, tasks: int) -> AbstractContextManager[Any]:
+    """What a client connects to."""
+    if where.scheduler is not None:
+        return contextlib.nullcontext(where.scheduler)
+    return _local(where.processes(tasks))
+
+
+def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Iterator[Outcome]:
+    """The outcomes of tasks, each of which is taken out of ``left``; some may be lost."""
+    from distributed import as_completed
+
+    with _client(cluster, patience) as client:
+        # Not by what they are: a result that has been removed meanwhile would be taken as done.
+        tasks = list(left.values())
+        futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
+        for future in as_completed(futures, loop=client.loop):
+            task = futures.pop(future)
+            try:
+                outcome = _outcome(task, future)
+            except (CancelledError, OSError):  # the scheduler is gone, or who has the outcome
+                continue
+            del left[task.name]
+            yield outcome
+
+
+def _silence() -> None:
+    """What Dask logs of workers and schedulers that are lost is told in the outcomes."""
+    import distributed  # gives some of its loggers levels of their own
+
+    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    for name in (distributed.__name__, *known):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
+def _outcome(task: Task, future: Any) -> Outcome:
+    from distributed import KilledWorker
+
+    if future.status != "error":
+        found: Outcome = future.result(timeout=_CONNECT_TIMEOUT)
+        return found
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        reason = "every worker process that took it died (out of memory, or killed)"
+        return Outcome(task.name, None, reason)
+    return Outcome(task.name, None, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+@contextlib.contextmanager
+def _client(cluster: Any, patience: float) -> Iterator[Any]:
+    from distributed import Client
+
+    deadline = time.monotonic() + patience
+    while True:
+        try:
+            client = Client(cluster, timeout=_CONNECT_TIMEOUT, set_as_default=False)
+            break
+        except (OSError, ValueError, ImportError) as error:
+            if time.monotonic() < deadline:
+                time.sleep(_PERIOD)
+                continue
+            raise ClusterError(
+                f"no Dask scheduler answers at {cluster}: {' '.join(str(error).split())}"
+            ) from error
+    with client:
+        yield client
+
+
+@contextlib.contextmanager
+def _local(workers: int) -> Iterator[Any]:
+    """A cluster of processes with one thread each."""
+    import dask
+    from distributed import LocalCluster
+
+    settings = {
+        "distributed.scheduler.allowed-failures": _DEATHS - 1,
+        # A worker that dies takes no task along but the one that it is at.
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.worker.preload": ["rs_localizer.offline.fleet.worker"],
+        # Nobody looks at what Dask samples of the work every 10 ms.
+        "distributed.worker.profile.enabled": False,
+    }
+    # Of worker processes that were killed, Python's clean-up would tell on the screen.
+    quiet = "ignore:resource_tracker:UserWarning"
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), quiet]))
+    with dask.config.set(settings):
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,  # the operating system's
+            dashboard_address="127.0.0.1:0",  # any free port, for nobody else
+            silence_logs=logging.CRITICAL + 1,
+        )
+        try:
+            yield cluster
+        except BaseException:
+            _kill(cluster)
+            raise
+        finally:
+            with contextlib.suppress(Exception):
+                cluster.close(timeout=5)
+
+
+def _kill(cluster: Any) -> None:
+    """End workers at once: one that is asked goes on with its recording for seconds."""
+    for nanny in cluster.workers.values():
+        with contextlib.suppress(AttributeError, ProcessLookupError, TypeError):
+            os.kill(nanny.process.pid, signal.SIGKILL)

@@ -1,0 +1,171 @@
+"""One recording of many: what a worker does with it, and what it answers."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shutil
+import socket
+import threading
+import time
+import uuid
+from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rs_localizer.io.whole import told
+from rs_localizer.offline.fleet.first import alone_until_compiled
+from rs_localizer.offline.fleet.identity import program, read_marker, write_marker
+
+LOG = "log.txt"
+"""What the command would have said of the recording."""
+
+PARTIAL = ".partial"
+"""Below the directory of all results: those that are not complete."""
+
+Figures = dict[str, float | int | str]
+"""What the summary says of a recording, by the name of the column."""
+
+# What is printed can be told apart only while one task of a process prints.
+_PRINTING = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What is done with each recording, by functions that a worker can import."""
+
+    command: str
+    # Arguments of the command, recording, folder to create: does it, as for one recording alone.
+    work: Callable[[Namespace, Path, Path], Figures]
+    kernels: str  # names what has to be compiled for it
+    # Compiles just that; without it, the first recording on a machine does, and the others wait.
+    warm: Callable[[Namespace], None] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One recording, and all that its result depends on."""
+
+    kind: Kind
+    arguments: Namespace
+    recording: Path  # absolute, as are all paths: workers are elsewhere
+    out: Path  # directory of all results
+    name: str  # of the folder in it
+    identity: str
+    program: str  # of who asks
+
+    @property
+    def folder(self) -> Path:
+        """Of the result."""
+        return self.out / self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a task."""
+
+    name: str
+    figures: Figures | None  # None: it failed
+    reason: str = ""  # why, in one line
+    seconds: float = 0.0
+
+
+def finished(task: Task) -> Figures | None:
+    """The figures of a complete result of just this task; None: there is none."""
+    found = read_marker(task.folder)
+    if found is None or found["identity"] != task.identity:
+        return None
+    return dict(found["figures"])
+
+
+def perform(task: Task) -> Outcome:
+    """Do a task, unless it has been done: its folder is there afterwards, whole, or not at all.
+
+    Whatever goes wrong with the recording is an outcome, not an exception.
+    """
+    started = time.perf_counter()
+    reason, figures = _unfit(task), None
+    if not reason:
+        figures = finished(task)
+        if figures is None:
+            figures, reason = _attempt(task)
+    return Outcome(task.name, figures, reason, time.perf_counter() - started)
+
+
+def _unfit(task: Task) -> str:
+    """Why this process cannot do it; empty: it can."""
+    here = socket.gethostname()
+    if program() != task.program:
+        return (
+            f"worker on {here} has another rs_localizer (sources {program()}, here "
+            f"{task.program}): install the same on both"
+        )
+    if not task.out.is_dir():
+        return f"worker on {here} does not see {task.out}: machines have to share its file system"
+    return ""
+
+
+def _attempt(task: Task) -> tuple[Figures | None, str]:
+    # A folder of its own: a worker that is taken for lost may still be at it.
+    partial = task.out / PARTIAL / uuid.uuid4().hex
+    inner = partial / task.name  # under its final name, which some files repeat
+    said = io.StringIO()
+    try:
+        with told(partial):
+            partial.mkdir(parents=True)
+        with (
+            _PRINTING,
+            contextlib.redirect_stdout(said),
+            contextlib.redirect_stderr(said),
+        ):
+            figures = _work(task, inner)
+        with told(inner):
+            inner.mkdir(exist_ok=True)
+            text = said.getvalue().replace(str(inner), task.name)
+            (inner / LOG).write_text(text, encoding="utf-8")
+            _complete(task, inner, figures)
+    except Exception as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        if not isinstance(error, (ValueError, OSError)):
+            text = f"{type(error).__name__}: {text}"
+        return None, text.replace(str(inner), str(task.folder))
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return figures, ""
+
+
+def _work(task: Task, folder: Path) -> Figures:
+    kind = task.kind
+    with alone_until_compiled(kind.kernels) as first:
+        if first and kind.warm is None:
+            return kind.work(task.arguments, task.recording, folder)
+        if first and kind.warm is not None:
+            kind.warm(task.arguments)
+    return kind.work(task.arguments, task.recording, folder)
+
+
+def _complete(task: Task, inner: Path, figures: Figures) -> None:
+    """Give a finished result its place, at once."""
+    about = {
+        "program": task.program,
+        "command": task.kind.command,
+        "recording": str(task.recording),
+        "settings": readable(task.arguments),
+    }
+    write_marker(inner, task.identity, about, figures)
+    if finished(task) is None and read_marker(task.folder) is not None:
+        task.folder.rename(inner.with_name("replaced"))  # of other settings
+    try:
+        inner.rename(task.folder)
+    except OSError:
+        if finished(task) is None:  # else another worker, taken for lost, has done it
+            raise
+
+
+def readable(arguments: Namespace) -> dict[str, object]:
+    """The arguments of a command as JSON has them."""
+    return {
+        name: value if isinstance(value, (bool, int, float, list, type(None))) else str(value)
+        for name, value in sorted(vars(arguments).items())
+    }

@@ -1,0 +1,1 @@
+"""What replay found, for the Rerun viewer: nothing here changes a pose."""

@@ -1,0 +1,238 @@
+"""Frames of a replay -> a recording of the Rerun viewer, or the viewer itself."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagReader
+from rs_localizer.io.outputs import Localized
+from rs_localizer.io.whole import whole_files
+from rs_localizer.offline.replay import Topics
+from rs_localizer.offline.viewing import paths
+from rs_localizer.offline.viewing.blueprint import blueprint
+from rs_localizer.offline.viewing.recorded import Cloud, Picture, shown
+from rs_localizer.offline.viewing.series import series
+from rs_localizer.offline.viewing.shapes import (
+    ellipsoid,
+    enlargement,
+    eye,
+    others,
+    readout_path,
+    reproject,
+)
+from rs_localizer.pipeline.frames import FrameLocalizer
+
+_APPLICATION = "rs_localizer"
+_TIMEOUT = 60.0  # s, for a viewer to take everything
+_SCREENS, _INSTEAD = ("DISPLAY", "WAYLAND_DISPLAY"), "--rerun writes a file"
+# Size of the image and of the body's axes in the scene: shares of the distance to the points.
+_PLANE, _AXES = 0.3, 0.12
+# More landmarks than this are thinned out.
+_MOST_LANDMARKS = 200_000
+_GRAY, _RED, _ORANGE, _BLUE = (150, 150, 150), (230, 60, 40), (240, 150, 0), (70, 130, 255)
+
+
+def write_view(
+    bag: BagReader,
+    topics: Topics,
+    localizer: FrameLocalizer,
+    frames: Sequence[Localized],
+    file: Path | None,
+) -> None:
+    """Show the frames of a replay beside what their recording holds.
+
+    Args:
+        bag, topics: what was replayed.
+        localizer: by which, after its last frame.
+        frames: with a pose, one or more.
+        file: to write; None: a viewer is opened.
+
+    Raises:
+        ImportError: without the Rerun SDK.
+        OutputError: when the file cannot be written.
+        ValueError: when no viewer starts.
+    """
+    import rerun as rr
+
+    calibration, config = localizer.calibration, localizer.config
+    assert calibration is not None  # without one there is no frame
+    camera = calibration.camera(config.readout_time, config.scan_direction)
+    name = bag.path.resolve().name
+    # The viewer keeps what its user has arranged by application: for each recording on its own.
+    stream = rr.RecordingStream(f"{_APPLICATION} {name}", recording_id=name)
+    items = list(shown(bag, topics))
+    look, longer = eye(frames), enlargement(frames)
+    arranged = blueprint(any(isinstance(item, Picture) for item in items), look)
+    by_stamp = {frame.input_stamp_ns: frame for frame in frames}
+    scene = _Scene(stream, camera, by_stamp, Sizes(look.depth, longer))
+    landmarks = np.zeros((0, 3)) if localizer.map is None else localizer.map.points
+    if file is None:
+        _start_viewer(stream, arranged)
+        scene.log(items, landmarks)
+        stream.flush(timeout_sec=_TIMEOUT)
+        return
+    with whole_files(file):
+        file.touch()  # what cannot be written says so here
+        stream.save(file, default_blueprint=arranged)
+        scene.log(items, landmarks)
+        stream.flush()
+        stream.disconnect()
+
+
+def _start_viewer(stream: Any, arranged: Any) -> None:
+    if sys.platform == "linux" and not any(map(os.environ.get, _SCREENS)):
+        # It would end at once, and what is sent to it would wait for ever.
+        raise ValueError(f"the Rerun viewer needs a screen ({' or '.join(_SCREENS)}); {_INSTEAD}")
+    # Beside the interpreter, where pip puts it; that need not be on the path.
+    beside = str(Path(sys.executable).parent)
+    os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", os.defpath), beside])
+    try:
+        stream.spawn(default_blueprint=arranged)
+    except (OSError, RuntimeError) as error:
+        reason = str(error).partition(". ")[0]
+        raise ValueError(
+            f"the Rerun viewer does not start: {reason}; --rerun writes a file"
+        ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """How large things are drawn."""
+
+    depth: float  # m from the camera to its points
+    longer: int  # than they are, residuals
+
+
+class _Scene:
+    """Logs to one stream."""
+
+    def __init__(
+        self, stream: Any, camera: Camera, frames: dict[int, Localized], sizes: Sizes
+    ) -> None:
+        self._stream = stream
+        self._camera = camera
+        self._sizes = sizes
+        self._residuals = paths.RESIDUALS.format(sizes.longer)
+        self._frames = {stamp: frames[stamp] for stamp in sorted(frames)}
+
+    def log(self, items: Sequence[Picture | Cloud], landmarks: Array) -> None:
+        self._log_still(items, landmarks)
+        for item in items:
+            self._stream.set_time(paths.TIMELINE, timestamp=_time(item.stamp_ns))
+            if isinstance(item, Picture):
+                self._log_picture(item)
+            else:
+                self._log_pixels(item)
+        for stamp, frame in self._frames.items():  # those of a smoothed motion, too
+            self._stream.set_time(paths.TIMELINE, timestamp=_time(stamp))
+            self._log_pose(frame)
+        self._log_series()
+
+    def _log_still(self, items: Sequence[Picture | Cloud], landmarks: Array) -> None:
+        import rerun as rr
+
+        clouds = [item.points for item in items if isinstance(item, Cloud)]
+        points = np.unique(np.concatenate([landmarks, *clouds]), axis=0)
+        points = points[:: 1 + len(points) // _MOST_LANDMARKS]
+        way = [frame.pose.position for frame in self._frames.values()]
+        self._stream.log(
+            paths.LANDMARKS, rr.Points3D(points, colors=_GRAY, radii=-1.5), static=True
+        )
+        self._stream.log(paths.PATH, rr.LineStrips3D([way], colors=_BLUE, radii=-1.0), static=True)
+        camera = self._camera
+        self._stream.log(
+            paths.IMAGE,
+            rr.Pinhole(
+                image_from_camera=camera.K,
+                resolution=camera.size,
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=_PLANE * self._sizes.depth,
+            ),
+            static=True,
+        )
+
+    def _log_picture(self, picture: Picture) -> None:
+        import rerun as rr
+
+        if isinstance(picture.data, bytes):
+            image: Any = rr.EncodedImage(contents=picture.data, media_type=picture.media_type)
+        else:
+            image = rr.Image(picture.data, color_model="L")
+        self._stream.log(paths.IMAGE, image)
+
+    def _log_pixels(self, cloud: Cloud) -> None:
+        """The matches of an image by what became of them."""
+        import rerun as rr
+
+        frame = self._frames.get(cloud.stamp_ns)
+        rest = others(cloud.pixels, frame)
+        self._stream.log(paths.OTHERS, rr.Points2D(_centred(rest), colors=_RED, radii=-2.0))
+        if frame is None:
+            for path in (paths.MATCHES, self._residuals, paths.INLIERS):
+                self._stream.log(path, rr.Clear(recursive=False))
+            self._stream.log(paths.REFUSED, rr.TextLog("no pose", level=rr.TextLogLevel.WARN))
+            return
+        found = reproject(frame, self._camera)
+        ends = found.pixels + self._sizes.longer * (found.predicted - found.pixels)
+        strips = np.stack([_centred(found.pixels), _centred(ends)], axis=1)
+        self._stream.log(
+            paths.MATCHES, rr.Points2D(_centred(found.predicted), colors=found.colours, radii=-3.0)
+        )
+        self._stream.log(self._residuals, rr.LineStrips2D(list(strips), colors=_ORANGE))
+        self._stream.log(paths.INLIERS, rr.Points3D(found.points, colors=found.colours, radii=-3.0))
+
+    def _log_pose(self, frame: Localized) -> None:
+        import rerun as rr
+
+        rotation, translation = frame.estimate.at(0.0)
+        self._stream.log(
+            paths.CAMERA,
+            rr.Transform3D(translation=-rotation.T @ translation, mat3x3=rotation.T),
+        )
+        self._stream.log(
+            paths.BODY,
+            rr.Transform3D(translation=frame.pose.position, mat3x3=frame.pose.rotation),
+            rr.TransformAxes3D(_AXES * self._sizes.depth),
+        )
+        shape = ellipsoid(frame.pose.covariance[:3, :3])
+        self._stream.log(
+            paths.COVARIANCE,
+            rr.Ellipsoids3D(
+                centers=[frame.pose.position],
+                half_sizes=[shape.half_sizes],
+                quaternions=[rr.Quaternion(xyzw=shape.quaternion)],
+                colors=_ORANGE,
+            ),
+        )
+        self._stream.log(paths.READOUT, rr.LineStrips3D([readout_path(frame)], colors=_ORANGE))
+
+    def _log_series(self) -> None:
+        import rerun as rr
+
+        stamps = [_time(stamp) for stamp in self._frames]
+        for path, (names, values) in series(list(self._frames.values())).items():
+            self._stream.log(path, rr.SeriesLines(names=names), static=True)
+            rr.send_columns(
+                path,
+                indexes=[rr.TimeColumn(paths.TIMELINE, timestamp=stamps)],
+                columns=rr.Scalars.columns(scalars=values),
+                recording=self._stream,
+            )
+
+
+def _time(stamp_ns: int) -> np.datetime64:
+    return np.datetime64(stamp_ns, "ns")
+
+
+def _centred(pixels: Array) -> Array:
+    """Rerun has the corner of the first pixel at 0, 0, we its centre."""
+    return pixels + 0.5

@@ -1,0 +1,58 @@
+"""The node ``feature_detector``: images in; keypoints with descriptors out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rs_localizer.config import FeatureConfig
+from rs_localizer.features.picture import draw_features
+from rs_localizer.io.messages import Make
+from rs_localizer.io.topics import KEYPOINTS
+from rs_localizer.pipeline.features import Extracted, FrameExtractor, keypoints
+from rs_localizer.ros.detector.node import Finder, ImageNode
+from rs_localizer.ros.detector.outputs import Show
+from rs_localizer.settings import FEATURES_NAME
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureSight:
+    """What is told of the last image."""
+
+    keypoints: int
+
+    @property
+    def text(self) -> str:
+        return f"{self.keypoints or 'no'} keypoints in the last image"
+
+    @property
+    def values(self) -> dict[str, str]:
+        return {"Keypoints": str(self.keypoints)}
+
+
+def tell(extracted: Extracted) -> tuple[int, FeatureSight]:
+    """Stamp of an image (ns), and what the statistics keep of it."""
+    return extracted.image.stamp_ns, FeatureSight(len(extracted.features))
+
+
+class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
+    """Looks for keypoints."""
+
+    task = FEATURES_NAME
+    output = KEYPOINTS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(FEATURES_NAME, FeatureConfig, tell, **options)
+
+    def make_finder(self, config: FeatureConfig) -> FrameExtractor:
+        return FrameExtractor(config)
+
+    def make_cloud(self, found: Extracted, make: Make) -> Any:
+        return keypoints(found, make)
+
+    def drawing(self, show: Show) -> Callable[[Extracted, FeatureConfig], None]:
+        return lambda found, _: show(found.image, draw_features(found.image.pixels, found.features))
+
+    def describe(self, finder: Finder[Extracted]) -> str:
+        return f"{self.config.features}, at most {self.config.max_keypoints} keypoints an image"

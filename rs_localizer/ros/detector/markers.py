@@ -1,0 +1,94 @@
+"""The node ``marker_detector``: images in; correspondences with a marker map out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rs_localizer.config import DetectorConfig
+from rs_localizer.core.reasons import Notice
+from rs_localizer.io.messages import Make
+from rs_localizer.io.topics import CORRESPONDENCES
+from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
+from rs_localizer.ros.detector.debug import DebugPictures, picture_topics
+from rs_localizer.ros.detector.node import Finder, ImageNode, Work
+from rs_localizer.ros.detector.outputs import Show
+from rs_localizer.ros.node.inputs import Topic
+from rs_localizer.ros.node.worker import Worker
+from rs_localizer.settings import DETECTOR_NAME
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerSight:
+    """What is told of the last image."""
+
+    markers: int  # of the map
+    boards: int
+    corners: int
+    unknown: int  # markers that are not in the map
+
+    @property
+    def text(self) -> str:
+        if self.corners == 0:
+            return "the last image shows nothing of the map"
+        boards = f" and {self.boards} boards" if self.boards else ""
+        return f"{self.corners} corners of {self.markers} markers{boards}"
+
+    @property
+    def values(self) -> dict[str, str]:
+        return {
+            "Markers": str(self.markers),
+            "Boards": str(self.boards),
+            "Corners": str(self.corners),
+            "Markers not in the map": str(self.unknown),
+        }
+
+
+def tell(detected: Detected) -> tuple[int, MarkerSight]:
+    """Stamp of an image (ns), and what the statistics keep of it."""
+    found = detected.detections
+    sight = MarkerSight(
+        markers=sum(int(item.known.sum()) for item in found.markers),
+        boards=len(found.boards),
+        corners=len(found.ids),
+        unknown=len(found.unknown),
+    )
+    return detected.image.stamp_ns, sight
+
+
+class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
+    """Looks for markers."""
+
+    task = DETECTOR_NAME
+    output = CORRESPONDENCES
+    odd = (Notice.WRONG_MAP, Notice.REPEATED_MARKERS)
+    checked_at_start = False  # the map may come later: on_configure tells
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(DETECTOR_NAME, DetectorConfig, tell, **options)
+
+    def check(self, config: DetectorConfig) -> None:
+        # Before it is configured, the map may still be missing.
+        if config.marker_map or self.worker is not None:
+            super().check(config)
+
+    def make_finder(self, config: DetectorConfig) -> FrameDetector:
+        return FrameDetector(config, self.refusals.notice)
+
+    def make_cloud(self, found: Detected, make: Make) -> Any:
+        return correspondences(found, make)
+
+    def drawing(self, show: Show) -> Callable[[Detected, DetectorConfig], None]:
+        self._pictures = DebugPictures(show, self.refusals.notice)
+        return self._pictures.add
+
+    def picture_topics(
+        self, worker: Worker[Work[DetectorConfig, Detected], Detected]
+    ) -> Mapping[str, Topic]:
+        return picture_topics(worker, self._pictures, self.refusals)
+
+    def describe(self, finder: Finder[Detected]) -> str:
+        assert isinstance(finder, FrameDetector)
+        found = finder.map
+        return f"{len(found.markers)} markers and {len(found.boards)} boards in {found.map_frame}"

@@ -1,0 +1,145 @@
+"""The estimating equation of the readout time over many triples of frames, compiled.
+
+Names and symbols are those of :mod:`rs_localizer.trajectory.online`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.so3 import log
+from rs_localizer.estimation.refine import inverted
+
+SIDE = 6
+"""Numbers of each side of an equation: angular and linear."""
+# What a camera may do (rad/s, m/s), squared: where the way is less certain than this, it says less.
+_MOTION = np.square([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+_HUBER = 12.6  # squared length beyond which a triple counts less: 95 % of six degrees of freedom
+_MEDIAN = 5.35  # median of chi-squared of six degrees of freedom
+
+
+class View(NamedTuple):
+    """One frame."""
+
+    rotation: Array  # (3,3) map_from_camera
+    position: Array  # (3,)
+    motion: Array  # (6,) angular and linear per readout, of the image alone
+    covariance: Array  # (12,12) of the image alone
+
+
+class Equations(NamedTuple):
+    """Triples ``y = T x``, stacked, and the covariances of both sides."""
+
+    x: Array  # (n,6)
+    y: Array  # (n,6)
+    xx: Array  # (n,6,6)
+    yx: Array  # (n,6,6)
+    yy: Array  # (n,6,6)
+
+
+class Score(NamedTuple):
+    """The estimating equation at one readout time."""
+
+    terms: Array  # (n,) of which the sum is zero at the solution
+    slope: float  # of the sum, without the part of the noise; negated
+    noise: float  # part of the noise that was taken away
+
+
+@kernel
+def score(of: Equations, value: float) -> Score:
+    """``sum of x*^T W (y - T x)``, where ``x*`` is the best guess of the way: what the noise of
+    ``y - T x`` tells of that of ``x`` is taken out of it, so that both are independent, and it is
+    shrunk towards rest where it is only noise.
+
+    NaN where a covariance is none.
+    """
+    count = len(of.x)
+    terms, error, squared = np.zeros(count), np.empty((count, SIDE)), np.zeros(count)
+    weights = np.empty((count, SIDE, SIDE))
+    spread = np.empty((SIDE, SIDE))
+    for n in range(count):
+        for i in range(SIDE):
+            error[n, i] = of.y[n, i] - value * of.x[n, i]
+            for j in range(SIDE):
+                both = of.yx[n, i, j] + of.yx[n, j, i]
+                spread[i, j] = of.yy[n, i, j] - value * both + value * value * of.xx[n, i, j]
+        weights[n] = inverted(spread)
+        for i in range(SIDE):
+            for j in range(SIDE):
+                squared[n] += error[n, i] * weights[n, i, j] * error[n, j]
+    scale = max(1.0, np.median(squared) / _MEDIAN)
+    slope, noise = 0.0, 0.0
+    mixed, taken = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE))  # of the noise of x and the error
+    left, way = np.empty((SIDE, SIDE)), np.empty(SIDE)
+    for n in range(count):
+        robust = min(1.0, np.sqrt(_HUBER * scale / max(squared[n], 1e-12))) / scale
+        for i in range(SIDE):
+            for j in range(SIDE):
+                mixed[i, j] = of.yx[n, j, i] - value * of.xx[n, i, j]
+        for i in range(SIDE):
+            way[i] = of.x[n, i]
+            for j in range(SIDE):
+                taken[i, j] = 0.0
+                for k in range(SIDE):
+                    taken[i, j] += mixed[i, k] * weights[n, k, j]
+                way[i] -= taken[i, j] * error[n, j]
+        for i in range(SIDE):
+            for j in range(SIDE):
+                left[i, j] = of.xx[n, i, j]
+                for k in range(SIDE):
+                    left[i, j] -= taken[i, k] * mixed[j, k]
+                spread[i, j] = left[i, j]
+            spread[i, i] += _MOTION[i]
+        shrink = inverted(spread)
+        for i in range(SIDE):
+            for j in range(SIDE):
+                shrink[i, j] *= _MOTION[i]
+        for i in range(SIDE):
+            likely = 0.0
+            for j in range(SIDE):
+                likely += shrink[i, j] * way[j]
+            for j in range(SIDE):
+                pulled = robust * weights[n, j, i] * likely
+                terms[n] += pulled * error[n, j]
+                slope += pulled * of.x[n, j]
+                through = 0.0
+                for k in range(SIDE):
+                    through += shrink[i, k] * left[k, j]
+                noise += robust * weights[n, j, i] * through
+    return Score(terms, slope - noise, noise)
+
+
+@kernel
+def equation(
+    before: View, now: View, after: View, first: float, second: float, of: Equations, place: int
+) -> None:
+    """Write the equation of a triple to its place.
+
+    Args:
+        first, second: s from the first view to the second one and on to the third.
+    """
+    span = first + second
+    # Integral of the parabola through three values (Simpson's rule for unlike intervals).
+    shares = (2.0 - second / first, span * span / (first * second), 2.0 - first / second)
+    back = np.ascontiguousarray(now.rotation.T)
+    x, y = of.x[place], of.y[place]
+    x[:3] = log(np.ascontiguousarray(before.rotation.T) @ now.rotation)
+    x[:3] += log(back @ after.rotation)
+    x[3:] = back @ (after.position - before.position)
+    x /= span
+    y[:], of.xx[place], of.yx[place], of.yy[place] = 0.0, 0.0, 0.0, 0.0
+    axes = np.eye(2 * SIDE)  # now from then; turns add up in the camera's own axes
+    views = (before, now, after)
+    for k in range(3):
+        axes[3:6, 3:6] = back @ views[k].rotation
+        axes[9:, 9:] = axes[3:6, 3:6]
+        covariance = axes @ views[k].covariance @ axes.T
+        share, pace = shares[k] / 6.0, (k - 1.0) / span
+        y += share * (axes[:SIDE, :SIDE].copy() @ views[k].motion)
+        of.xx[place] += pace * pace * covariance[:SIDE, :SIDE]
+        of.yx[place] += pace * share * covariance[SIDE:, :SIDE]
+        of.yy[place] += share * share * covariance[SIDE:, SIDE:]

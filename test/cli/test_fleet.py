@@ -1,0 +1,241 @@
+"""Many recordings by one command: the same bytes by one and two workers, and nothing in the way."""
+
+from __future__ import annotations
+
+import csv
+import filecmp
+import itertools
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rs_localizer import data
+from rs_localizer.cli import fleet
+from rs_localizer.cli.main import main
+from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.offline.fleet.task import Outcome, Task, perform
+
+pytest.importorskip("distributed", reason="needs Dask")
+
+SHUTTER = ["-p", "readout_time:=0.03"]
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Two flights of one name, and a file that is none."""
+    path = tmp_path_factory.mktemp("bags")
+    words = ["--rate", "10", "--duration", "0.65", "--angular-velocity", "0", "1.2", "0.6"]
+    for seed, folder in enumerate(("a", "b")):
+        out = str(path / folder / "flight")
+        assert main(["simulate", out, *words, "--seed", str(seed)]) == 0
+    (path / "notes.mcap").write_text("no recording")
+    return [str(path / "a" / "flight"), str(path / "b" / "flight"), str(path / "notes.mcap")]
+
+
+def rows(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "summary.csv").open() as file:
+        return {row["folder"]: row for row in csv.DictReader(file)}
+
+
+def differing(one: filecmp.dircmp[str]) -> list[str]:
+    """Names of all that is not the same, to the last byte, in two trees."""
+    _, other, unreadable = filecmp.cmpfiles(one.left, one.right, one.common_files, shallow=False)
+    below = [name for sub in one.subdirs.values() for name in differing(sub)]
+    return [*one.left_only, *one.right_only, *other, *unreadable, *below]
+
+
+def test_bytes_are_the_same_by_one_and_two_workers_and_of_one_recording(
+    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["replay", *recordings, *SHUTTER]
+    for workers in ("1", "2"):
+        out = str(tmp_path / workers)
+        assert main([*words, "--out", out, "--workers", workers]) == 1
+        said = capsys.readouterr()
+        assert said.err == (
+            f"rs_localizer replay: 1 of 3 recordings failed; {out}/summary.csv says why\n"
+        )
+        assert "notes: failed: " in said.out
+        assert "3 recordings: 2 done, 1 failed\n" in said.out
+    assert differing(filecmp.dircmp(tmp_path / "1", tmp_path / "2")) == []
+    found = rows(tmp_path / "1")
+    assert {name: row["state"] for name, row in found.items()} == {
+        "a_flight": "done", "b_flight": "done", "notes": "failed"
+    }  # fmt: skip
+    assert found["a_flight"]["frames"] == found["a_flight"]["localized"] == "7"
+    assert found["notes"]["reason"].startswith(f"{recordings[2]} cannot be read as a recording")
+    assert (tmp_path / "1" / "summary.png").read_bytes().startswith(b"\x89PNG")
+    assert "# replay: 3 recordings: 2 done, 1 failed\n" in (tmp_path / "1/summary.md").read_text()
+    # Alone, as ever:
+    assert main(["replay", recordings[0], *SHUTTER, "--out", str(tmp_path / "alone")]) == 0
+    alone = filecmp.dircmp(tmp_path / "alone", tmp_path / "1" / "a_flight")
+    assert sorted(differing(alone)) == ["fleet.json", "log.txt"]
+    # What is done is not done again.
+    result = tmp_path / "1" / "a_flight" / "poses.txt"
+    before = result.stat()
+    capsys.readouterr()
+    assert main([*words[:3], *SHUTTER, "--out", str(tmp_path / "1")]) == 0
+    assert "2 of 2 recordings have been done before\n" in capsys.readouterr().out
+    assert result.stat() == before
+
+
+@pytest.fixture
+def undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody works, so that what comes before it is quick to try."""
+    monkeypatch.setattr(fleet, "perform_all", lambda tasks, where: (item for item in ()))
+
+
+@pytest.mark.usefixtures("undone")
+def test_results_of_other_settings_are_in_the_way(
+    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["replay", *recordings, "--out", str(out), *SHUTTER]
+    (out / "a_flight").mkdir(parents=True)
+    (out / "a_flight" / "mine").write_text("")
+    assert main([*words, "--overwrite"]) == 1
+    assert f"{out}/a_flight exists and is no result of replay; choose" in capsys.readouterr().err
+    (out / "a_flight" / "fleet.json").write_text('{"identity": "another", "figures": {}}')
+    assert main(words) == 1
+    assert "a_flight is a result of other settings, another recording or another version; " in (
+        capsys.readouterr().err
+    )
+    assert main([*words, "--overwrite"]) == 0
+    assert (out / "a_flight" / "mine").exists()  # until there is a better one
+    assert rows(out)["b_flight"]["state"] == "not done"
+
+
+@pytest.mark.usefixtures("undone")
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["replay", "a", "b"], "many recordings need --out DIR"),
+        (["replay", "a", "b", "--ros"], "--ros plays one recording"),
+        (["replay", "a", "--out", "o", "--workers", "0"], "must be 1 or more, got 0"),
+        (["replay", "a", "--workers", "2", "--scheduler", "tcp://h:1", "--out", "o"], "give it or"),
+        (["replay", "a", "b", "--out", "o", "-p", "solver:=magic"], "-p: solver"),
+        (["calibrate", "a", "b", "--out", "o", "--plots", "x/y"], "--plots is a name in the"),
+        (["detect", "a", "b", "--out", "o"], "give --map, --board or --features"),
+        (["evaluate", "a"], "give EST and TRUTH"),
+        (["evaluate", "a", "b", "--out", "o"], "go with --truths"),
+        (["evaluate", "a", "--truths", "t"], "many recordings need --out DIR"),
+    ],
+)
+def test_wrong_usage(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_without_dask_one_sentence_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fleet.importlib.util, "find_spec", lambda name: None)
+    assert main(["replay", "a", "b", "--out", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err == (
+        "rs_localizer replay: many recordings need Dask, which is not installed: "
+        "pip install 'rs_localizer[fleet]'\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_commands_do_not_write_into_one_directory(
+    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with fleet.only_one(tmp_path):
+        assert main(["replay", *recordings, *SHUTTER, "--out", str(tmp_path)]) == 1
+    assert f"another command is writing into {tmp_path}; wait" in capsys.readouterr().err
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As by a worker, without the time that its start takes."""
+    monkeypatch.setattr(fleet, "perform_all", lambda tasks, where: map_closed(perform, tasks))
+
+
+def map_closed(function: Callable[[Task], Outcome], tasks: list[Task]) -> Iterator[Outcome]:
+    yield from map(function, tasks)
+
+
+@pytest.mark.usefixtures("in_process")
+def test_evaluate_finds_the_truth_of_each_by_its_name(
+    recordings: list[str], tmp_path: Path
+) -> None:
+    """The estimates are the truth itself; one of them has none to be compared with."""
+    truths, estimates = tmp_path / "truths", tmp_path / "estimates"
+    truths.mkdir()
+    for name in ("one", "two"):
+        shutil.copytree(recordings[0], estimates / name)
+    (truths / "one").symlink_to(recordings[0])
+    words = ["evaluate", *map(str, estimates.iterdir()), "--truths", str(truths)]
+    assert main([*words, "--out", str(tmp_path / "out"), "--plot", "pictures"]) == 1
+    found = rows(tmp_path / "out")
+    assert found["one"]["position (m) median"] == "0"
+    assert (tmp_path / "out" / "one" / "pictures" / "errors.png").is_file()
+    assert "poses compared\n" in (tmp_path / "out" / "one" / "log.txt").read_text()
+    assert "there is no truth of" in found["two"]["reason"]
+    assert not (tmp_path / "out" / "two").exists()
+
+
+@pytest.mark.usefixtures("in_process")
+def test_detect_makes_a_recording_of_each(tmp_path: Path) -> None:
+    webcam = data.path(data.WEBCAM)
+    with open_bag(webcam) as bag, BagWriter(tmp_path / "some") as some:
+        wanted = ("/camera_info", "/image/compressed")
+        for topic, recorded, message in itertools.islice(bag.messages(wanted), 6):
+            some.write(topic, message, recorded)
+    shutil.copytree(tmp_path / "some", tmp_path / "more")
+    words = [str(tmp_path / "some"), str(tmp_path / "more"), "--board", "6x4", "--square", "0.03"]
+    assert main(["detect", *words, "--out", str(tmp_path / "out")]) == 0
+    for name, row in rows(tmp_path / "out").items():
+        assert row["with corners"] == row["images"]
+        assert float(row["corners"]) == 24.0
+        with open_bag(tmp_path / "out" / name) as bag:
+            assert bag.count(["/correspondences"]) == int(row["images"]) > 1
+
+
+@pytest.mark.usefixtures("in_process")
+def test_calibrate_tells_of_each_what_it_lacks(recordings: list[str], tmp_path: Path) -> None:
+    """Seven images are too few, and say so; what can be calibrated with has tests of its own."""
+    assert main(["calibrate", *recordings[:2], "--out", str(tmp_path / "out")]) == 1
+    assert {row["state"] for row in rows(tmp_path / "out").values()} == {"failed"}
+    assert all("images" in row["reason"] for row in rows(tmp_path / "out").values())
+
+
+def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
+    recordings: list[str], tmp_path: Path
+) -> None:
+    """As from a terminal: every process of the group gets the signal."""
+    bags = [str(tmp_path / "in" / str(k)) for k in range(3)]
+    for bag in bags:
+        shutil.copytree(recordings[0], bag)
+    out = tmp_path / "out"
+    words = [sys.executable, "-m", "rs_localizer", "replay", *bags, *SHUTTER, "--out", str(out)]
+    running = subprocess.Popen(
+        [*words, "--workers", "1"],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (out / "0").exists():
+        assert running.poll() is None
+        time.sleep(0.01)
+    os.killpg(running.pid, signal.SIGINT)
+    _, errors = running.communicate(timeout=60)
+    assert (running.returncode, errors) == (130, "rs_localizer replay: interrupted\n")
+    found = rows(out)
+    done = {name for name, row in found.items() if row["state"] == "done"}
+    assert {"0"} <= done
+    assert {path.name for path in out.iterdir() if path.is_dir()} == done
+    assert all((out / name / "fleet.json").is_file() for name in done)
+    assert {row["state"] for row in found.values()} <= {"done", "not done"}
+    again = subprocess.run([*words, "--workers", "1"], capture_output=True, text=True, check=True)
+    assert f"{len(done)} of 3 recordings have been done before\n" in again.stdout
+    assert {row["state"] for row in rows(out).values()} == {"done"}

@@ -1,0 +1,140 @@
+"""Poses at any row, and transforms.json: both say where the camera saw the points."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.nerfstudio import NerfstudioError, transforms
+from rs_localizer.io.trajectories import read_tum
+
+READOUT = 0.03
+MOVING = ("--angular-velocity", "0.4", "1", "-0.3", "--linear-velocity", "0.5", "0.2", "0.3")
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    path = tmp_path_factory.mktemp("exports") / "flight"
+    words = ["--duration", "0.3", "--noise", "0.1", "--points", "150", *MOVING]
+    assert main(["simulate", str(path), *words, "--readout-time", str(READOUT)]) == 0
+    with open_bag(path) as bag:
+        clouds = [read_correspondences(m) for _, _, m in bag.messages(["/correspondences"])]
+    return SimpleNamespace(
+        path=path, params=("--params", str(path / "parameters.yaml")),
+        clouds={cloud.stamp_ns: cloud for cloud in clouds},
+    )  # fmt: skip
+
+
+def replay(flight: Any, out: Path, *words: str) -> int:
+    return main(["replay", str(flight.path), *flight.params, "--out", str(out), *words])
+
+
+@pytest.mark.parametrize("more", [(), ("--smooth",), ("-p", "pose_time:=mid_frame")])
+def test_poses_at_rows(flight: Any, tmp_path: Path, more: tuple[str, ...]) -> None:
+    out = tmp_path / "out"
+    rows = ["--row", "first", "--row", "middle", "--row", "last", "--row", "0.25"]
+    assert replay(flight, out, *rows, *more) == 0
+    plain = read_tum(out / "poses.txt")
+    taus = {"first": -0.5, "middle": 0.0, "last": 0.5, "0.25": 0.25}
+    for name, tau in taus.items():
+        found = read_tum(out / f"poses_{name}.txt")
+        stamps = sorted(flight.clouds)
+        assert len(found) == len(plain) == len(stamps)
+        seconds = READOUT * (tau + 0.5)  # from the stamp, which is the first row's
+        np.testing.assert_allclose((found.stamps_ns - stamps) * 1e-9, seconds, atol=2e-9)
+        # What this row shows is where the pose of its exposure puts it.
+        errors = []
+        for stamp, position, quaternion in zip(
+            stamps, found.positions, found.quaternions, strict=True
+        ):
+            cloud = flight.clouds[stamp]
+            near = np.abs(cloud.pixels[:, 1] / 479 - 0.5 - tau) < 0.02
+            turn = Rotation.from_quat(quaternion).as_matrix()
+            seen = (cloud.points[near] - position) @ turn @ K.T
+            errors += list(np.linalg.norm(seen[:, :2] / seen[:, 2:] - cloud.pixels[near], axis=1))
+        assert len(errors) > 10
+        assert np.median(errors) < 0.8  # in these rows the image moves by 1 px
+    reference = "middle" if "pose_time:=mid_frame" in more else "first"
+    same = read_tum(out / f"poses_{reference}.txt")
+    np.testing.assert_allclose(same.positions, plain.positions, atol=1e-9)
+    assert replay(flight, out, "--overwrite") == 0
+    assert not (out / "poses_last.txt").exists()
+
+
+def test_transforms_explain_every_pixel(flight: Any, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert replay(flight, out, "--nerfstudio") == 0
+    told = json.loads((out / "transforms.json").read_text())
+    assert (told["camera_model"], told["w"], told["h"]) == ("OPENCV", 640, 480)
+    assert (told["fl_x"], told["cx"], told["cy"]) == (500.0, 320.0, 240.0)
+    assert len(told["frames"]) == len(flight.clouds)
+    for frame in told["frames"]:
+        cloud = flight.clouds[int(Path(frame["file_path"]).stem)]
+        pose = np.array(frame["transform_matrix"])
+        u, v = cloud.pixels.T + 0.5
+        seconds = (v / told["h"] - 0.5) * told["rolling_shutter_time"]
+        turns = Rotation.from_rotvec(np.outer(seconds, frame["camera_angular_velocity"]))
+        moved = pose[:3, 3] + np.outer(seconds, pose[:3, :3] @ frame["camera_linear_velocity"])
+        # Axes of OpenGL: x right, y up, the camera looks along -z.
+        x, y, z = turns.inv().apply((cloud.points - moved) @ pose[:3, :3]).T
+        seen = told["fl_x"] * x / -z + told["cx"], told["fl_y"] * -y / -z + told["cy"]
+        assert np.median(np.hypot(seen[0] - u, seen[1] - v)) < 0.25
+
+
+def test_images_of_the_recording_go_with_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walls = tmp_path / "walls"
+    words = ["--images", "--duration", "0.1", "--width", "320", "--height", "240", "--focal", "250"]
+    assert main(["simulate", str(walls), *words, "--readout-time", "0.02"]) == 0
+    seen = tmp_path / "seen"
+    marker_map = str(walls / "marker_map.yaml")
+    assert main(["detect", str(walls), "--map", marker_map, "--images", "--out", str(seen)]) == 0
+    params = ["--params", str(seen / "parameters.yaml")]
+    assert main(["replay", str(seen), *params, "--out", str(tmp_path / "a"), "--nerfstudio"]) == 0
+    told = json.loads((tmp_path / "a" / "transforms.json").read_text())
+    for frame in told["frames"]:
+        assert (tmp_path / "a" / frame["file_path"]).read_bytes().startswith(b"\xff\xd8")
+    assert "are not in the recording" not in capsys.readouterr().out
+    assert main(["replay", str(walls), "--nerfstudio", "--ros"]) == 2
+    assert main(["replay", str(seen), "--smooth", "--rate", "100", "--nerfstudio"]) == 2
+    assert main(["replay", str(seen), "--row", "0.7"]) == 2
+    assert "must be first, middle, last, or a row time" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"distortion_model": "rational_polynomial"}, "has no lens rational_polynomial"),
+        ({"scan_direction": "bottom_to_top", "readout_time": 0.01}, "this one moves bottom_to_top"),
+    ],
+)
+def test_what_the_format_cannot_say_is_told(changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(NerfstudioError, match=text):
+        transforms(Camera(640, 480, K, **changes), [])
+
+
+def test_a_part_of_the_sensor(tmp_path: Path) -> None:
+    from rs_localizer.core.camera import Roi
+
+    camera = Camera(
+        640, 480, K, [0.1, 0.01, 0.001, 0.002], readout_time=0.479,
+        binning=(2, 2), roi=Roi(0, 100, 640, 200),
+    )  # fmt: skip
+    told = transforms(camera, [])
+    assert (told["w"], told["h"], told["fl_x"]) == (320, 100, 250.0)
+    # As Camera has it: a delivered pixel p is 2 p + offset on the sensor.
+    assert (told["cx"], told["cy"]) == (319.5 / 2 + 0.5, 139.5 / 2 + 0.5)
+    assert told["rolling_shutter_time"] == pytest.approx(0.2)  # 200 rows of 1 ms
+    assert [told[k] for k in ("k1", "k2", "p1", "p2", "k3")] == [0.1, 0.01, 0.001, 0.002, 0.0]

@@ -1,0 +1,145 @@
+"""``replay --rerun``: what the file holds, read back, and that nothing else changes."""
+
+from __future__ import annotations
+
+import filecmp
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.cli import replay_view
+from rs_localizer.cli.main import main
+from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.estimates import read_motions
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.recording import IMAGE_TOPIC, write_image
+from rs_localizer.offline.viewing import paths
+
+chunk = pytest.importorskip("rerun.chunk", reason="needs the Rerun SDK")
+
+SHUTTER = ["-p", "readout_time:=0.03"]
+FRAMES = 7
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight with images."""
+    folder = tmp_path_factory.mktemp("bags")
+    words = ["--rate", "10", "--duration", "0.65", "--outliers", "0.2", "--noise", "0.5"]
+    turn = ["--angular-velocity", "0", "1.2", "0.6"]
+    assert main(["simulate", str(folder / "matches"), *words, *turn]) == 0
+    jpeg = cv2.imencode(".jpg", np.full((480, 640), 90, np.uint8))[1].tobytes()
+    with open_bag(folder / "matches") as bag, BagWriter(folder / "flight") as copy:
+        for topic, recorded, message in bag.messages(tuple(bag.topics)):
+            copy.write(topic, message, recorded)
+            if topic == "/correspondences":
+                write_image(copy, IMAGE_TOPIC, stamp_ns(message), "jpeg", jpeg)
+    return folder / "flight"
+
+
+@pytest.fixture(scope="module")
+def shown(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The result, and all that its file for the viewer holds, by entity."""
+    out = tmp_path_factory.mktemp("out") / "seen"
+    assert main(["replay", str(flight), *SHUTTER, "--out", str(out), "--rerun"]) == 0
+    found: dict[str, Any] = {}
+    for item in chunk.RrdReader(out / "view.rrd").stream():
+        found.setdefault(item.entity_path.strip("/"), []).append(item.to_record_batch())
+    return out, found
+
+
+def values(found: dict[str, Any], path: str, column: str) -> list[Any]:
+    """Of a component, in the order of the stamps."""
+    rows = [
+        (batch.column(paths.TIMELINE)[k].value, batch.column(column)[k].as_py())
+        for batch in found[path]
+        if column in batch.schema.names and paths.TIMELINE in batch.schema.names
+        for k in range(batch.num_rows)
+    ]
+    return [value for _, value in sorted(rows, key=lambda row: row[0])]
+
+
+def test_poses_and_velocities_are_those_of_the_result(
+    shown: tuple[Path, dict[str, Any]],
+) -> None:
+    out, found = shown
+    motions = read_motions(out)
+    assert motions.twists is not None
+    places = values(found, paths.BODY, "Transform3D:translation")
+    np.testing.assert_allclose(np.array(places)[:, 0], motions.poses.positions, atol=1e-5)
+    speeds = values(found, paths.ANGULAR, "Scalars:scalars")
+    np.testing.assert_allclose(speeds, motions.twists.angular, atol=1e-5)
+    (path,) = [
+        batch.column("LineStrips3D:strips")[0].as_py()[0]
+        for batch in found[paths.PATH]
+        if "LineStrips3D:strips" in batch.schema.names
+    ]
+    np.testing.assert_allclose(path, motions.poses.positions, atol=1e-5)
+
+
+def test_matches_are_inliers_or_others(shown: tuple[Path, dict[str, Any]]) -> None:
+    _, found = shown
+    inliers = values(found, paths.MATCHES, "Points2D:positions")
+    rest = values(found, paths.OTHERS, "Points2D:positions")
+    assert len(inliers) == len(rest) == FRAMES
+    # Of 150 points each a fifth is wrong.
+    assert all(len(a) + len(b) == 150 for a, b in zip(inliers, rest, strict=True))
+    assert all(100 < len(a) <= 121 for a in inliers)
+    assert len(values(found, paths.COVARIANCE, "Ellipsoids3D:half_sizes")) == FRAMES
+    assert len(values(found, paths.IMAGE, "EncodedImage:blob")) == FRAMES
+
+
+def test_nothing_else_changes(
+    flight: Path, shown: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    assert main(["replay", str(flight), *SHUTTER, "--out", str(tmp_path / "plain")]) == 0
+    for name in ("poses.txt", "twists.txt", "result/result.mcap"):
+        assert filecmp.cmp(tmp_path / "plain" / name, shown[0] / name, shallow=False)
+    assert not (tmp_path / "plain" / "view.rrd").exists()
+
+
+def test_a_file_that_cannot_be_written_is_one_line(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--out", str(tmp_path / "out"), "--rerun", str(tmp_path / "no" / "where.rrd")]
+    assert main(["replay", str(flight), *SHUTTER, *words]) == 1
+    assert "where.rrd cannot be written: No such file" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", "--rerun", "flight", "other"]) == 2
+    assert "--rerun FILE must end in .rrd, got flight (a recording" in capsys.readouterr().err
+    assert main(["replay", "a", "b", "--out", "o", "--view"]) == 2
+    assert "--rerun and --view show one recording" in capsys.readouterr().err
+
+
+def test_without_the_sdk_one_sentence_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(replay_view.importlib.util, "find_spec", lambda name: None)
+    assert main(["replay", str(flight), "--view"]) == 1
+    assert capsys.readouterr().err == (
+        "rs_localizer replay: --rerun and --view need the Rerun SDK, which is not installed: "
+        "pip install 'rs_localizer[view]'\n"
+    )
+
+
+def test_without_a_screen_the_result_is_there_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    out = tmp_path / "out"
+    assert main(["replay", str(flight), *SHUTTER, "--out", str(out), "--view"]) == 1
+    assert capsys.readouterr().err == (
+        "rs_localizer replay: the Rerun viewer needs a screen (DISPLAY or WAYLAND_DISPLAY); "
+        "--rerun writes a file\n"
+    )
+    assert (out / "poses.txt").is_file()

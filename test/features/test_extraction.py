@@ -1,0 +1,142 @@
+"""Keypoints lie where the picture has them, and are described as COLMAP does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.features import extraction, methods
+from rs_localizer.features.extraction import FeatureExtractor, Features
+from rs_localizer.features.methods import FeatureError, root_descriptors
+
+# OpenCV 5 has AKAZE in its contrib modules only.
+KINDS = [
+    pytest.param(kind, marks=[] if kind != "akaze" or hasattr(cv2, "AKAZE") else pytest.mark.skip)
+    for kind in ("sift", "orb", "akaze")
+]
+
+
+def distances(ours: Any, others: Any, kind: str) -> Any:
+    """Of all pairs of descriptors."""
+    if kind == "sift":
+        a, b = ours.astype(float), others.astype(float)
+        return np.sqrt(np.maximum((a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T, 0))
+    a, b = (np.unpackbits(item, axis=1).astype(float) for item in (ours, others))
+    return a @ (1 - b).T + (1 - a) @ b.T
+
+
+def mutual(ours: Any, others: Any, kind: str) -> tuple[Any, Any]:
+    """Pairs that are each other's nearest."""
+    between = distances(ours, others, kind)
+    there, back = between.argmin(1), between.argmin(0)
+    rows = np.flatnonzero(back[there] == np.arange(len(there)))
+    return rows, there[rows]
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], KINDS[2]])
+def test_blobs_are_found_in_their_middle(kind: str, blobs: Any) -> None:
+    image, middles = blobs
+    found = FeatureExtractor(kind, 1000).extract(image)
+    off = found.pixels[:, None] - middles
+    nearest = np.linalg.norm(off, axis=2).argmin(1)
+    errors = off[np.arange(len(found)), nearest]
+    errors = errors[np.linalg.norm(errors, axis=1) < 1.0]
+    assert len(errors) > 40
+    # OpenCV's own SIFT is 0.25 px off to the right and down.
+    assert np.abs(np.median(errors, axis=0)).max() < 0.02
+
+
+def test_large_images_are_reduced_and_their_keypoints_are_not(
+    blobs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extraction, "_LONGEST_SIDE", 250)
+    image, middles = blobs
+    found = FeatureExtractor("sift", 1000).extract(image)
+    off = found.pixels[:, None] - middles
+    errors = off[np.arange(len(found)), np.linalg.norm(off, axis=2).argmin(1)]
+    errors = errors[np.linalg.norm(errors, axis=1) < 1.0]
+    assert len(errors) > 30
+    assert np.abs(np.median(errors, axis=0)).max() < 0.05
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_images_show_the_same_points(kind: str, look: Any) -> None:
+    (one, to_one), (two, to_two) = look(0.0, 1.5, (0, 0)), look(0.1, 1.9, (3.3, -2.6))
+    extractor = FeatureExtractor(kind, 600)
+    a, b = extractor.extract(one), extractor.extract(two)
+    rows, columns = mutual(a.descriptors, b.descriptors, kind)
+    homogeneous = np.column_stack([a.pixels[rows], np.ones(len(rows))])
+    expected = homogeneous @ (np.linalg.inv(to_two) @ to_one).T
+    errors = b.pixels[columns] - expected[:, :2]
+    errors = errors[np.linalg.norm(errors, axis=1) < 3.0]
+    assert len(errors) > 60
+    # Whole pixels of ORB's levels leave 0.9 px.
+    assert (
+        np.median(np.linalg.norm(errors, axis=1)) < {"sift": 0.2, "orb": 0.65, "akaze": 0.6}[kind]
+    )
+    assert np.abs(errors.mean(axis=0)).max() < 0.15
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_image_gives_the_same_bits(kind: str, look: Any) -> None:
+    image, _ = look(0.0, 1.5, (0, 0))
+
+    def bits(found: Features) -> list[bytes]:
+        return [a.tobytes() for a in (found.pixels, found.scores, found.descriptors)]
+
+    threads, results = cv2.getNumThreads(), []
+    try:
+        for count in (1, 2, threads):
+            cv2.setNumThreads(count)
+            results.append(bits(FeatureExtractor(kind, 300).extract(image)))
+    finally:
+        cv2.setNumThreads(threads)
+    assert results[0] == results[1] == results[2]
+
+
+def test_sift_is_colmaps(look: Any) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    image, _ = look(0.0, 1.5, (0, 0))
+    theirs, values = pycolmap.Sift().extract(image)
+    described = np.rint(512.0 * values) if values.dtype.kind == "f" else values
+    ours = FeatureExtractor("sift", 3000).extract(image)
+    rows, columns = mutual(ours.descriptors, described, "sift")
+    # COLMAP has the corner of the first pixel at 0, 0.
+    off = theirs[columns, :2] - 0.5 - ours.pixels[rows]
+    near = np.linalg.norm(off, axis=1) < 0.5
+    assert near.sum() > 0.55 * min(len(ours), len(theirs))
+    assert np.abs(np.median(off[near], axis=0)).max() < 0.03
+    apart = np.linalg.norm(ours.descriptors[rows[near]] - described[columns[near]], axis=1)
+    assert np.median(apart) < 80.0  # of 512, the length of each
+
+
+def test_descriptors_of_sift_have_the_length_of_a_byte() -> None:
+    histograms = np.random.default_rng(0).exponential(20.0, (50, 128)).astype(np.float32)
+    packed = root_descriptors(histograms)
+    assert packed.dtype == np.uint8
+    np.testing.assert_allclose(np.linalg.norm(packed.astype(float), axis=1), 512.0, atol=4.0)
+    assert not root_descriptors(np.zeros((1, 128), np.float32)).any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (15, 40), (16, 16), (17, 200), (33, 64)])
+def test_small_images(kind: str, shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    extractor = FeatureExtractor(kind, 50)
+    for image in (noise, np.zeros(shape, np.uint8)):
+        found = extractor.extract(image)
+        assert len(found) == len(found.scores) == len(found.sizes) == len(found.descriptors)
+        assert found.descriptors.shape[1] in (32, 61, 128)
+        assert np.all((found.pixels > -1.0) & (found.pixels < np.array(shape[::-1])))
+
+
+def test_what_opencv_does_not_have_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(methods.cv2, "AKAZE", raising=False)
+    monkeypatch.delattr(methods.cv2, "xfeatures2d", raising=False)
+    with pytest.raises(FeatureError, match="has no AKAZE: take sift or orb, or install"):
+        FeatureExtractor("akaze", 100)
+    with pytest.raises(FeatureError, match="features must be one of sift, orb, akaze; got 'surf'"):
+        FeatureExtractor("surf", 100)

@@ -1,0 +1,37 @@
+"""Every part of an image keeps some of its keypoints, and the best ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rs_localizer.features.selection import balanced
+
+
+def test_all_are_kept_where_they_are_few() -> None:
+    pixels = np.random.default_rng(0).uniform(0, 100, (20, 2))
+    np.testing.assert_array_equal(balanced(pixels, pixels[:, 0], (100, 100), 20), np.arange(20))
+
+
+@pytest.mark.parametrize("size", [(640, 480), (479, 641), (300, 1000)])
+def test_dim_parts_keep_keypoints(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(1)
+    # Bright on the left tenth, dim elsewhere.
+    bright = rng.uniform((0, 0), (0.1 * size[0], size[1]), (2000, 2))
+    dim = rng.uniform((0.1 * size[0], 0), size, (2000, 2))
+    pixels = np.vstack([bright, dim])
+    scores = np.concatenate([rng.uniform(10, 11, 2000), rng.uniform(0, 1, 2000)])
+    rows = balanced(pixels, scores, size, 500)
+    assert len(rows) == len(set(rows.tolist())) == 500
+    # By score alone there would be none.
+    assert np.count_nonzero(rows >= 2000) > 350
+    # Within a part they are the best.
+    kept = scores[rows]
+    assert kept[rows < 2000].min() > np.median(scores[:2000])
+    assert kept[rows >= 2000].mean() > np.mean(scores[2000:]) + 0.2
+
+
+def test_on_equal_terms_the_best_remain() -> None:
+    pixels = np.full((10, 2), 5.0)
+    scores = np.array([3.0, 9, 1, 8, 7, 2, 6, 5, 4, 0])
+    np.testing.assert_array_equal(balanced(pixels, scores, (640, 480), 4), [1, 3, 4, 6])

@@ -1,0 +1,135 @@
+"""PX4's messages say in its axes what a frame says in those of ROS."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.io.outputs import Localized, Pose, Twist
+from rs_localizer.io.px4 import vehicle_odometry
+
+UP = {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}
+# Numbers of the message: PX4-Autopilot, msg/versioned/VehicleOdometry.msg.
+NED, FRD, BODY_FRD = 1, 2, 3
+
+
+def localized(
+    position: Any = (0.0, 0.0, 0.0),
+    twist: Twist | None = None,
+    pose_deviations: Any = (0.01,) * 6,
+    **attitude: float,
+) -> Localized:
+    """A body of x forward, y left, z up in a map of x east, y north, z up."""
+    angles = UP | attitude
+    rotation = Rotation.from_euler("xyz", list(angles.values()), degrees=True).as_matrix()
+    estimate: Any = SimpleNamespace(inliers=np.arange(10) < 8)
+    pose = Pose(np.array(position), rotation, np.diag(np.square(pose_deviations)))
+    return Localized(
+        2_000_000_123, 2_000_000_999, "map", "base_link", pose, twist, np.zeros(0), 0, estimate
+    )
+
+
+def moving(linear: Any = (0.0, 0.0, 0.0), angular: Any = (0.0, 0.0, 0.0)) -> Twist:
+    return Twist(np.array(linear), np.array(angular), np.diag([1.0, 4.0, 9.0, 1.0, 1.0, 1.0]))
+
+
+def attitude(fields: dict[str, Any]) -> tuple[float, float, float]:
+    """Roll (right side down), pitch (nose up), heading (clockwise from the first axis), degrees."""
+    w, x, y, z = fields["q"].astype(float)
+    return (
+        math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
+        math.degrees(math.asin(2 * (w * y - z * x))),
+        math.degrees(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
+    )
+
+
+def test_east_north_up_becomes_north_east_down() -> None:
+    fields = vehicle_odometry(localized((1.0, 2.0, 3.0)), "ned", 0, 0)
+    assert fields["pose_frame"] == NED
+    np.testing.assert_allclose(fields["position"], [2.0, 1.0, -3.0])
+    assert attitude(fields) == pytest.approx((0.0, 0.0, 90.0))  # it looks east
+
+
+def test_a_map_without_north_only_turns_over() -> None:
+    fields = vehicle_odometry(localized((1.0, 2.0, 3.0), yaw=30.0), "frd", 0, 0)
+    assert fields["pose_frame"] == FRD
+    np.testing.assert_allclose(fields["position"], [1.0, -2.0, -3.0])
+    assert attitude(fields) == pytest.approx((0.0, 0.0, -30.0), abs=1e-4)  # left is against it
+
+
+@pytest.mark.parametrize("world", ["frd", "ned"])
+def test_tilt_means_the_same_for_pilots(world: str) -> None:
+    # In ROS a positive pitch lowers the nose, a positive roll the right side.
+    fields = vehicle_odometry(localized(pitch=10.0), world, 0, 0)
+    assert attitude(fields)[:2] == pytest.approx((0.0, -10.0), abs=1e-4)
+    fields = vehicle_odometry(localized(roll=10.0), world, 0, 0)
+    assert attitude(fields)[:2] == pytest.approx((10.0, 0.0), abs=1e-4)
+
+
+def test_velocities_are_those_of_the_body() -> None:
+    frame = localized(twist=moving((1.0, 2.0, 3.0), (0.1, 0.2, 0.3)), yaw=77.0)
+    fields = vehicle_odometry(frame, "ned", 0, 0)
+    assert fields["velocity_frame"] == BODY_FRD
+    np.testing.assert_allclose(fields["velocity"], [1.0, -2.0, -3.0])
+    np.testing.assert_allclose(fields["angular_velocity"], [0.1, -0.2, -0.3], rtol=1e-6)
+    np.testing.assert_allclose(fields["velocity_variance"], [1.0, 4.0, 9.0])
+
+
+def test_what_is_not_known_is_nan() -> None:
+    fields = vehicle_odometry(localized(), "ned", 0, 0)
+    for name in ("velocity", "angular_velocity", "velocity_variance"):
+        assert np.isnan(fields[name]).all()
+    assert np.isfinite(fields["position"]).all()
+
+
+def test_variances_go_with_their_axes() -> None:
+    deviations = (0.1, 0.2, 0.3, 0.01, 0.02, 0.03)  # east, north, up; turns about them
+    level = vehicle_odometry(localized(pose_deviations=deviations), "ned", 0, 0)
+    np.testing.assert_allclose(level["position_variance"], [0.04, 0.01, 0.09], rtol=1e-6)
+    # It looks east: its roll is a turn about east, its pitch one about north.
+    np.testing.assert_allclose(level["orientation_variance"], [1e-4, 4e-4, 9e-4], rtol=1e-6)
+    turned = vehicle_odometry(localized(pose_deviations=deviations, yaw=90.0), "ned", 0, 0)
+    np.testing.assert_allclose(turned["position_variance"], [0.04, 0.01, 0.09], rtol=1e-6)
+    np.testing.assert_allclose(turned["orientation_variance"], [4e-4, 1e-4, 9e-4], rtol=1e-6)
+
+
+def test_variances_are_those_of_the_errors() -> None:
+    """Of poses drawn from the covariance: positions in the world, turns about the body's axes."""
+    rng = np.random.default_rng(3)
+    root = 0.01 * rng.normal(size=(6, 6))
+    frame = localized((1.0, 2.0, 3.0), yaw=40.0, pitch=20.0, roll=-10.0)
+    pose = frame.pose
+    drawn = []
+    for error in rng.normal(size=(4000, 6)) @ root.T:
+        turn = Rotation.from_rotvec(error[3:]).as_matrix()
+        other = localized(pose.position + error[:3])
+        object.__setattr__(other.pose, "rotation", turn @ pose.rotation)
+        drawn.append(vehicle_odometry(other, "ned", 0, 0))
+    object.__setattr__(pose, "covariance", root @ root.T)
+    fields = vehicle_odometry(frame, "ned", 0, 0)
+    positions = np.array([other["position"] for other in drawn], dtype=float)
+    np.testing.assert_allclose(positions.var(axis=0), fields["position_variance"], rtol=0.1)
+    here = rotation_of(fields)
+    turns = [(here.inv() * rotation_of(other)).as_rotvec() for other in drawn]
+    np.testing.assert_allclose(np.var(turns, axis=0), fields["orientation_variance"], rtol=0.1)
+
+
+def rotation_of(fields: dict[str, Any]) -> Rotation:
+    """PX4's quaternions begin with the scalar."""
+    return Rotation.from_quat(np.roll(fields["q"].astype(float), -1))
+
+
+def test_times_quality_and_resets() -> None:
+    fields = vehicle_odometry(localized(), "frd", 257, 2_050_000_000)
+    assert (fields["timestamp"], fields["timestamp_sample"]) == (2_050_000, 2_000_000)
+    assert fields["quality"] == 80  # percent of the points
+    assert fields["reset_counter"] == 1  # a uint8
+    assert abs(np.linalg.norm(fields["q"]) - 1.0) < 1e-6  # EKF2 takes 1e-5
+    none = localized()
+    none.estimate.inliers[:] = False
+    assert vehicle_odometry(none, "frd", 0, 0)["quality"] == 1  # 0 would be invalid

@@ -1,0 +1,39 @@
+"""Folders of results: a recording's own name, and never the same twice."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from rs_localizer.offline.fleet.names import folder_names
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["/a/flight", "/a/drive.mcap"], ["flight", "drive"]),
+        (["/a/flight", "/b/flight", "/b/other"], ["a_flight", "b_flight", "other"]),
+        (["/a/x/flight", "/b/x/flight"], ["a_x_flight", "b_x_flight"]),
+        (["/flight", "/b/flight"], ["flight", "b_flight"]),
+        (["/a/one.mcap", "/a/one.db3"], ["a_one.mcap", "a_one.db3"]),
+    ],
+)
+def test_parents_tell_those_of_one_name_apart(paths: list[str], names: list[str]) -> None:
+    assert folder_names([Path(path) for path in paths]) == names
+
+
+def test_a_folder_keeps_its_point(tmp_path: Path) -> None:
+    (tmp_path / "flight.2").mkdir()
+    assert folder_names([tmp_path / "flight.2"]) == ["flight.2"]
+
+
+def test_all_names_differ_and_are_names() -> None:
+    rng = random.Random(0)
+    parts = ["a", "b", "a_b", "b.x"]
+    for _ in range(300):
+        paths = {Path("/", *rng.choices(parts, k=rng.randint(1, 4))) for _ in range(12)}
+        names = folder_names(list(paths))
+        assert len(set(names)) == len(paths)
+        assert all(name and "/" not in name for name in names)

@@ -1,0 +1,194 @@
+"""One recording of many: whole or not there, and done again only when it has changed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rs_localizer.offline.fleet import first
+from rs_localizer.offline.fleet.identity import MARKER, identity, program
+from rs_localizer.offline.fleet.task import LOG, PARTIAL, Figures, Kind, Task, finished, perform
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(first, "cache_directory", lambda: tmp_path / "cache")
+    return tmp_path / "cache"
+
+
+def count_letters(args: Namespace, recording: Path, out: Path) -> Figures:
+    """Stands for a command: reads, prints, writes."""
+    text = recording.read_text()
+    out.mkdir()
+    (out / "half").write_text(text[:1])
+    sys.stdout.write(f"reading into {out}\n")
+    sys.stderr.write("odd\n")
+    if args.fault is not None:
+        raise args.fault
+    (out / "letters").write_text(str(len(text)))
+    return {"letters": len(text), "of": 0.1 + 0.2, "said": "a|b"}
+
+
+def task(tmp_path: Path, *, fault: BaseException | None = None, kernels: str = "none") -> Task:
+    recording = tmp_path / "in" / "text"
+    recording.parent.mkdir(exist_ok=True)
+    if not recording.exists():
+        recording.write_text("hello")
+    (tmp_path / "out").mkdir(exist_ok=True)
+    return Task(
+        Kind("count", count_letters, kernels),
+        Namespace(fault=fault),
+        recording,
+        tmp_path / "out",
+        "text",
+        identity("count", {}, [recording]),
+        program(),
+    )
+
+
+def test_a_result_is_whole_and_tells_what_it_is_of(tmp_path: Path) -> None:
+    given = task(tmp_path)
+    assert finished(given) is None
+    outcome = perform(given)
+    assert outcome.figures == {"letters": 5, "of": 0.1 + 0.2, "said": "a|b"}
+    assert (outcome.name, outcome.reason) == ("text", "")
+    assert sorted(file.name for file in given.folder.iterdir()) == [
+        *(MARKER, "half", "letters", LOG)
+    ]
+    assert (given.folder / LOG).read_text() == "reading into text\nodd\n"
+    marker = json.loads((given.folder / MARKER).read_text())
+    assert marker["recording"] == str(given.recording)
+    assert marker["program"] == program()
+    assert finished(given) == outcome.figures
+    assert list((given.out / PARTIAL).iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (ValueError("it is\n  bent"), "it is bent"),
+        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
+        (MemoryError("no 3 GB"), "MemoryError: no 3 GB"),
+        (ZeroDivisionError(), "ZeroDivisionError: ZeroDivisionError"),
+    ],
+)
+def test_a_fault_is_a_reason_and_leaves_nothing(
+    tmp_path: Path, fault: BaseException, reason: str
+) -> None:
+    given = task(tmp_path, fault=fault)
+    outcome = perform(given)
+    assert (outcome.figures, outcome.reason) == (None, reason)
+    assert list(given.out.iterdir()) == [given.out / PARTIAL]
+    assert list((given.out / PARTIAL).iterdir()) == []
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
+    perform(task(tmp_path))
+    again = perform(task(tmp_path, fault=ValueError("nobody calls it")))
+    assert again.figures is not None
+    assert again.figures["letters"] == 5
+
+
+def test_another_recording_is_another_result(tmp_path: Path) -> None:
+    old = task(tmp_path)
+    perform(old)
+    old.recording.write_text("hello there")
+    new = task(tmp_path)
+    assert new.identity != old.identity
+    assert finished(new) is None
+    outcome = perform(new)
+    assert outcome.figures is not None
+    assert outcome.figures["letters"] == 11
+    assert (new.folder / "letters").read_text() == "11"
+
+
+def test_identity_is_of_settings_files_and_times(tmp_path: Path) -> None:
+    recording = tmp_path / "bag"
+    recording.mkdir()
+    (recording / "data").write_text("1")
+    os.utime(recording / "data", ns=(10**18, 10**18))
+    first_one = identity("replay", {"a": 1}, [recording])
+    assert identity("replay", {"a": 1}, [recording]) == first_one
+    others = {
+        identity("replay", {"a": 2}, [recording]),
+        identity("detect", {"a": 1}, [recording]),
+        identity("replay", {"a": 1}, [recording, recording]),
+    }
+    os.utime(recording / "data", ns=(10**18, 10**18 + 1))
+    others.add(identity("replay", {"a": 1}, [recording]))
+    assert len(others | {first_one}) == 5
+
+
+def test_a_worker_of_another_version_refuses(tmp_path: Path) -> None:
+    outcome = perform(replace(task(tmp_path), program="beef"))
+    assert outcome.figures is None
+    assert outcome.reason.endswith("here beef): install the same on both")
+
+
+def test_a_worker_that_does_not_see_the_results_says_so(tmp_path: Path) -> None:
+    outcome = perform(replace(task(tmp_path), out=tmp_path / "elsewhere"))
+    assert f"does not see {tmp_path}/elsewhere: machines have to share" in outcome.reason
+
+
+def test_the_first_one_compiles_alone(tmp_path: Path, cache: Path) -> None:
+    """Of three processes that need the same kernels, two wait until the first one has them."""
+    log = tmp_path / "log"
+    code = (
+        "import os, sys, time\n"
+        "from pathlib import Path\n"
+        "from rs_localizer.offline.fleet import first\n"
+        "first.cache_directory = lambda: Path(sys.argv[1])\n"
+        "def say(text):\n"
+        "    with open(sys.argv[2], 'a') as log: log.write(text)\n"
+        "with first.alone_until_compiled('k'):\n"
+        "    say('('); time.sleep(0.3); say(')')\n"
+    )
+    started = [
+        subprocess.Popen([sys.executable, "-c", code, str(cache), str(log)]) for _ in range(3)
+    ]
+    assert [process.wait(60) for process in started] == [0, 0, 0]
+    assert log.read_text().startswith("()")
+    assert len(log.read_text()) == 6
+    # And nobody waits any more: one within the other would for ever.
+    with first.alone_until_compiled("k"), first.alone_until_compiled("k"):
+        pass
+
+
+def test_a_first_one_that_fails_leaves_the_next_one_first(tmp_path: Path, cache: Path) -> None:
+    def marks() -> list[Path]:
+        return [file for file in (cache / "fleet").iterdir() if file.suffix != ".lock"]
+
+    perform(task(tmp_path, fault=ValueError(), kernels="k"))
+    assert marks() == []
+    perform(task(tmp_path, kernels="k"))
+    assert len(marks()) == 1
+
+
+def test_who_can_compile_alone_does_no_more_alone(tmp_path: Path, cache: Path) -> None:
+    """While the first one works, having compiled, a second one may come."""
+    given = task(tmp_path, kernels="k")
+    said: list[str] = []
+
+    def work(args: Namespace, recording: Path, out: Path) -> Figures:
+        with first.alone_until_compiled("k") as is_first:
+            said.append(f"work, first: {is_first}")
+        return {}
+
+    kind = Kind("count", work, "k", lambda args: said.append("compiled"))
+    assert perform(replace(given, kind=kind)).figures == {}
+    perform(replace(given, kind=kind, name="again"))
+    assert said == ["compiled", "work, first: False", "work, first: False"]
+
+
+def test_without_a_cache_nobody_waits(tmp_path: Path, cache: Path) -> None:
+    cache.write_text("a file where the folder should be")
+    with first.alone_until_compiled("k"), first.alone_until_compiled("k"):
+        pass
+    assert perform(task(tmp_path)).figures is not None

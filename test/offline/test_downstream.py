@@ -1,0 +1,193 @@
+"""A replayed flight as the systems downstream get it: frames, signs and covariances of each.
+
+The flight is the independent simulator's; laws of motion and the truth judge, in the axes of those
+who listen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.outputs import Localized, messages
+from rs_localizer.io.px4 import vehicle_odometry
+from rs_localizer.io.recording import CAMERA_FRAME, write_frame
+from rs_localizer.io.transforms.rigid import Transform, make_transform
+from rs_localizer.lab.checks import fusion
+from rs_localizer.lab.experiments.honesty.estimating import believed
+from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
+from rs_localizer.pipeline.broadcasts import broadcast
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.jumps import Jumps
+from rs_localizer.settings import build, load_params_file
+
+CONFIG = Path(__file__).parents[2] / "config"
+LENGTH = 45
+SETTLED = slice(5, None)  # the tracker's first frames are coarser
+ENU_TO_NED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+FLU_TO_FRD = np.diag([1, -1, -1])
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A recording, and the truth (LENGTH,...) at the stamps."""
+
+    path: Path
+    position: Array
+    rotation: Array
+    linear: Array
+    angular: Array
+    odom_from_base: list[Transform]
+
+
+def write_tf(
+    bag: BagWriter, stamp_ns: int, topic: str, ends: tuple[str, str], of: Transform
+) -> None:
+    stamped = make_transform(make_message, stamp_ns, *ends, of)
+    bag.write(topic, make_message(TF_TYPE, transforms=[stamped]), stamp_ns)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    path = tmp_path_factory.mktemp("flight") / "flight"
+    frames = fusion.fly(1, LENGTH, 3)
+    truth = fusion.true_states(frames.first)
+    turned = Rotation.from_euler("z", 50.0, degrees=True).as_matrix()
+    odometry = []
+    with BagWriter(path) as bag:
+        start = int(frames.stamp_ns[0])
+        mounting = fusion.MOUNTING.camera_from_base.inverse()
+        write_tf(bag, start, "/tf_static", ("base_link", CAMERA_FRAME), mounting)
+        for index in range(LENGTH):
+            stamp_ns = int(frames.stamp_ns[index])
+            points, pixels = frames.seen(index, fusion.NOISE)
+            write_frame(
+                bag, believed(frames.camera), stamp_ns, points, pixels, np.arange(len(points))
+            )
+            # Wheels that began elsewhere, and slip by 2 cm a second.
+            drift = np.array([1.0, -2.0, 0.5]) + 0.02 * index / 30
+            odometry.append(Transform(turned @ truth[1][index], turned @ truth[0][index] + drift))
+            write_tf(bag, stamp_ns, "/tf", ("odom", "base_link"), odometry[-1])
+    return Flight(path, *truth, odometry)
+
+
+def localizer(config: NodeConfig, transforms: Any) -> FrameLocalizer:
+    return FrameLocalizer(config, transforms=transforms)
+
+
+def replayed(flight: Flight, config: NodeConfig) -> tuple[list[Localized], FrameLocalizer]:
+    with open_bag(flight.path) as bag:
+        topics = find_topics(bag)
+        used = localizer(config, find_transforms(bag, topics, config))
+        found = [result for _, result in replay(bag, topics, used)]
+    assert all(found)
+    assert len(found) == LENGTH
+    return found, used
+
+
+@pytest.fixture(scope="module")
+def frames(flight: Flight) -> list[Localized]:
+    return replayed(flight, NodeConfig(readout_time=0.03, base_frame="base_link"))[0]
+
+
+def test_a_flight_is_no_jump(frames: list[Localized]) -> None:
+    jumps = Jumps(NodeConfig)
+    assert [jumps.add(frame) for frame in frames] == [0] * LENGTH
+
+
+def squared(errors: Array, covariances: Array) -> float:
+    """Mean squared error in standard deviations, per component."""
+    each = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    return float(np.mean(each)) / errors.shape[1]
+
+
+def turns(found: Any, true: Any) -> Array:
+    """Rotation vectors about the fixed axes."""
+    vectors: Array = (Rotation.from_matrix(found) * Rotation.from_matrix(true).inv()).as_rotvec()
+    return vectors
+
+
+def test_odometry_is_that_of_the_body_in_the_map(flight: Flight, frames: list[Localized]) -> None:
+    """For mavros and robot_localization, which turn it into their frames themselves."""
+    odometry = [messages(frame, make_message)["odometry"] for frame in frames][SETTLED]
+    assert {(m.header.frame_id, m.child_frame_id) for m in odometry} == {("map", "base_link")}
+    poses = [m.pose.pose for m in odometry]
+    position = np.array([[p.position.x, p.position.y, p.position.z] for p in poses])
+    rotation = Rotation.from_quat(
+        [[p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w] for p in poses]
+    ).as_matrix()
+    of_pose = np.hstack(
+        [position - flight.position[SETTLED], turns(rotation, flight.rotation[SETTLED])]
+    )
+    covariances = np.array([m.pose.covariance.reshape(6, 6) for m in odometry])
+    assert 0.4 < squared(of_pose, covariances) < 2.0
+    twists = [m.twist.twist for m in odometry]
+    velocity = (
+        np.array([[*vars_of(t.linear), *vars_of(t.angular)] for t in twists])
+        - np.hstack([flight.linear, flight.angular])[SETTLED]
+    )
+    covariances = np.array([m.twist.covariance.reshape(6, 6) for m in odometry])
+    # It changes its velocities less than the default of acceleration.* allows for.
+    assert 0.2 < squared(velocity, covariances) < 2.0
+
+
+def vars_of(vector: SimpleNamespace) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def test_px4_gets_the_same_in_its_axes(flight: Flight, frames: list[Localized]) -> None:
+    fields = [vehicle_odometry(frame, "ned", 0, frame.stamp_ns) for frame in frames][SETTLED]
+
+    def column(name: str) -> Array:
+        return np.array([item[name] for item in fields], dtype=float)
+
+    rotation = Rotation.from_quat(np.roll(column("q"), -1, axis=1)).as_matrix()
+    true = ENU_TO_NED @ flight.rotation[SETTLED] @ FLU_TO_FRD
+    in_body = np.einsum("nji,nj->ni", true, turns(rotation, true))
+    errors = {
+        "position": column("position") - flight.position[SETTLED] @ ENU_TO_NED.T,
+        "orientation": in_body,
+        "velocity": column("velocity") - flight.linear[SETTLED] @ FLU_TO_FRD.T,
+    }
+    for name, error in errors.items():
+        assert 0.2 < np.mean(error**2 / column(f"{name}_variance")) < 2.0, name
+    rates = column("angular_velocity") - flight.angular[SETTLED] @ FLU_TO_FRD.T
+    assert np.median(np.abs(rates)) < np.deg2rad(5.0)
+
+
+def test_px4s_own_laws_of_motion_hold(frames: list[Localized]) -> None:
+    """Velocities in the body are how positions and attitudes change: without any truth."""
+    fields = [vehicle_odometry(frame, "ned", 0, frame.stamp_ns) for frame in frames][SETTLED]
+    seconds = np.diff([1e-6 * item["timestamp_sample"] for item in fields])[:, None]
+    attitude = Rotation.from_quat([np.roll(item["q"].astype(float), -1) for item in fields])
+    velocity = attitude.apply([item["velocity"] for item in fields])
+    steps = np.diff([item["position"].astype(float) for item in fields], axis=0)
+    way = 0.5 * (velocity[1:] + velocity[:-1]) * seconds
+    assert np.sqrt(np.mean((steps - way) ** 2)) < 0.4 * np.sqrt(np.mean(steps**2))
+    rates = np.array([item["angular_velocity"] for item in fields], dtype=float)
+    turned = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+    expected = 0.5 * (rates[1:] + rates[:-1]) * seconds
+    assert np.sqrt(np.mean((turned - expected) ** 2)) < 0.4 * np.sqrt(np.mean(turned**2))
+
+
+def test_nav2_finds_the_robot_by_its_odometry(flight: Flight) -> None:
+    """With config/nav2.yaml: map -> odom, with odom -> base_link of that moment, is the pose."""
+    config = build(load_params_file(CONFIG / "nav2.yaml") | {"readout_time": 0.03})
+    found, used = replayed(flight, config)
+    for index, frame in enumerate(found):
+        sent = broadcast(frame, config, used.transforms)
+        assert sent is not None
+        assert (sent.parent, sent.child) == ("map", "odom")
+        assert sent.stamp_ns == frame.stamp_ns + 200_000_000  # usable until the next one comes
+        robot = sent.parent_from_child @ flight.odom_from_base[index]
+        assert np.linalg.norm(robot.translation - flight.position[index]) < 0.05
+        assert np.linalg.norm(turns(robot.rotation, flight.rotation[index])) < np.deg2rad(1.0)

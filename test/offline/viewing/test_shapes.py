@@ -1,0 +1,118 @@
+"""What the viewer draws: shapes by their definitions, not by the code's own formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+import rs_localizer as rsl
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.outputs import Localized, Pose
+from rs_localizer.offline.viewing.shapes import (
+    ellipsoid,
+    enlargement,
+    eye,
+    others,
+    readout_path,
+    reproject,
+    row_colours,
+)
+
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+CAMERA = rsl.Camera(width=640, height=480, K=K, readout_time=0.03)
+ROW = np.dtype([(name, "<f8") for name in ("x", "y", "z", "u", "v", "residual")])
+
+
+def localized(points: Array, pixels: Array, residual: float = 0.3) -> Localized:
+    """A camera that moves 0.2 m to the right within its readout, and looks along z."""
+    rows = np.zeros(len(points), ROW)
+    for name, values in zip("xyzuv", np.hstack([points, pixels]).T, strict=True):
+        rows[name] = values
+    estimate = rsl.Estimate(
+        rotation=np.eye(3),
+        translation=np.array([0.0, 0.0, 1.0]),
+        angular_velocity=np.zeros(3),
+        linear_velocity=np.array([0.2, 0.0, 0.0]),
+        inliers=np.ones(len(points), np.bool_),
+        residuals=np.full(len(points), residual),
+        joint_covariance=np.eye(18),
+        global_shutter_inliers=0,
+        iterations=0,
+    )
+    pose = Pose(np.array([0.0, 0.0, -1.0]), np.eye(3), np.eye(6))
+    return Localized(0, 0, "map", "camera", pose, None, rows, 0, estimate)
+
+
+def test_the_ellipsoid_holds_95_percent() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    covariance = root @ root.T
+    shape = ellipsoid(covariance)
+    axes = Rotation.from_quat(shape.quaternion).as_matrix()
+    samples = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
+    inside = np.sum((samples @ axes / shape.half_sizes) ** 2, axis=1) <= 1.0
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
+    assert np.prod(shape.half_sizes) == pytest.approx(
+        np.sqrt(np.linalg.det(covariance)) * chi2.ppf(0.95, 3) ** 1.5, rel=1e-4
+    )
+
+
+def test_a_flat_covariance_is_a_flat_ellipsoid() -> None:
+    shape = ellipsoid(np.diag([4.0, 0.0, 1.0]) - 1e-18 * np.eye(3))
+    assert shape.half_sizes[0] == 0.0
+    assert np.linalg.norm(shape.quaternion) == pytest.approx(1.0)
+
+
+def test_reprojections_are_of_the_row_that_sees_the_point() -> None:
+    """At a depth of 2 m, where a metre is 250 px; at tau the camera has gone 0.2 tau to the right,
+    so that the point appears as much to the left."""
+    points = np.array([[0.0, y, 1.0] for y in (-0.8, 0.0, 0.8)])
+    found = reproject(localized(points, np.full((3, 2), 100.0)), CAMERA)
+    rows = 239.5 + 250.0 * points[:, 1]
+    columns = 319.5 - 250.0 * 0.2 * (rows - 239.5) / 479.0
+    np.testing.assert_allclose(found.predicted, np.stack([columns, rows], axis=1), atol=1e-6)
+    assert found.pixels.tolist() == [[100.0, 100.0]] * 3
+    # From blue, above, to yellow, below.
+    assert found.colours[0, 2] > found.colours[1, 2] > found.colours[2, 2]
+    assert found.colours[0, 0] < found.colours[1, 0] < found.colours[2, 0]
+
+
+def test_points_behind_the_camera_are_left_out() -> None:
+    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -3.0]])
+    assert len(reproject(localized(points, np.zeros((2, 2))), CAMERA).predicted) == 1
+
+
+def test_the_way_within_the_readout_is_that_of_the_camera() -> None:
+    way = readout_path(localized(np.zeros((0, 3)), np.zeros((0, 2))))
+    np.testing.assert_allclose(way[4], [0.0, 0.0, -1.0], atol=1e-12)
+    assert np.linalg.norm(way[-1] - way[0]) == pytest.approx(0.2)
+
+
+def test_others_are_what_is_no_inlier() -> None:
+    pixels = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    frame = localized(np.ones((2, 3)), pixels[[0, 2]])
+    assert others(pixels, frame).tolist() == [[3.0, 4.0]]
+    assert others(pixels, None).tolist() == pixels.tolist()
+
+
+def test_colours_stay_within_their_ends() -> None:
+    found = row_colours(np.array([-9.0, -0.5, 0.5, 9.0])).tolist()
+    assert found[0] == found[1] == [0, 114, 255]
+    assert found[2] == found[3] == [255, 220, 0]
+
+
+@pytest.mark.parametrize(("residual", "factor"), [(0.1, 100), (1.0, 10), (40.0, 1), (1e-9, 500)])
+def test_residuals_are_drawn_so_that_one_sees_them(residual: float, factor: int) -> None:
+    points = np.ones((4, 3))
+    assert enlargement([localized(points, np.ones((4, 2)), residual)]) == factor
+
+
+def test_the_eye_sees_camera_and_points() -> None:
+    points = np.array([[0.1, 0.0, 1.0], [-0.1, 0.0, 1.0], [0.0, 0.1, 1.0]])
+    look = eye([localized(points, np.zeros((3, 2)))])
+    ahead = look.target - look.position
+    assert ahead @ np.array([0.0, 0.0, 1.0]) > 0.0
+    assert look.depth == pytest.approx(2.0, abs=0.1)
+    np.testing.assert_allclose(look.up, [0.0, -1.0, 0.0])

@@ -1,0 +1,144 @@
+"""The recipes for other package systems name what setup.py and package.xml name."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from configparser import ConfigParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+import setuptools
+import yaml
+from catkin_pkg.package import parse_package
+
+ROOT = Path(__file__).parents[1]
+DOCKERFILE = ROOT / "packaging" / "docker" / "Dockerfile"
+# conda's names, where they differ from pip's.
+CONDA = {
+    "matplotlib": "matplotlib-base",
+    "opencv-python-headless": "py-opencv",
+    "Pillow": "pillow",
+    "PyYAML": "pyyaml",
+}
+
+
+@pytest.fixture
+def declared(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What setup.py says."""
+    said: dict[str, Any] = {}
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(setuptools, "setup", lambda **options: said.update(options))
+    exec(compile((ROOT / "setup.py").read_text(), "setup.py", "exec"), {"__name__": "__main__"})
+    return said
+
+
+@pytest.fixture
+def recipe() -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((ROOT / "packaging/conda/recipe.yaml").read_text())
+    return found
+
+
+def test_conda_brings_what_pip_brings(declared: dict[str, Any], recipe: dict[str, Any]) -> None:
+    wanted = {}
+    for line in declared["install_requires"]:
+        name, bound = re.fullmatch(r"([\w-]+)(.*)", line).groups()
+        # With machine code in the tree setup.py pins Numba, which conda compiles itself.
+        wanted[CONDA.get(name, name)] = "" if name == "numba" else bound
+    found = dict((*line.split(), "")[:2] for line in recipe["requirements"]["run"])
+    assert found.pop("python") == declared["python_requires"]
+    assert found == wanted
+
+
+def test_conda_has_the_same_commands_and_version(
+    declared: dict[str, Any], recipe: dict[str, Any]
+) -> None:
+    points = recipe["build"]["python"]["entry_points"]
+    assert sorted(points) == sorted(declared["entry_points"]["console_scripts"])
+    assert recipe["context"]["version"] == declared["version"]
+    assert (ROOT / recipe["about"]["license_file"]).is_file()
+    assert recipe["about"]["license"].split(" AND ") == parse_package(ROOT / "package.xml").licenses
+
+
+def instructions() -> list[tuple[str, list[str]]]:
+    """Those of the Dockerfile, and their words."""
+    text = re.sub(r"^#.*\n", "", DOCKERFILE.read_text(), flags=re.MULTILINE)
+    lines = [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+    return [(line.split()[0], shlex.split(line)[1:]) for line in lines]
+
+
+def test_the_container_is_built_of_files_that_exist() -> None:
+    stages: set[str] = set()
+    copied: set[str] = set()
+    for word, rest in instructions():
+        if word == "FROM":
+            stages |= {rest[-1]} if "AS" in rest else set()
+        elif word == "COPY" and rest[0].startswith("--from="):
+            assert rest[0].removeprefix("--from=") in stages
+        elif word == "COPY":
+            for name in rest[:-1]:
+                assert (ROOT / name).exists(), name
+            copied |= set(rest[:-1])
+    # All that setup.py reads, and what the commands run.
+    assert {"setup.py", "setup.cfg", "pyproject.toml", "package.xml", "README.md"} <= copied
+    assert {"rs_localizer", "config", "launch", "resource"} <= copied
+    named = set(re.findall(r"packaging/\S+\.py", DOCKERFILE.read_text()))
+    assert named <= copied
+
+
+def test_the_container_runs_a_command_of_ours_and_not_as_root(declared: dict[str, Any]) -> None:
+    last = dict(instructions())  # of each kind the last one
+    commands = {line.split(" = ")[0] for line in declared["entry_points"]["console_scripts"]}
+    assert json.loads(" ".join(last["ENTRYPOINT"]).replace("[", '["').replace("]", '"]'))[0] in (
+        commands
+    )
+    assert last["USER"] != ["root"]
+    assert "ros" in declared["extras_require"]
+    python = re.search(r"python:3\.(\d+)", DOCKERFILE.read_text())
+    assert python is not None
+    assert int(python[1]) in (11, 12)
+
+
+def test_machine_code_makes_a_wheel_of_this_python_and_this_numba(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rs_localizer" / "compiled").mkdir(parents=True)
+    about = tmp_path / "rs_localizer" / "compiled" / "about.json"
+    monkeypatch.chdir(tmp_path)
+    said: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, "setup", lambda **options: said.update(options))
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    code = compile((ROOT / "setup.py").read_text(), "setup.py", "exec")
+    exec(code, {"__name__": "__main__"})
+    assert said["distclass"] is setuptools.Distribution
+    assert "numba" in said["install_requires"]
+    version = "{}.{}".format(*sys.version_info)
+    about.write_text(json.dumps({"python": version, "numba": "0.99.1", "cpus": ["x86-64-v3"]}))
+    exec(code, {"__name__": "__main__"})
+    assert said["distclass"]().has_ext_modules()
+    assert "numba==0.99.1" in said["install_requires"]
+    about.write_text(json.dumps({"python": "3.9", "numba": "0.99.1", "cpus": []}))
+    with pytest.raises(SystemExit, match=r"is for Python 3\.9: compile again"):
+        exec(code, {"__name__": "__main__"})
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")  # rosdep brings all there
+    exec(code, {"__name__": "__main__"})
+    assert said["install_requires"] == ["setuptools"]
+
+
+def test_rosdep_knows_every_key() -> None:
+    keys = yaml.safe_load((ROOT / "test" / "rosdep_keys.yaml").read_text())
+    package = parse_package(ROOT / "package.xml")
+    named = {item.name for kind in ("exec", "test", "build", "buildtool")
+             for item in getattr(package, f"{kind}_depends")}  # fmt: skip
+    assert named == keys["apt"].keys() | keys["jazzy"].keys()
+    assert all(name.startswith("python3-") for name in keys["apt"].values())  # and none by pip
+
+
+def test_colcon_puts_executables_where_ros2_run_looks() -> None:
+    settings = ConfigParser()
+    settings.read(ROOT / "setup.cfg")
+    assert settings["install"]["install_scripts"] == "$base/lib/rs_localizer"
