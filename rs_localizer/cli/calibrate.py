@@ -14,7 +14,7 @@ from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
 from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
-from rs_localizer.cli.given import given_settings
+from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.shots import file_shots
 from rs_localizer.cli.topics import add_topics, given_topics
@@ -79,15 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
     )
-    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: ROS 2 params file")
-    parser.add_argument(
-        "-p",
-        dest="assignments",
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="one setting; scan_direction gives the axis (its reverse is tried as well)",
-    )
+    add_settings(parser, "scan_direction gives the axis (its reverse is tried as well)")
     topics = parser.add_argument_group("topics of a bag (default: found by name and type)")
     add_topics(topics, but=(IMU,))
     topics.add_argument("--image", metavar="TOPIC")

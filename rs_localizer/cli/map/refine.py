@@ -10,8 +10,8 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
+from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.topics import add_topics, given_topics
-from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import open_bag
@@ -25,7 +25,6 @@ from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.offline.recordings import Recorded, read_recording
 from rs_localizer.offline.replay import find_topics
 from rs_localizer.process.arguments import number
-from rs_localizer.settings import build, load_params_file, parse_assignment
 
 _GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
 _HOLD = 0.001
@@ -66,22 +65,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="how well these are known (default: %(default)s)",
     )
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="instead of camera_info")
-    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: ROS 2 params file")
-    parser.add_argument(
-        "-p",
-        dest="assignments",
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="one setting: readout_time, scan_direction, stamp_offset, matching.*; map_deviation: "
-        "how well all landmarks are known",
+    add_settings(
+        parser,
+        "readout_time, scan_direction, stamp_offset, matching.*; map_deviation: how well all "
+        "landmarks are known",
     )
     topics = parser.add_argument_group("topics of the bag (default: found by name and type)")
     add_topics(topics, but=(IMU,))
 
 
 def run(args: argparse.Namespace) -> None:
-    config = _config(args)
+    if args.out.suffix not in WRITERS:
+        raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
+    config = given_settings(args)
     if args.out.exists() and not args.overwrite:
         raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
@@ -108,16 +104,6 @@ def run(args: argparse.Namespace) -> None:
 
 def _told(step: str) -> None:
     print(f"adjusted: {step}", flush=True)
-
-
-def _config(args: argparse.Namespace) -> NodeConfig:
-    if args.out.suffix not in WRITERS:
-        raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
-    try:
-        values = {} if args.params is None else load_params_file(args.params)
-        return build(values | dict(map(parse_assignment, args.assignments)))
-    except ValueError as error:
-        raise UsageError(str(error)) from error
 
 
 def _localized(camera: Camera, recorded: Recorded, landmarks: Map | None) -> RecordedMap:

@@ -10,6 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
+from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.shots import shots_of
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
@@ -25,7 +26,6 @@ from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Marker
 from rs_localizer.offline.image_sources import Carried
 from rs_localizer.process.arguments import number
-from rs_localizer.settings import build, load_params_file, parse_assignment
 
 _LISTED = 12
 
@@ -69,18 +69,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate", type=number(0.0, above=True), metavar="HZ",
         help="images per second of a video or of files",
     )  # fmt: skip
-    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: ROS 2 params file")
-    parser.add_argument(
-        "-p", dest="assignments", action="append", default=[], metavar="NAME:=VALUE",
-        help="one setting: readout_time (0: it is found), scan_direction, stamp_offset",
-    )  # fmt: skip
+    add_settings(parser, "readout_time (0: it is found), scan_direction, stamp_offset")
     topics = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
     topics.add_argument("--image", metavar="TOPIC")
     topics.add_argument("--camera-info", metavar="TOPIC")
 
 
 def run(args: argparse.Namespace) -> None:
-    config, markers = _config(args), _markers(args)
+    if args.out.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"--out must end in .yaml, got {args.out}")
+    config, markers = given_settings(args), _markers(args)
     origin = _origin(args, markers)
     if args.out.exists() and not args.overwrite:
         raise ValueError(f"{args.out} exists; choose another --out, or --overwrite")
@@ -99,16 +97,6 @@ def run(args: argparse.Namespace) -> None:
     print(f"written: {args.out}")
     for text in problems(marker_map):
         print(f"warning: {text}")
-
-
-def _config(args: argparse.Namespace) -> NodeConfig:
-    if args.out.suffix not in (".yaml", ".yml"):
-        raise UsageError(f"--out must end in .yaml, got {args.out}")
-    try:
-        values = {} if args.params is None else load_params_file(args.params)
-        return build(values | dict(map(parse_assignment, args.assignments)))
-    except ValueError as error:
-        raise UsageError(str(error)) from error
 
 
 def _markers(args: argparse.Namespace) -> tuple[Marker, ...]:

@@ -120,18 +120,21 @@ class Film:
         """Pixels (p,2) of points in each image; NaN for those that it does not show."""
         size = np.array([self.camera.width, self.camera.height]) - 1.0
         for stamp in self.stamps.tolist():
-
-            def local_at(delay: Array, stamp: float = stamp) -> Array:
-                rotations, places = self.walk.poses(stamp + delay)
-                return np.asarray(np.einsum("nji,nj->ni", rotations, points - places))
-
-            pixels = self.camera.project_rolling(local_at, (len(points),))
+            rotation, place = self.walk.poses(np.array([stamp]))
+            local = (points - place) @ rotation[0]
             # What lies far outside is folded back by the lens's polynomial.
-            local = local_at(np.zeros(len(points)))
-            ahead = np.abs(local[:, :2]).max(axis=1) < local[:, 2]
+            ahead = np.flatnonzero(np.abs(local[:, :2]).max(axis=1) < local[:, 2])
+
+            def local_at(delay: Array, stamp: float = stamp, those: Array = points[ahead]) -> Array:
+                rotations, places = self.walk.poses(stamp + delay)
+                return np.asarray(np.einsum("nji,nj->ni", rotations, those - places))
+
+            pixels = self.camera.project_rolling(local_at, (len(ahead),))
             with np.errstate(invalid="ignore"):
                 inside = np.all((pixels > 1.0) & (pixels < size - 1.0), axis=1)
-            yield np.where((inside & ahead)[:, None], pixels, np.nan)
+            shown = np.full((len(points), 2), np.nan)
+            shown[ahead[inside]] = pixels[inside]
+            yield shown
 
 
 def ring(rng: np.random.Generator, count: int) -> list[tuple[Array, Array]]:
