@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,19 +14,18 @@ from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
 from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
-from rs_localizer.cli.given import given_settings
+from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
+from rs_localizer.cli.shots import file_shots
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration.files import read_calibration, write_calibration
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
-from rs_localizer.io.video import has_times
 from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.offline.image_sources import (
     IMAGE_TYPES,
@@ -37,10 +35,6 @@ from rs_localizer.offline.image_sources import (
     SourceError,
     find_topic,
     from_bag,
-    from_files,
-    from_video,
-    have_times,
-    image_files,
 )
 from rs_localizer.offline.imu_recording import read_imu_recording
 from rs_localizer.offline.recordings import read_recording
@@ -85,15 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
     )
-    parser.add_argument("--params", type=Path, metavar="FILE", help="settings: ROS 2 params file")
-    parser.add_argument(
-        "-p",
-        dest="assignments",
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="one setting; scan_direction gives the axis (its reverse is tried as well)",
-    )
+    add_settings(parser, "scan_direction gives the axis (its reverse is tried as well)")
     topics = parser.add_argument_group("topics of a bag (default: found by name and type)")
     add_topics(topics, but=(IMU,))
     topics.add_argument("--image", metavar="TOPIC")
@@ -170,7 +156,9 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
     if not is_bag(path):
         if args.imu is not None:
             raise UsageError("--imu is for bags: a video or files have no IMU")
-        with _files(args) as shots:
+        known = args.calibration is not None
+        camera = read_calibration(args.calibration) if known else _unknown((2, 2))
+        with file_shots(path, args.rate, camera) as shots:
             return _detected(args, shots)
     with open_bag(path) as bag:
         imu = None
@@ -213,33 +201,6 @@ def _unknown(size: tuple[int, int]) -> Camera:
     width, height = size
     K = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
     return Camera(width=width, height=height, K=K)
-
-
-@contextmanager
-def _files(args: argparse.Namespace) -> Iterator[Iterator[Shot | Carried]]:
-    """The images of a video or folder."""
-    path: Path = args.recording
-    known = args.calibration is not None
-    camera = read_calibration(args.calibration) if known else _unknown((2, 2))
-    clock = ImageClock(args.rate)
-    if not path.is_dir():
-        if args.rate is None and not has_times(path):
-            raise UsageError("this video has no presentation times: give --rate; the readout time "
-                             "scales with it")  # fmt: skip
-        yield from_video(path, camera, clock)
-        _tell_clock(clock)
-        return
-    files = image_files(path)
-    if args.rate is None and not have_times(files):
-        raise UsageError("the names of the files are not times in ns: give --rate")
-    yield from_files(files, camera, clock)
-    _tell_clock(clock)
-
-
-def _tell_clock(clock: ImageClock) -> None:
-    print(clock.told())
-    if fault := clock.fault():
-        print(f"warning: {fault}")
 
 
 def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Source:

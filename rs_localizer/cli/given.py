@@ -13,8 +13,10 @@ from rs_localizer.settings import build, load_params_file, parse_assignment
 _ROWS = {"first": -0.5, "middle": 0.0, "last": 0.5}
 
 
-def add_settings(parser: argparse._ActionsContainer) -> None:
-    """``--params`` and ``-p``, for :func:`given_settings`."""
+def add_settings(
+    parser: argparse._ActionsContainer, which: str = "as after --ros-args; may be repeated"
+) -> None:
+    """``--params`` and ``-p``, for :func:`given_settings`; ``which`` says what matters."""
     parser.add_argument("--params", type=Path, metavar="FILE", help="settings: a ROS 2 params file")
     parser.add_argument(
         "-p",
@@ -22,7 +24,7 @@ def add_settings(parser: argparse._ActionsContainer) -> None:
         action="append",
         default=[],
         metavar="NAME:=VALUE",
-        help="one setting, as after --ros-args; may be repeated",
+        help=f"one setting: {which}",
     )
 
 

@@ -7,6 +7,8 @@
         size: 0.16                 # side of the black square
         position: [0.0, 0.0, 1.5]  # of its middle
         quaternion: [0.5, 0.5, 0.5, 0.5]  # x y z w; or rotation: three rows of a matrix
+        position_deviation: [0.001, 0.001, 0.002]  # optional, of a survey: m, and rad
+        rotation_deviation: [0.001, 0.001, 0.001]
       - family: apriltag_36h11
         id: 0
         corners: [[0, 1, 2], [0, 1.2, 2], [0, 1.2, 1.8], [0, 1, 1.8]]
@@ -43,8 +45,7 @@ the top left one clockwise, as seen from the front.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +55,10 @@ import yaml
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.yaml_text import YamlError, load_yaml
+from rs_localizer.markers.entries import Entry, EntryError
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
-from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.poses import Pose, finite
 from rs_localizer.markers.poses import rotation_of_quaternion as _rotation
 from rs_localizer.markers.prints import Board, Charuco, Chessboard, CircleGrid, Marker
 
@@ -96,7 +98,7 @@ def read_marker_map(path: Path | str) -> MarkerMap:
 
 
 def _map(tree: Any) -> MarkerMap:
-    entry = _Entry(tree, "the map")
+    entry = Entry(tree, "the map")
     markers = [_marker(item) for item in entry.entries("markers", "marker")]
     boards = [_board(item) for item in entry.entries("boards", "board")]
     frame = entry.take("map_frame", str)
@@ -104,78 +106,41 @@ def _map(tree: Any) -> MarkerMap:
     return MarkerMap(tuple(markers), tuple(boards), frame)
 
 
-class _EntryError(ValueError):
-    """Says already which entry it is about."""
-
-
-class _Entry:
-    """A mapping of the file whose keys are taken one after the other; the rest is unknown."""
-
-    def __init__(self, tree: Any, where: str) -> None:
-        self.where = where
-        if not isinstance(tree, dict):
-            raise _EntryError(f"{where} must be a mapping, found {tree!r}")
-        self._left = dict(tree)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._left
-
-    def take(self, name: str, kind: type | tuple[type, ...], *default: Any) -> Any:
-        if name not in self._left and default:
-            return default[0]
-        if name not in self._left:
-            found = ", ".join(map(str, self._left)) or "nothing else"
-            raise _EntryError(f"{self.where} has no {name}; it has {found}")
-        value = self._left.pop(name)
-        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise _EntryError(f"{self.where}: {name} cannot be {value!r}")
-        return value
-
-    def number(self, name: str) -> float:
-        return float(self.take(name, (int, float)))
-
-    def entries(self, name: str, one: str) -> list[_Entry]:
-        listed = self.take(name, (list, type(None)), None) or []
-        return [_Entry(item, f"{one} {index + 1}") for index, item in enumerate(listed)]
-
-    def finish(self) -> None:
-        if self._left:
-            raise _EntryError(f"{self.where} has the unknown {', '.join(map(str, self._left))}")
-
-    @contextlib.contextmanager
-    def named(self) -> Iterator[None]:
-        """Faults within are about this entry."""
-        try:
-            yield
-        except _EntryError:
-            raise
-        except ValueError as error:
-            raise _EntryError(f"{self.where}: {error}") from error
-
-
-def _marker(entry: _Entry) -> Marker:
+def _marker(entry: Entry) -> Marker:
     name, number = entry.take("family", str), entry.take("id", int)
     entry.where += f" ({name} {number})"
+    deviations = _deviations(entry)
     if "corners" not in entry:
         size, pose = entry.number("size"), _pose(entry)
         entry.finish()
         with entry.named():
-            return Marker.at(name, number, size, pose)
+            return replace(Marker.at(name, number, size, pose), deviations=deviations)
     corners = entry.take("corners", list)
     told = entry.number("size") if "size" in entry else None
     entry.finish()
     with entry.named():
-        marker = Marker(family(name), number, corners)
+        marker = Marker(family(name), number, corners, deviations)
         if told is not None and abs(marker.size - told) > _SIZE_TOLERANCE * abs(told):
             raise ValueError(f"its corners are {marker.size:.4g} m apart, but size is {told:g}")
         return marker
 
 
-def _board(entry: _Entry) -> Board:
+def _deviations(entry: Entry) -> Array | None:
+    """Of a surveyed marker: place (m) and turn (rad)."""
+    if "position_deviation" not in entry and "rotation_deviation" not in entry:
+        return None
+    with entry.named():
+        return np.concatenate([
+            finite(entry.take(name, list), (3,), name)
+            for name in ("position_deviation", "rotation_deviation")
+        ])  # fmt: skip
+
+
+def _board(entry: Entry) -> Board:
     kind = entry.take("type", str)
     entry.where += f" ({kind})"
     if kind not in _BOARDS:
-        raise _EntryError(f"{entry.where}: type must be one of {', '.join(_BOARDS)}")
+        raise EntryError(f"{entry.where}: type must be one of {', '.join(_BOARDS)}")
     columns, rows = entry.take("columns", int), entry.take("rows", int)
     spacing = entry.number("spacing") if "circles" in kind else 0.0
     square = 0.0 if "circles" in kind else entry.number("square")
@@ -194,7 +159,7 @@ def _board(entry: _Entry) -> Board:
         return Charuco(columns, rows, square, marker, family(name), first_id, legacy, pose)
 
 
-def _pose(entry: _Entry) -> Pose:
+def _pose(entry: Entry) -> Pose:
     position = entry.take("position", list)
     with entry.named():
         if "rotation" not in entry:
@@ -214,6 +179,8 @@ _EXPLANATION = """\
 #     [0, 0, 0, 1]: the same axes as the map. [0.7071, 0, 0, 0.7071]: upright in a map whose z is up
 #     and whose y points into the wall.
 #   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
+#   position_deviation, rotation_deviation: standard deviations of a survey along the axes of
+#     map_frame, m and rad
 # Measure what was put up, write it here, and check it: rs_localizer markers check FILE;
 # rs_localizer detect names a marker that is not where this file has it.
 """
@@ -232,10 +199,14 @@ def write_marker_map(path: Path | str, marker_map: MarkerMap) -> None:
 
 def _marker_entry(marker: Marker) -> dict[str, Any]:
     entry: dict[str, Any] = {"family": marker.family.name, "id": marker.id}
+    known: dict[str, Any] = {}
+    if marker.deviations is not None:
+        known["position_deviation"] = _significant(marker.deviations[:3])
+        known["rotation_deviation"] = _significant(marker.deviations[3:])
     square = Marker.at(marker.family.name, marker.id, marker.size, marker.pose)
     if np.abs(square.corners - marker.corners).max() > _SAME * marker.size:
-        return entry | {"corners": _numbers(marker.corners)}
-    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose)
+        return entry | {"corners": _numbers(marker.corners)} | known
+    return entry | {"size": _rounded(marker.size)} | _pose_entry(marker.pose) | known
 
 
 def _board_entry(board: Board) -> dict[str, Any]:
@@ -271,6 +242,11 @@ def _numbers(values: Array) -> Any:
     if values.ndim > 1:
         return [_numbers(row) for row in values]
     return [_rounded(value) for value in values]
+
+
+def _significant(values: Array) -> list[float]:
+    """Three digits: more are not known of a deviation."""
+    return [float(f"{value:.3g}") for value in values]
 
 
 def _rounded(value: float) -> float:

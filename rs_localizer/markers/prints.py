@@ -36,6 +36,9 @@ class Marker:
     family: Family
     id: int
     corners: Array  # (4,3) m, map frame
+    # (6,) standard deviations of place (m) and turn (rad) along the map's axes, where it was
+    # surveyed.
+    deviations: Array | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.id < self.family.count:
@@ -44,6 +47,10 @@ class Marker:
             )
         object.__setattr__(self, "corners", finite(self.corners, (4, 3), "corners"))
         _square_pose(self.corners)
+        if self.deviations is not None:
+            object.__setattr__(self, "deviations", finite(self.deviations, (6,), "deviations"))
+            if np.any(self.deviations < 0.0):
+                raise ValueError(f"deviations must not be negative: {self.deviations.tolist()}")
 
     @classmethod
     def at(cls, family_name: str, id_: int, size: float, pose: Pose | None = None) -> Self:

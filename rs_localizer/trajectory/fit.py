@@ -13,13 +13,12 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored
+from rs_localizer.trajectory.descent import minimise, settle
 from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline_kernels import CONTROL
 
-# The rounds end when the noise settles to this part of it.
-_ROUNDS, _SETTLED = 8, 0.01
 _FEW_STEPS = 6
 
 
@@ -77,8 +76,8 @@ def fit(
     problem, state = Problem(camera, observations, start, freedom), start
     if deviation is None:
         trusted = Problem(camera, observations.subset(observations.trusted), start, freedom)
-        state, deviation = _settle(trusted, start, trusted.noise(start, np.inf))
-    state, deviation = _settle(problem, state, deviation)
+        state, deviation = settle(trusted, start, trusted.noise(start, np.inf))
+    state, deviation = settle(problem, state, deviation)
     return _finish(problem, state, deviation)
 
 
@@ -89,7 +88,8 @@ def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time
     held = replace(found.freedom, readout_time=False)
     start = replace(found.state, readout_time=readout_time)
     problem = Problem(camera, observations, start, held)
-    return problem.normal(problem.minimise(start, found.deviation, _FEW_STEPS), found.deviation)[0]
+    least = minimise(problem, start, found.deviation, _FEW_STEPS)
+    return problem.normal(least, found.deviation)[0]
 
 
 def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:
@@ -103,16 +103,6 @@ def image_speeds(camera: Camera, observations: Observations, state: State) -> Ar
     return np.concatenate(speeds)
 
 
-def _settle(problem: Problem, state: State, deviation: float) -> tuple[State, float]:
-    """State and noise when neither changes any more."""
-    for _ in range(_ROUNDS):
-        state = problem.minimise(state, deviation)
-        before, deviation = deviation, problem.noise(state, deviation)
-        if abs(deviation - before) < _SETTLED * deviation:
-            break
-    return state, deviation
-
-
 def _finish(problem: Problem, state: State, deviation: float) -> Fit:
     """The estimate with its covariances."""
     squared = problem.errors(state)
@@ -121,7 +111,7 @@ def _finish(problem: Problem, state: State, deviation: float) -> Fit:
     inliers = squared < (LIMIT * deviation) ** 2
     frames = len(np.unique(problem.observations.frames[inliers]))
     used = problem.border + CONTROL * min(frames, len(state.spline.positions))
-    inflation = _inflation(squared[inliers], deviation, used)
+    inflation = inflation_of(squared[inliers], deviation, used)
     return Fit(
         state=state,
         camera=with_lens(replace(problem.camera, readout_time=abs(state.readout_time)), state.lens),
@@ -136,7 +126,7 @@ def _finish(problem: Problem, state: State, deviation: float) -> Fit:
     )
 
 
-def _inflation(squared: Array, deviation: float, used: int) -> float:
+def inflation_of(squared: Array, deviation: float, used: int) -> float:
     """How the covariance of the M-estimator differs from the inverse of its normal matrix.
 
     Huber's formula, ``E psi^2 / (E psi')^2``, where the matrix has the mean weight instead; and
@@ -146,5 +136,11 @@ def _inflation(squared: Array, deviation: float, used: int) -> float:
     weight = (1.0 - share) ** 2
     psi_squared = np.mean(weight**2 * squared) / (2.0 * deviation**2)
     slope = np.mean(weight - 2.0 * share * (1.0 - share))
-    freedoms = 2.0 * len(squared) / max(2.0 * len(squared) - used, 1.0)
-    return float(psi_squared * np.mean(weight) / slope**2 * freedoms)
+    return float(psi_squared * np.mean(weight) / slope**2 * left_over(len(squared), used))
+
+
+def left_over(keypoints: int, used: int) -> float:
+    """By how much the noise's variance is larger than the mean square of what is left of it, when
+    so many numbers were estimated.
+    """
+    return 2.0 * keypoints / max(2.0 * keypoints - used, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,8 @@ class Observations:
     frames: IntArray  # (n,) number of the image, rising
     trusted: BoolArray  # (n,) inliers of their frame alone
     gyro: GyroSamples | None = None
+    # (p,) number of the free rigid body that each landmark is part of, from 0 on; -1: known.
+    bodies: IntArray | None = None
 
     def subset(self, chosen: BoolArray) -> Observations:
         """The chosen keypoints (n,), with all landmarks."""
@@ -44,6 +47,10 @@ class Freedom:
     stamps: float = 0.0  # s, standard deviation of each image's stamp; 0: they are right
     angular_acceleration: float = 100.0  # rad/s^2, zero-mean prior at each control
     linear_acceleration: float = 50.0  # m/s^2
+    # Likewise of the velocity of images that stand alone, in stretches of one interval; infinite:
+    # nothing is known of it.
+    angular_velocity: float = math.inf  # rad/s
+    linear_velocity: float = math.inf  # m/s
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,10 +1,4 @@
-"""Reprojection errors along a spline and their normal equations, compiled.
-
-A keypoint is compared with the projection of its landmark at the time of its own row. Noise moves
-the keypoint to another row, too, so that the error has the covariance ``s^2 A A^T`` with
-``A = I - flow g^T``: ``flow`` is the pixel's motion in one readout, ``g`` the row time's gradient.
-Errors and derivatives are multiplied by the inverse of ``A`` and weighted by Tukey's biweight.
-"""
+"""The normal equations of keypoints along a spline, compiled."""
 
 from __future__ import annotations
 
@@ -14,43 +8,15 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.trajectory.spline_kernels import (
-    CONTROL,
-    LOCAL,
-    ORDER,
-    cumulative,
-    pose,
-    pull_back,
-    rates,
+from rs_localizer.trajectory.sight_kernels import (
+    Curve,
+    Row,
+    Sights,
+    Terms,
+    differentiate,
+    make_row,
 )
-
-# Where the rows overtake the image points to within this share, a keypoint's row says nothing.
-_LEAST_PACE = 0.1
-
-
-class Curve(NamedTuple):
-    """A spline and what is computed of it once per step."""
-
-    rotations: Array  # (n,3,3)
-    positions: Array  # (n,3)
-    vectors: Array  # (n,3) from control to control
-    inverses: Array  # (n,3,3)
-    spacing: float
-
-
-class Sights(NamedTuple):
-    """Keypoints, where on the spline they are seen, and what the lens makes of them."""
-
-    first: IntArray  # (n,) first of the four controls
-    u: Array  # (n,)
-    tau: Array  # (n,) row time
-    local: Array  # (n,3) landmark in camera axes
-    velocity: Array  # (n,3) its velocity, m/s
-    errors: Array  # (n,2) predicted less measured pixel
-    by_ray: Array  # (n,2,2)
-    by_lens: Array  # (n,2,m)
-    slots: IntArray  # (n,) place of the landmark among the free ones; -1: known
-    frames: IntArray  # (n,) number of the image
+from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
 
 class Normal(NamedTuple):
@@ -72,148 +38,50 @@ class Normal(NamedTuple):
     image_slope: Array  # (g,)
 
 
-class Terms(NamedTuple):
-    """What is free beside the controls, and the noise."""
-
-    readout_time: float
-    gradient: Array  # (2,) of the row time by the pixel
-    readout_column: int  # of the border; -1: fixed
-    lens_column: int  # first of the lens' columns; -1: fixed
-    point_column: int  # first of the landmarks' columns; -1: all known
-    stamps_free: bool  # each image has a time of its own
-    variance: float  # px^2, of the noise of u and of v
-    limit: float  # px^2, where Tukey's weight ends
-
-
 @kernel
-def look(
-    curve: Curve, first: IntArray, u: Array, points: Array, local: Array, velocity: Array
-) -> None:
-    """Points (n,3) in camera axes at their own times, and their velocities there."""
-    work, rotation, position = np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3)
-    rate, away = np.empty((4, 3)), np.empty(3)
-    for n in range(len(first)):
-        pose(curve.rotations, curve.positions, curve.vectors, first[n], u[n], work, rotation,
-             position)  # fmt: skip
-        rates(curve.positions, curve.vectors, first[n], u[n], curve.spacing, work, rotation, rate)
-        for i in range(3):
-            away[i] = points[n, i] - position[i]
-        for i in range(3):
-            local[n, i] = (
-                rotation[0, i] * away[0] + rotation[1, i] * away[1] + rotation[2, i] * away[2]
-            )
-        for i in range(3):
-            a, b = (i + 1) % 3, (i + 2) % 3
-            velocity[n, i] = (
-                rate[0, b] * local[n, a]
-                - rate[0, a] * local[n, b]
-                - rotation[0, i] * rate[1, 0]
-                - rotation[1, i] * rate[1, 1]
-                - rotation[2, i] * rate[1, 2]
-            )
-
-
-@kernel
-def _whitened(sights: Sights, terms: Terms, n: int, by_point: Array, flow: Array) -> bool:
-    """Fill the whitened derivative (2,3) of the pixel by the camera point, the inverse of A
-    (rows 2 and 3 of ``flow``) and the unwhitened flow per second (row 0); false if useless.
+def _border_of(sights: Sights, terms: Terms, n: int, row: Row, columns: IntArray,
+               border: Array) -> int:  # fmt: skip
+    """Fill the columns of the border that keypoint n touches, rising, and its derivatives
+    (2,...) by them; returns their number.
     """
-    x, y, z = sights.local[n, 0], sights.local[n, 1], 1.0 / sights.local[n, 2]
-    for i in range(2):
-        a, b = sights.by_ray[n, i, 0] * z, sights.by_ray[n, i, 1] * z
-        by_point[i, 0], by_point[i, 1], by_point[i, 2] = a, b, -(a * x + b * y) * z
-        total = 0.0
-        for j in range(3):
-            total += by_point[i, j] * sights.velocity[n, j]
-        flow[0, i] = total
-    pace = 1.0 - terms.readout_time * (
-        terms.gradient[0] * flow[0, 0] + terms.gradient[1] * flow[0, 1]
-    )
-    if not (sights.local[n, 2] > 0.0 and abs(pace) > _LEAST_PACE):
-        return False
-    for i in range(2):
-        for j in range(2):
-            flow[2 + i, j] = terms.readout_time * flow[0, i] * terms.gradient[j] / pace
-        flow[2 + i, i] += 1.0
-    for j in range(3):
-        a, b = by_point[0, j], by_point[1, j]
-        by_point[0, j] = flow[2, 0] * a + flow[2, 1] * b
-        by_point[1, j] = flow[3, 0] * a + flow[3, 1] * b
-    return True
-
-
-@kernel
-def squared_errors(sights: Sights, terms: Terms, out: Array) -> None:
-    """Squared whitened errors (n,), px^2; infinite for keypoints that say nothing."""
-    by_point, flow = np.empty((2, 3)), np.empty((4, 2))
-    for n in range(len(sights.first)):
-        if _whitened(sights, terms, n, by_point, flow):
-            e = sights.errors[n]
-            a = flow[2, 0] * e[0] + flow[2, 1] * e[1]
-            b = flow[3, 0] * e[0] + flow[3, 1] * e[1]
-            out[n] = a * a + b * b
-        else:
-            out[n] = np.inf
+    count = len(row.by_shared[0])
+    for k in range(count):
+        columns[k] = k
+        border[0, k], border[1, k] = row.by_shared[0, k], row.by_shared[1, k]
+    slot = sights.slots[n] if terms.point_column >= 0 else -1
+    if slot < 0:
+        return count
+    base, arm = terms.point_column + terms.point_width * slot, sights.arms[n]
+    for i in range(3):
+        columns[count + i] = base + i
+        for r in range(2):
+            border[r, count + i] = row.by_landmark[r, i]
+    if terms.point_width == 3:
+        return count + 3
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        columns[count + 3 + i] = base + 3 + i
+        for r in range(2):
+            g = row.by_landmark[r]
+            border[r, count + 3 + i] = arm[a] * g[b] - arm[b] * g[a]
+    return count + 6
 
 
 @kernel
 def accumulate(curve: Curve, sights: Sights, terms: Terms, normal: Normal) -> float:
     """Add the keypoints' part to the normal equations; returns its cost."""
-    work, rotation, position = np.empty((8, 3, 3)), np.empty((3, 3)), np.empty(3)
-    by_point, flow, turn, error = np.empty((2, 3)), np.empty((4, 2)), np.empty(3), np.empty(2)
-    rows, basis, late = np.zeros((2, LOCAL)), np.empty(3), np.empty(2)
-    lenses = sights.by_lens.shape[2] if terms.lens_column >= 0 else 0
-    columns, border = np.empty(4 + lenses, np.int64), np.empty((2, 4 + lenses))
+    row = make_row(sights, terms)
+    rows, error, late = row.by_controls, row.error, row.by_time
+    most = row.by_shared.shape[1] + 6
+    columns, border = np.empty(most, np.int64), np.empty((2, most))
     cost = 0.0
     for n in range(len(sights.first)):
-        if not _whitened(sights, terms, n, by_point, flow):
-            cost += terms.limit / (3.0 * terms.variance)
+        weight, spent = differentiate(curve, sights, terms, n, row)
+        cost += spent
+        if weight == 0.0:
             continue
-        for i in range(2):
-            error[i] = flow[2 + i, 0] * sights.errors[n, 0] + flow[2 + i, 1] * sights.errors[n, 1]
-        rest = 1.0 - (error[0] * error[0] + error[1] * error[1]) / terms.limit
-        if not rest > 0.0:
-            cost += terms.limit / (3.0 * terms.variance)
-            continue
-        cost += (1.0 - rest * rest * rest) * terms.limit / (3.0 * terms.variance)
-        weight = rest * rest / terms.variance
-        first = sights.first[n]
-        pose(curve.rotations, curve.positions, curve.vectors, first, sights.u[n], work, rotation,
-             position)  # fmt: skip
-        cumulative(sights.u[n], 0, basis)
-        count, image = 0, sights.frames[n]
-        for r in range(2):
-            late[r] = flow[2 + r, 0] * flow[0, 0] + flow[2 + r, 1] * flow[0, 1]
-            g, p = by_point[r], sights.local[n]
-            turn[0] = g[1] * p[2] - g[2] * p[1]
-            turn[1] = g[2] * p[0] - g[0] * p[2]
-            turn[2] = g[0] * p[1] - g[1] * p[0]
-            pull_back(turn, curve.inverses, first, work, rows[r])
-            count = 0
-            if terms.readout_column >= 0:
-                columns[0] = terms.readout_column
-                border[r, 0] = sights.tau[n] * late[r]
-                count = 1
-            for k in range(lenses):
-                columns[count] = terms.lens_column + k
-                border[r, count] = (
-                    flow[2 + r, 0] * sights.by_lens[n, 0, k]
-                    + flow[2 + r, 1] * sights.by_lens[n, 1, k]
-                )
-                count += 1
-            slot = sights.slots[n] if terms.point_column >= 0 else -1
-            for i in range(3):
-                moved = rotation[i, 0] * g[0] + rotation[i, 1] * g[1] + rotation[i, 2] * g[2]
-                if slot >= 0:
-                    columns[count] = terms.point_column + 3 * slot + i
-                    border[r, count] = moved
-                    count += 1
-                for k in range(ORDER):
-                    share = 1.0 if k == 0 else basis[k - 1]
-                    if k < 3:
-                        share -= basis[k]
-                    rows[r, CONTROL * k + 3 + i] = -share * moved
-        base = CONTROL * first
+        count, image = _border_of(sights, terms, n, row, columns, border), sights.frames[n]
+        base = CONTROL * sights.first[n]
         for a in range(LOCAL):
             x, y = weight * rows[0, a], weight * rows[1, a]
             normal.slope[base + a] += x * error[0] + y * error[1]

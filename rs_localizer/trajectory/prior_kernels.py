@@ -6,7 +6,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.trajectory.normal_kernels import Curve, Normal
+from rs_localizer.trajectory.normal_kernels import Normal
+from rs_localizer.trajectory.sight_kernels import Curve
 from rs_localizer.trajectory.spline_kernels import CONTROL, ORDER
 
 
@@ -80,4 +81,41 @@ def add_smoothness(
                     for b in range(a + 1):
                         column = base + CONTROL * b + 3 + i
                         normal.band[row - column, column] += x * second[b]
+    return cost
+
+
+@kernel
+def add_rest(curve: Curve, controls: IntArray, angular: float, linear: float,
+             normal: Normal) -> float:  # fmt: skip
+    """Add a zero-mean prior of these deviations (rad/s, m/s) on the velocity from each of some
+    controls (k,) to the next; returns its cost.
+    """
+    by_turn = np.empty((3, 6))
+    angular_precision = (curve.spacing * angular) ** -2
+    linear_precision = (curve.spacing * linear) ** -2
+    cost = 0.0
+    for k in controls:
+        turned, inverse = curve.vectors[k + 1], curve.inverses[k + 1]
+        base = CONTROL * k
+        for i in range(3):
+            for j in range(3):
+                by_turn[i, j] = -inverse[j, i]
+                by_turn[i, 3 + j] = inverse[i, j]
+        for i in range(3):
+            cost += angular_precision * turned[i] * turned[i]
+            for a in range(6):
+                row = base + CONTROL * (a // 3) + a % 3
+                x = angular_precision * by_turn[i, a]
+                normal.slope[row] += x * turned[i]
+                for b in range(a + 1):
+                    column = base + CONTROL * (b // 3) + b % 3
+                    normal.band[row - column, column] += x * by_turn[i, b]
+            moved = curve.positions[k + 1, i] - curve.positions[k, i]
+            cost += linear_precision * moved * moved
+            before, after = base + 3 + i, base + CONTROL + 3 + i
+            normal.slope[before] -= linear_precision * moved
+            normal.slope[after] += linear_precision * moved
+            normal.band[0, before] += linear_precision
+            normal.band[0, after] += linear_precision
+            normal.band[CONTROL, before] -= linear_precision
     return cost

@@ -1,33 +1,28 @@
-"""The cost of a trajectory, its normal equations and its minimum.
-
-Gauss and Newton with Levenberg's damping on the whitened errors of
-:mod:`rs_localizer.trajectory.normal_kernels`.
+"""The cost of a trajectory and its normal equations, on the whitened errors of
+:mod:`rs_localizer.trajectory.sight_kernels`.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored, Undetermined
+from rs_localizer.trajectory.bodies import Pieces
 from rs_localizer.trajectory.gyro_kernels import MOUNT
 from rs_localizer.trajectory.gyro_terms import GyroTerms
 from rs_localizer.trajectory.lens import lens_values, project
 from rs_localizer.trajectory.model import Freedom, Observations, State
-from rs_localizer.trajectory.normal_kernels import (
-    Curve,
-    Normal,
-    Sights,
-    Terms,
-    accumulate,
-    look,
-    squared_errors,
-)
-from rs_localizer.trajectory.prior_kernels import add_smoothness, eliminate_stamps
+from rs_localizer.trajectory.normal_kernels import Normal, accumulate
+from rs_localizer.trajectory.prior_kernels import add_rest, add_smoothness, eliminate_stamps
+from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, look, squared_errors
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
 LIMIT = 6.0
@@ -37,17 +32,19 @@ _SCALE_LIMIT = 4.0
 # Median of a squared error in two dimensions, in variances.
 _MEDIAN = 2.0 * np.log(2.0)
 _LEAST_DEVIATION = 1e-4  # px; recordings without noise are simulated
-_STEPS, _MOST_DAMPINGS = 20, 6
-_LEAST_GAIN = 0.02  # of the cost; a step that brings less is the last one
-_FIRST_DAMPING = 1e-8
+_LOOSE_BODY = 100.0  # m, rad
 # Kernels and OpenCV leave the interpreter free for each other.
 _PARTS = 2
 # What parts of a recording add to the normal equations.
 _SUMS = tuple(name for name in Normal._fields if name != "image_first")
 
+_Done = TypeVar("_Done")
+Step = tuple[Array, Array]
+"""Of the controls (6 n,) and of the border (b,)."""
+
 
 class Problem:
-    """The cost of a state, its normal equations and its minimum."""
+    """The cost of a state and its normal equations."""
 
     def __init__(
         self, camera: Camera, observations: Observations, start: State, freedom: Freedom
@@ -60,23 +57,20 @@ class Problem:
         self._workers = ThreadPoolExecutor(_PARTS)  # of its own: threads do not survive a fork
         self._last: tuple[State, Curve, list[Sights]] | None = None
         self.lens_count = len(start.lens) if freedom.lens else 0
-        self.slots = np.full(len(start.landmarks), -1)
-        if freedom.landmarks > 0.0:
-            seen = np.unique(observations.points)
-            self.slots[seen] = np.arange(len(seen))
-        self.free_points = np.flatnonzero(self.slots >= 0)
+        self.pieces = _pieces(observations, freedom)
         readout = 1 if freedom.readout_time else 0
-        self.border = readout + self.lens_count + 3 * len(self.free_points)
+        self.border = readout + self.lens_count + self.pieces.columns
         self.gyro: GyroTerms | None = None
         if observations.gyro is not None and start.mount is not None:
             self.gyro = GyroTerms(observations.gyro, start, self.border)
             self.border += MOUNT
         self.lens_column = readout if self.lens_count else -1
-        self.point_column = readout + self.lens_count if len(self.free_points) else -1
+        self.point_column = readout + self.lens_count if self.pieces.count else -1
 
     @property
-    def _point_columns(self) -> slice:
-        return slice(self.point_column, self.point_column + 3 * len(self.free_points))
+    def point_columns(self) -> slice:
+        """Where the landmarks stand in a step of the border."""
+        return slice(self.point_column, self.point_column + self.pieces.columns)
 
     def look(self, state: State) -> tuple[Curve, list[Sights]]:
         """The spline, and all keypoints on it in so many parts of the recording."""
@@ -85,13 +79,16 @@ class Problem:
             curve = Curve(
                 spline.rotations, spline.positions, *spline.steps(), float(spline.layout.spacing)
             )
-            parts = list(
-                self._workers.map(lambda part: self._part(state, curve, part), self._parts)
-            )
-            self._last = state, curve, list(parts)
+            arms = self.pieces.arms(state.landmarks)
+            parts = self.each(lambda part: self._part(state, curve, arms, part), self._parts)
+            self._last = state, curve, parts
         return self._last[1:]
 
-    def _part(self, state: State, curve: Curve, part: slice) -> Sights:
+    def each(self, work: Callable[..., _Done], *parts: list[Any]) -> list[_Done]:
+        """What comes of work on the parts of the recording, which threads share."""
+        return list(self._workers.map(work, *parts))
+
+    def _part(self, state: State, curve: Curve, arms: Array, part: slice) -> Sights:
         seen = self.observations
         tau, points, frames = seen.row_times[part], seen.points[part], seen.frames[part]
         times = seen.times[part] + state.delays[frames] + state.readout_time * tau
@@ -102,16 +99,17 @@ class Problem:
         seen_as = project(self.camera, state.lens, ahead, self.lens_column >= 0)
         return Sights(
             first, u, tau, local, velocity, seen_as.pixels - seen.pixels[part],
-            seen_as.by_ray, seen_as.by_lens, self.slots[points], frames,
+            seen_as.by_ray, seen_as.by_lens, self.pieces.slots[points], arms[points], frames,
         )  # fmt: skip
 
     def terms(self, state: State, deviation: float) -> Terms:
         return Terms(
             float(state.readout_time),
             self.camera.row_time_gradient,
-            0 if self.freedom.readout_time else -1,
-            self.lens_column,
+            self.freedom.readout_time,
+            self.lens_column >= 0,
             self.point_column,
+            self.pieces.width,
             self.freedom.stamps > 0.0,
             deviation**2,
             (LIMIT * deviation) ** 2,
@@ -138,7 +136,7 @@ class Problem:
         curve, parts = self.look(state)
         terms = self.terms(state, deviation)
         normals = self._empty(len(state.spline.positions), parts, len(state.delays))
-        costs = self._workers.map(
+        costs = self.each(
             lambda sights, normal: accumulate(curve, sights, terms, normal), parts, normals
         )
         cost, normal = sum(costs), normals[0]
@@ -149,6 +147,12 @@ class Problem:
             curve, state.spline.layout.firsts, float(self.freedom.angular_acceleration),
             float(self.freedom.linear_acceleration), normal,
         )  # fmt: skip
+        alone = state.spline.layout.alone()
+        if len(alone) and self.freedom.angular_velocity < math.inf:
+            cost += add_rest(
+                curve, alone, float(self.freedom.angular_velocity),
+                float(self.freedom.linear_velocity), normal,
+            )  # fmt: skip
         cost += self._add_priors(state, normal)
         if self.gyro is not None:
             cost += self.gyro.add(state, normal)
@@ -189,29 +193,33 @@ class Problem:
             normal.border_slope[at] += offset / deviations
             normal.corner[diagonal[at], diagonal[at]] += deviations**-2
             cost += float(offset @ offset)
-        if self.point_column >= 0:
-            known = self.observations.landmarks[self.free_points]
-            offset = (state.landmarks[self.free_points] - known).ravel() / self.freedom.landmarks
-            at = self._point_columns
+        if self.point_column >= 0 and not self.pieces.rigid:
+            free = self.pieces.slots >= 0
+            offset = (state.landmarks - self.observations.landmarks)[free].ravel()
+            offset /= self.freedom.landmarks
+            at = self.point_columns
             normal.border_slope[at] += offset / self.freedom.landmarks
             normal.corner[diagonal[at], diagonal[at]] += self.freedom.landmarks**-2
             cost += float(offset @ offset)
+        if self.pieces.rigid:  # a body none of whose landmarks fits stays where it is
+            at = self.point_columns
+            normal.corner[diagonal[at], diagonal[at]] += _LOOSE_BODY**-2
         if self.freedom.stamps > 0.0:
             normal.image_information[:] += self.freedom.stamps**-2
             normal.image_slope[:] += state.delays * self.freedom.stamps**-2
             cost += float(np.sum((state.delays / self.freedom.stamps) ** 2))
         return cost
 
-    def moved(self, state: State, normal: Normal, controls: Array, border: Array) -> State:
+    def moved(self, state: State, normal: Normal, step: Step) -> State:
         """The state after a step that these normal equations led to."""
+        controls, border = step
         readout_time, lens, landmarks = state.readout_time, state.lens, state.landmarks
         if self.freedom.readout_time:
             readout_time = readout_time + float(border[0])
         if self.lens_column >= 0:
             lens = lens + border[self.lens_column : self.lens_column + self.lens_count]
         if self.point_column >= 0:
-            landmarks = landmarks.copy()
-            landmarks[self.free_points] += border[self._point_columns].reshape(-1, 3)
+            landmarks = self.pieces.moved(landmarks, border[self.point_columns])
         delays, mount = state.delays, state.mount
         if self.gyro is not None and mount is not None:
             mount = self.gyro.moved(mount, border)
@@ -222,24 +230,21 @@ class Problem:
             delays = delays - (normal.image_slope + pull) / normal.image_information
         return State(state.spline.moved(controls), readout_time, lens, landmarks, delays, mount)
 
-    def minimise(self, state: State, deviation: float, steps: int = _STEPS) -> State:
-        """The state of least cost near to this one, after at most so many steps."""
-        cost, normal = self.normal(state, deviation)
-        damping = _FIRST_DAMPING
-        for _ in range(steps):
-            for _ in range(_MOST_DAMPINGS):
-                try:
-                    trial = self.moved(state, normal, *Factored(normal, damping).step())
-                    trial_cost, trial_normal = self.normal(trial, deviation)
-                except Undetermined:  # far from the minimum, rounding may cost definiteness
-                    trial_cost = np.inf
-                if trial_cost < cost + _LEAST_GAIN:  # NaN compares false
-                    break
-                damping = max(100.0 * damping, 1e-4)
-            else:
-                return state
-            gain = cost - trial_cost
-            state, cost, normal, damping = trial, trial_cost, trial_normal, 0.1 * damping
-            if gain < _LEAST_GAIN:
-                break
-        return state
+    def step(self, normal: Normal, damping: float) -> Step:
+        """Of controls and border, Levenberg's.
+
+        Raises:
+            Undetermined: when the normal equations are not positive definite.
+        """
+        return Factored(normal, damping).step()
+
+
+def _pieces(observations: Observations, freedom: Freedom) -> Pieces:
+    """What is free of the map: bodies, or the landmarks that are seen."""
+    if observations.bodies is not None:
+        return Pieces(observations.bodies, rigid=True)
+    slots = np.full(len(observations.landmarks), -1)
+    if freedom.landmarks > 0.0:
+        seen = np.unique(observations.points)
+        slots[seen] = np.arange(len(seen))
+    return Pieces(slots, rigid=False)

@@ -55,6 +55,11 @@ class Layout:
         ends: Array = self.starts + self.spacing * (np.diff(self.firsts) - (ORDER - 1))
         return ends
 
+    def alone(self) -> IntArray:
+        """The second controls (k,) of stretches of one interval, which lies behind them."""
+        seconds: IntArray = 1 + self.firsts[:-1][np.diff(self.firsts) == ORDER]
+        return seconds
+
     def control_times(self) -> Array:
         """Times (n,) at which the controls weigh most, s."""
         parts = [

@@ -41,6 +41,16 @@ def first_spline(
     parts = stretches(times)
     if not parts:
         raise ValueError(f"{len(times)} frames have a pose, none of them {LEAST_FRAMES} in a row")
+    return spline_through(parts, times, rotations, positions, spacing, margin)
+
+
+def spline_through(
+    parts: list[IntArray], times: Array, rotations: Array, positions: Array, spacing: float,
+    margin: float,
+) -> Spline:  # fmt: skip
+    """A spline near poses, as :func:`first_spline`, with a stretch for each part: indices of frames
+    that follow each other, or of one that stands alone.
+    """
     intervals = np.array([[times[part[0]] - margin, times[part[-1]] + margin] for part in parts])
     layout = Layout.over(intervals, spacing)
     controls = layout.control_times()
@@ -48,8 +58,11 @@ def first_spline(
     for k, part in enumerate(parts):
         own = controls[layout.firsts[k] : layout.firsts[k + 1]]
         inside = np.clip(own, times[part[0]], times[part[-1]])
-        turns = Slerp(times[part], Rotation.from_matrix(rotations[part]))
-        all_rotations.append(turns(inside).as_matrix())
+        if len(part) == 1:
+            all_rotations.append(np.repeat(rotations[part], len(own), axis=0))
+        else:
+            turns = Slerp(times[part], Rotation.from_matrix(rotations[part]))
+            all_rotations.append(turns(inside).as_matrix())
         all_positions.append(
             np.column_stack([np.interp(inside, times[part], positions[part, i]) for i in range(3)])
         )

@@ -61,10 +61,10 @@ def test_text(tmp_path: Path) -> None:
     [
         (["map"], 2, "the following arguments are required: ACTION"),
         (["map", "fly"], 2, "invalid choice: 'fly'"),
-        (["map", "convert", "a.ply", "b.obj"], 2, "OUT must end in .npz or .ply, got b.obj"),
+        (["map", "convert", "a.ply", "b.obj"], 2, "OUT must end in .npz or .ply or .yaml"),
         (["map", "convert", "a.ply", "b.npz", "--text"], 2, "--text goes with .ply"),
         (["map", "info", "nowhere.ply"], 1, "No such file or directory: 'nowhere.ply'"),
-        (["map", "info", str(COLMAP / "truth.json")], 1, "truth.json: expected a folder of COLMAP"),
+        (["map", "info", str(COLMAP / "truth.json")], 1, "truth.json is not a marker map"),
     ],
 )
 def test_what_is_refused(

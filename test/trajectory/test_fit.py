@@ -109,7 +109,7 @@ def test_the_normal_matrix_is_the_derivative_of_the_slope(direction: str, distor
         for sign in (-1.0, 1.0):
             step = np.zeros(controls + border)
             step[k] = sign * h
-            moved = problem.moved(state, normal, step[:controls], step[controls:])
+            moved = problem.moved(state, normal, (step[:controls], step[controls:]))
             found = problem.normal(moved, 1.0)[1]
             slopes.append(np.concatenate([found.slope, found.border_slope]))
         numeric = (slopes[1] - slopes[0]) / (2.0 * h)

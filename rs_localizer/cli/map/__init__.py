@@ -11,6 +11,9 @@ from types import ModuleType
 ACTIONS = {
     "info": "say what a map holds",
     "convert": "write a map to another file",
+    "align": "bring a map to metres, to z up, to an origin",
+    "survey": "find where markers are, from a recording that shows them",
+    "refine": "adjust a map with the rolling shutter that saw it",
 }
 
 

@@ -3,53 +3,75 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.cli.map import either
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.maps.landmarks import Map
-
-_KINDS = "a .npz or .ply file or a folder of COLMAP"
+from rs_localizer.markers.maps import MarkerMap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE", help=_KINDS)
-    parser.add_argument(
-        "--database",
-        type=Path,
-        metavar="FILE",
-        help="COLMAP's, for the descriptors (default: database.db, or the only database of any "
-        "name, in the folder or one of the two above)",
-    )
+    either.add_input(parser)
 
 
 def run(args: argparse.Namespace) -> None:
-    read_and_describe(args)
+    found, kind = either.read(args)
+    describe(args.file, found, kind)
 
 
-def read_and_describe(args: argparse.Namespace) -> Map:
-    """The map that the arguments name; its table is printed."""
-    # Frames are the localizer's business: files do not name one.
-    landmarks = read_map_file(args.file, "map", args.database)
-    _describe(args.file, landmarks)
-    return landmarks
+def describe(file: Path, found: Map | MarkerMap, kind: str) -> None:
+    """Print the table of a map."""
+    rows = _of_markers(found, kind) if isinstance(found, MarkerMap) else _of_landmarks(found)
+    print(file)
+    for name, text in [*rows, *_extents(found.points)]:
+        print(f"  {name:40} {text}")
 
 
-def _describe(file: Path, landmarks: Map) -> None:
+def _of_landmarks(landmarks: Map) -> list[tuple[str, str]]:
     rows = [("landmarks", str(len(landmarks)))]
     if landmarks.dropped:
         rows.append(("left out (not finite, or not described)", str(landmarks.dropped)))
     rows.append(("ids", _ids(landmarks)))
     rows.append(("descriptors", _descriptors(landmarks)))
-    low, high = landmarks.points.min(axis=0), landmarks.points.max(axis=0)
-    median = np.median(landmarks.points, axis=0)
+    if landmarks.covariances is not None:
+        spread = np.sqrt(np.trace(landmarks.covariances, axis1=1, axis2=2))
+        known = spread[np.isfinite(spread)]
+        middle = f"{1e3 * np.median(known):.2f} mm (median)" if len(known) else "none"
+        rows.append(("deviations known", f"{len(known)}, {middle}"))
+    return rows
+
+
+def _of_markers(marker_map: MarkerMap, kind: str) -> list[tuple[str, str]]:
+    rows = [("format", kind), ("map frame", marker_map.map_frame)]
+    families = Counter(marker.family.name for marker in marker_map.markers)
+    for name, count in sorted(families.items()):
+        ids = sorted(marker.id for marker in marker_map.markers if marker.family.name == name)
+        rows.append((f"markers of {name}", f"{count}, ids {ids[0]} to {ids[-1]}"))
+    sizes = sorted({round(marker.size, 6) for marker in marker_map.markers})
+    if sizes:
+        rows.append(("sizes (m)", ", ".join(f"{size:g}" for size in sizes[:6])))
+    known = [m.deviations for m in marker_map.markers if m.deviations is not None]
+    if known:
+        spread = np.linalg.norm(np.array(known)[:, :3], axis=1)
+        rows.append(
+            ("deviations known", f"{len(known)}, {1e3 * np.median(spread):.2f} mm (median)")
+        )
+    if marker_map.boards:
+        rows.append(("boards", ", ".join(board.name for board in marker_map.boards)))
+    return rows
+
+
+def _extents(points: Array) -> list[tuple[str, str]]:
+    rows = []
+    low, high, median = points.min(axis=0), points.max(axis=0), np.median(points, axis=0)
     for name, *values in zip("xyz", low, median, high, strict=True):
         least, middle, most = (f"{value:.3f}" for value in values)
         rows.append((f"{name} (m)", f"{least} to {most}, median {middle}"))
-    print(file)
-    for name, text in rows:
-        print(f"  {name:40} {text}")
+    return rows
 
 
 def _ids(landmarks: Map) -> str:

@@ -37,6 +37,7 @@ class Map:
         frame: in which the points are given.
         dropped: landmarks that were left out because they held NaN or infinity, or because no
             descriptor of theirs is known.
+        covariances: (n,3,3) m^2, NaN for those of which none is known; or None.
 
     Raises:
         MapError: for anything else, saying what was found.
@@ -47,6 +48,7 @@ class Map:
     descriptors: Descriptors | None
     frame: str
     dropped: int = 0
+    covariances: Array | None = None
 
     def __post_init__(self) -> None:
         count = len(self.points)
@@ -65,6 +67,8 @@ class Map:
             _check_ids(self.ids, count)
         if self.descriptors is not None:
             _check_descriptors(self.descriptors, count)
+        if self.covariances is not None and self.covariances.shape != (count, 3, 3):
+            raise MapError(f"covariances must be ({count},3,3), found {self.covariances.shape}")
 
     def __len__(self) -> int:
         return len(self.points)
@@ -76,6 +80,7 @@ class Map:
             and np.array_equal(self.points, other.points)
             and _equal(self.ids, other.ids)
             and _equal(self.descriptors, other.descriptors)
+            and _equal(self.covariances, other.covariances)
         )
 
     @property
@@ -95,8 +100,10 @@ def make_map(
     ids: NDArray[Any] | None,
     descriptors: NDArray[Any] | None,
     frame: str,
+    covariances: NDArray[Any] | None = None,
 ) -> Map:
-    """A map of arrays as they were read: points (n,3), integers (n,), uint8 or floats (n,d).
+    """A map of arrays as they were read: points (n,3), integers (n,), uint8 or floats (n,d), and
+    numbers (n,3,3).
 
     Landmarks with a value that is not finite are dropped and counted.
 
@@ -124,18 +131,23 @@ def make_map(
             descriptors = np.ascontiguousarray(descriptors)
         else:
             raise MapError(f"descriptors must be uint8 or floats, found {descriptors.dtype}")
+    if covariances is not None:
+        if covariances.shape != (len(points), 3, 3) or covariances.dtype.kind not in "fiu":
+            raise MapError(f"covariances must be ({len(points)},3,3), found {covariances.shape}")
+        covariances = np.ascontiguousarray(covariances, dtype=np.float64)
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped:
         points = points[finite]
         ids = None if ids is None else ids[finite]
         descriptors = None if descriptors is None else descriptors[finite]
-    return Map(points, ids, descriptors, frame, dropped)
+        covariances = None if covariances is None else covariances[finite]
+    return Map(points, ids, descriptors, frame, dropped, covariances)
 
 
 def _equal(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
     if one is None or other is None:
         return one is other
-    return one.dtype == other.dtype and np.array_equal(one, other)
+    return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 
 def _check_ids(ids: Ids, count: int) -> None:

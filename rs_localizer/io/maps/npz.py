@@ -1,4 +1,5 @@
-"""Maps as NumPy archives: ``points`` (n,3), and ``ids`` (n,), ``descriptors`` (n,d) where known.
+"""Maps as NumPy archives: ``points`` (n,3), and ``ids`` (n,), ``descriptors`` (n,d) and
+``covariances`` (n,3,3; m^2, NaN: not known) where known.
 
 Nothing in them is ever unpickled, and nothing is allocated before the headers of the arrays, the
 sizes in the archive and the size of the file agree.
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 
-_ARRAYS = ("points", "ids", "descriptors")
+_ARRAYS = ("points", "ids", "descriptors", "covariances")
 # Of all arrays together, unpacked: ten million landmarks with 128 bytes each, say.
 _MOST_BYTES = 2 * 2**30
 # Deflate packs no better than this.
@@ -38,7 +39,10 @@ def read_npz(path: Path, frame: str) -> Map:
     with path.open("rb") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns of old headers
         arrays = _arrays(file)
-    return make_map(arrays["points"], arrays.get("ids"), arrays.get("descriptors"), frame)
+    return make_map(
+        arrays["points"], arrays.get("ids"), arrays.get("descriptors"), frame,
+        arrays.get("covariances"),
+    )  # fmt: skip
 
 
 def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
@@ -66,6 +70,8 @@ def write_npz(path: Path, landmarks: Map) -> None:
         arrays["ids"] = landmarks.ids
     if landmarks.descriptors is not None:
         arrays["descriptors"] = landmarks.descriptors
+    if landmarks.covariances is not None:
+        arrays["covariances"] = landmarks.covariances
     with path.open("wb") as file:  # given a name, NumPy would append a suffix
         np.savez(file, **arrays)
 

@@ -1,0 +1,116 @@
+"""Maps of landmarks or of markers: what all actions on files of maps take and write."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from rs_localizer.cli import UsageError
+from rs_localizer.io.maps.files import WRITERS, read_map_file
+from rs_localizer.io.maps.landmarks import Map, make_map
+from rs_localizer.io.maps.ply import write_ply
+from rs_localizer.io.whole import whole_files
+from rs_localizer.markers.families import family
+from rs_localizer.markers.formats.common import Unsaid
+from rs_localizer.markers.formats.files import (
+    FORMATS,
+    OWN,
+    SUFFIXES,
+    is_marker_file,
+    read_any,
+    write_any,
+)
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.process.arguments import number
+
+_KINDS = (
+    "landmarks: a .npz or .ply file or a folder of COLMAP; markers: a .yaml or .json file of "
+    f"{', '.join(FORMATS)}"
+)
+_OUTPUTS = (*WRITERS, *SUFFIXES)
+
+
+def add_input(parser: argparse.ArgumentParser) -> None:
+    """The file, and what it may not say itself."""
+    parser.add_argument("file", type=Path, metavar="FILE", help=_KINDS)
+    parser.add_argument(
+        "--database",
+        type=Path,
+        metavar="FILE",
+        help="COLMAP's, for the descriptors (default: database.db, or the only database of any "
+        "name, in the folder or one of the two above)",
+    )
+    foreign = parser.add_argument_group("markers: what files of other programs do not say")
+    foreign.add_argument("--family", help=f"(default: {Unsaid().family.name})")
+    foreign.add_argument("--size", type=number(0.0, above=True), metavar="M", help="of all markers")
+    foreign.add_argument("--map-frame", metavar="NAME", help="(default: map)")
+    foreign.add_argument("--part", metavar="NAME", help="of several bundles or bodies")
+
+
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Where to, and as what."""
+    parser.add_argument("out", type=Path, metavar="OUT", help=f"ends in {', '.join(_OUTPUTS)}")
+    parser.add_argument("--text", action="store_true", help="write .ply as text")
+    parser.add_argument(
+        "--to", choices=FORMATS, help="of markers (default: .json is of wpilib, .yaml our own)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT")
+
+
+def read(args: argparse.Namespace) -> tuple[Map | MarkerMap, str]:
+    """The map that the arguments name, and the name of its format, empty for landmarks."""
+    if is_marker_file(args.file):
+        return read_any(args.file, _unsaid(args))
+    # Frames are the localizer's business: files of landmarks do not name one.
+    return read_map_file(args.file, args.map_frame or "map", args.database), ""
+
+
+def _unsaid(args: argparse.Namespace) -> Unsaid:
+    known = Unsaid()
+    try:
+        kind = known.family if args.family is None else family(args.family)
+    except ValueError as error:
+        raise UsageError(f"--family: {error}") from error
+    return Unsaid(kind, args.size, args.map_frame or known.map_frame, args.part or "")
+
+
+def check_output(args: argparse.Namespace) -> None:
+    """Refuse a name that says nothing, and to replace what is there."""
+    suffix = args.out.suffix
+    if suffix not in _OUTPUTS:
+        raise UsageError(f"OUT must end in {' or '.join(_OUTPUTS)}, got {args.out}")
+    if args.text and suffix != ".ply":
+        raise UsageError("--text goes with .ply")
+    if args.to is not None and (suffix == ".json") != (args.to == "wpilib"):
+        raise UsageError(f"{args.to} is written to {'.json' if args.to == 'wpilib' else '.yaml'}")
+    if args.to is not None and suffix in WRITERS:
+        raise UsageError("--to is for markers")
+    if args.out.exists() and not args.overwrite:
+        raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
+
+
+def write(args: argparse.Namespace, found: Map | MarkerMap) -> None:
+    """Write the map to OUT: markers to a file of landmarks as their corners, whose ids are those
+    of ``detect``.
+    """
+    path: Path = args.out
+    if isinstance(found, Map) and path.suffix not in WRITERS:
+        raise UsageError(f"{args.file} holds landmarks, which go to {' or '.join(WRITERS)}")
+    with whole_files(path):
+        if isinstance(found, MarkerMap) and path.suffix in SUFFIXES:
+            write_any(path, found, args.to or ("wpilib" if path.suffix == ".json" else OWN))
+        else:
+            landmarks = corners(found) if isinstance(found, MarkerMap) else found
+            if args.text:
+                write_ply(path, landmarks, binary=False)
+            else:
+                WRITERS[path.suffix](path, landmarks)
+    print(f"written to {path}")
+
+
+def corners(marker_map: MarkerMap) -> Map:
+    """The corners of a marker map as landmarks: their ids are rows of ``MarkerMap.points``."""
+    points = marker_map.points
+    return make_map(points, np.arange(len(points)), None, marker_map.map_frame)

@@ -1,0 +1,170 @@
+"""``rs_localizer map refine``: a map adjusted with the rolling shutter that saw it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.topics import add_topics, given_topics
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.calibration.files import read_calibration, write_calibration
+from rs_localizer.io.maps.files import WRITERS, read_map_file
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.topics import IMU
+from rs_localizer.io.whole import whole_files
+from rs_localizer.mapping.recorded import RecordedMap, from_recording
+from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
+from rs_localizer.offline.recordings import Recorded, read_recording
+from rs_localizer.offline.replay import find_topics
+from rs_localizer.process.arguments import number
+
+_GIVEN, _ESTIMATED, _GLOBAL = "given", "estimated", "global"
+_HOLD = 0.001
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Bundle adjustment in continuous time: landmarks are free, the motion is a spline, each "
+        "keypoint is seen when its own row was exposed."
+    )
+    parser.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="a bag of correspondences or keypoints"
+    )
+    parser.add_argument(
+        "--map", type=Path, metavar="MAP", help="the map (default: the points of the recording)"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help=" or ".join(WRITERS))
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT")
+    parser.add_argument(
+        "--shutter",
+        choices=(_GIVEN, _ESTIMATED, _GLOBAL),
+        help="the readout time: as set, to be found, or none (default: as set, found if it is 0)",
+    )
+    parser.add_argument("--intrinsics", action="store_true", help="adjust the lens as well")
+    parser.add_argument(
+        "--hold",
+        type=int,
+        nargs="+",
+        metavar="ID",
+        help="landmarks of known place, three or more: they hold frame and size of the map "
+        "(default: the map as a whole stays where it is, with the size that it has)",
+    )
+    parser.add_argument(
+        "--hold-deviation",
+        type=number(0.0, above=True),
+        default=_HOLD,
+        metavar="M",
+        help="how well these are known (default: %(default)s)",
+    )
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="instead of camera_info")
+    add_settings(
+        parser,
+        "readout_time, scan_direction, stamp_offset, matching.*; map_deviation: how well all "
+        "landmarks are known",
+    )
+    topics = parser.add_argument_group("topics of the bag (default: found by name and type)")
+    add_topics(topics, but=(IMU,))
+
+
+def run(args: argparse.Namespace) -> None:
+    if args.out.suffix not in WRITERS:
+        raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
+    config = given_settings(args)
+    if args.out.exists() and not args.overwrite:
+        raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
+    landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
+    with open_bag(args.recording) as bag:
+        topics = find_topics(bag, given_topics(args, but=(IMU,))).without(IMU)
+        recorded = read_recording(bag, topics, config.matching, landmarks)
+    shutter = args.shutter or (_GIVEN if config.readout_time > 0.0 else _ESTIMATED)
+    if shutter == _GIVEN and not config.readout_time > 0.0:
+        raise UsageError("--shutter given needs -p readout_time:=S or --params")
+    readout_time = 0.0 if shutter == _GLOBAL else config.readout_time
+    camera = recorded.calibration.camera(readout_time, config.scan_direction)
+    if args.calibration is not None:
+        given = read_calibration(args.calibration)
+        camera = replace(given, readout_time=readout_time, scan_direction=config.scan_direction)
+    known = _localized(camera, recorded, landmarks)
+    deviations = _deviations(args, known.landmarks, config.map_deviation)
+    freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
+    found = refine(
+        camera, known.seen, known.start, freedom, stamp_offset=config.stamp_offset, done=_told
+    )
+    _tell(known, found)
+    _write(args, known.landmarks, found)
+
+
+def _told(step: str) -> None:
+    print(f"adjusted: {step}", flush=True)
+
+
+def _localized(camera: Camera, recorded: Recorded, landmarks: Map | None) -> RecordedMap:
+    with tqdm(total=len(recorded.clouds), unit="image", desc="localize", disable=None) as bar:
+        return from_recording(camera, recorded.clouds, landmarks, bar.update)
+
+
+def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) -> Array | None:
+    """How well each landmark is known, m; None: not at all."""
+    every = map_deviation if map_deviation > 0.0 else np.inf
+    if args.hold is None:
+        return np.full(len(landmarks), every) if map_deviation > 0.0 else None
+    if landmarks.ids is None:
+        raise UsageError("--hold needs a map with ids")
+    unknown = sorted(set(args.hold) - set(landmarks.ids.tolist()))
+    if unknown:
+        raise UsageError(f"--hold: the map has no landmark {unknown[0]}")
+    return np.where(np.isin(landmarks.ids, args.hold), args.hold_deviation, every)
+
+
+def _tell(known: RecordedMap, found: RefinedMap) -> None:
+    """The table of what changed."""
+    moved = np.linalg.norm(found.points - known.start.points, axis=1)[found.refined]
+    spread = np.sqrt(np.trace(found.covariances[found.refined], axis1=1, axis2=2))
+    rows = [
+        ("images with a pose", f"{len(known.seen.stamps_ns)} of {known.images}"),
+        ("landmarks refined", f"{np.count_nonzero(found.refined)} of {len(found.points)}"),
+        ("noise before", f"{found.before:.3f} px"),
+        ("noise after", f"{found.after:.3f} px"),
+        ("keypoints that fit", f"{np.mean(found.inliers):.1%}"),
+    ]
+    if len(moved):
+        rows += [
+            (
+                "landmarks moved by",
+                f"{1e3 * np.median(moved):.1f} mm (median), {1e3 * moved.max():.1f} at most",
+            ),
+            ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"),
+        ]
+    deviation = found.readout_time_deviation
+    spread_text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
+    rows.append(("readout time", f"{1e3 * found.readout_time:.3f}{spread_text} ms"))
+    for name, text in rows:
+        print(f"{name:26} {text}")
+    if found.readout_time < 0.0:
+        print("the readout time is negative: the scan direction is the reverse of what was set")
+
+
+def _millimetres(lengths: Array) -> str:
+    return f"{1e3 * np.median(lengths):.1f} mm (median)"
+
+
+def _write(args: argparse.Namespace, landmarks: Map, found: RefinedMap) -> None:
+    refined = replace(landmarks, points=found.points, covariances=found.covariances)
+    lens = args.out.with_name(f"{args.out.stem}_camera_info.yaml")
+    files = [args.out, lens] if args.intrinsics else [args.out]
+    with whole_files(*files):
+        WRITERS[args.out.suffix](args.out, refined)
+        if args.intrinsics:
+            write_calibration(lens, found.camera)
+    print(f"written: {', '.join(map(str, files))}")
+    left = np.count_nonzero(~found.refined)
+    if left:
+        print(f"{left} landmarks stayed as they were: fewer than two images determine them")

@@ -1,0 +1,195 @@
+"""``rs_localizer map survey``: where markers are, from a recording that shows them."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.shots import shots_of
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.camera_info import Calibration, read_camera_info
+from rs_localizer.io.images import Image
+from rs_localizer.io.whole import whole_files
+from rs_localizer.mapping.spotting import LEAST_SIDE, Spotted, Spotter, every_marker
+from rs_localizer.mapping.survey import Survey, survey
+from rs_localizer.markers.consistency import problems
+from rs_localizer.markers.families import FAMILIES, Family, family
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Marker
+from rs_localizer.offline.image_sources import Carried
+from rs_localizer.process.arguments import number
+
+_LISTED = 12
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Find the poses of all markers that a recording shows, each together with another one in "
+        "some images. The lens must be calibrated; sizes are taken as given: an error of theirs "
+        "is one of all distances."
+    )
+    parser.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="a video, a folder of images, or a bag"
+    )
+    parser.add_argument(
+        "--family",
+        action="append",
+        required=True,
+        help=f"of the markers; may be repeated: {', '.join(FAMILIES)}",
+    )
+    parser.add_argument(
+        "--size",
+        action="append",
+        required=True,
+        metavar="[ID:]M",
+        help="side of the black square, m: of all markers, and of single ids that differ",
+    )
+    parser.add_argument(
+        "--origin", type=int, metavar="ID",
+        help="marker whose frame is that of the map (default: the lowest id of the most that hang "
+        "together)",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, required=True, metavar="WALL.yaml")
+    parser.add_argument("--overwrite", action="store_true", help="replace WALL.yaml")
+    parser.add_argument("--map-frame", default="map", help="(default: %(default)s)")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="the lens")
+    parser.add_argument(
+        "--min-side", type=number(0.0), default=LEAST_SIDE, metavar="PX",
+        help="markers with a shorter side are left out (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--rate", type=number(0.0, above=True), metavar="HZ",
+        help="images per second of a video or of files",
+    )  # fmt: skip
+    add_settings(parser, "readout_time (0: it is found), scan_direction, stamp_offset")
+    topics = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
+    topics.add_argument("--image", metavar="TOPIC")
+    topics.add_argument("--camera-info", metavar="TOPIC")
+
+
+def run(args: argparse.Namespace) -> None:
+    if args.out.suffix not in (".yaml", ".yml"):
+        raise UsageError(f"--out must end in .yaml, got {args.out}")
+    config, markers = given_settings(args), _markers(args)
+    origin = _origin(args, markers)
+    if args.out.exists() and not args.overwrite:
+        raise ValueError(f"{args.out} exists; choose another --out, or --overwrite")
+    if not args.recording.exists():
+        raise ValueError(f"{args.recording} does not exist")
+    camera, spotted = _spotted(args, config, Spotter(markers, args.min_side))
+    found = survey(camera, spotted, markers, origin=origin, stamp_offset=config.stamp_offset)
+    _tell(found, len(spotted))
+    surveyed = tuple(
+        replace(marker, deviations=None if k == 0 else deviations)
+        for k, (marker, deviations) in enumerate(zip(found.markers, found.deviations, strict=True))
+    )
+    marker_map = MarkerMap(surveyed, map_frame=args.map_frame)
+    with whole_files(args.out):
+        write_marker_map(args.out, marker_map)
+    print(f"written: {args.out}")
+    for text in problems(marker_map):
+        print(f"warning: {text}")
+
+
+def _markers(args: argparse.Namespace) -> tuple[Marker, ...]:
+    """All that may be there, by families and sizes."""
+    try:
+        families: list[Family] = [family(name) for name in args.family]
+    except ValueError as error:
+        raise UsageError(f"--family: {error}") from error
+    kinds = [one.kind for one in families]
+    if len(set(kinds)) < len(kinds):
+        raise UsageError("--family: families of one kind share their patterns; give the largest")
+    size, sizes = 0.0, {}
+    for text in args.size:
+        number_of, _, metres = text.rpartition(":")
+        try:
+            value = float(metres)
+            if not 0.0 < value < np.inf:
+                raise ValueError
+            if number_of:
+                sizes[int(number_of)] = value
+            else:
+                size = value
+        except ValueError:
+            raise UsageError(f"--size must be metres, or ID:metres, got {text!r}") from None
+    if not size:
+        raise UsageError("--size needs the size of all other markers, too")
+    return every_marker(families, size, sizes)
+
+
+def _origin(args: argparse.Namespace, markers: tuple[Marker, ...]) -> int | None:
+    if args.origin is None:
+        return None
+    places = [k for k, marker in enumerate(markers) if marker.id == args.origin]
+    if not places:
+        raise UsageError(f"--origin: {' and '.join(args.family)} have no id {args.origin}")
+    return places[0]
+
+
+def _spotted(
+    args: argparse.Namespace, config: NodeConfig, spotter: Spotter
+) -> tuple[Camera, list[Spotted]]:
+    """The camera, and the markers of each image."""
+    spotted: dict[int, Spotted] = {}
+    calibration: Calibration | None = None
+    with shots_of(args) as shots:
+        for shot in tqdm(shots, unit="image", desc="detect", disable=None):
+            if isinstance(shot, Carried) or not isinstance(shot.image, Image):
+                continue
+            read = read_camera_info(shot.camera_info)
+            if calibration is not None and read != calibration:
+                raise ValueError("camera_info changes on the way; cut the recording there")
+            calibration = read
+            camera = calibration.camera(config.readout_time, config.scan_direction)
+            height, width = shot.image.pixels.shape
+            if camera.size != (width, height):
+                raise ValueError(
+                    f"the images are of {width}x{height}, the calibration is for "
+                    f"{camera.size[0]}x{camera.size[1]}"
+                )
+            stamp = shot.image.stamp_ns
+            spotted[stamp] = spotter.spot(shot.image.pixels, stamp)
+    if calibration is None:
+        raise ValueError(f"{args.recording} has no image that can be read")
+    return camera, [spotted[stamp] for stamp in sorted(spotted)]
+
+
+def _tell(found: Survey, images: int) -> None:
+    """The table of the markers."""
+    fit = found.fit
+    print(f"images with a marker     {found.images} of {images}")
+    print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
+    deviation = fit.readout_time_deviation
+    spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
+    print(f"readout time             {1e3 * fit.state.readout_time:.3f}{spread} ms")
+    print(
+        f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
+    )
+    for marker, sights, deviations in zip(
+        found.markers, found.sights, found.deviations, strict=True
+    ):
+        x, y, z = marker.pose.position
+        place = 1e3 * np.linalg.norm(deviations[:3])
+        turn = np.degrees(np.linalg.norm(deviations[3:]))
+        name = marker.name.removeprefix("marker ")
+        print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}")
+    for part in found.apart:
+        print(
+            f"not connected: {_listed(part)}: no image shows one of them together with those above"
+        )
+    if found.rare:
+        print(f"left out: {_listed(found.rare)}: too few images show them, or none as the others")
+
+
+def _listed(markers: tuple[Marker, ...]) -> str:
+    more = f" and {len(markers) - _LISTED} more" if len(markers) > _LISTED else ""
+    return ", ".join(marker.name for marker in markers[:_LISTED]) + more

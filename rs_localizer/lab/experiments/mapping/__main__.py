@@ -1,0 +1,34 @@
+"""The figures of ``docs/mapping.md``:
+
+python -m rs_localizer.lab.experiments.mapping bend bound large surveys
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+
+from rs_localizer.lab.experiments.mapping.refining import bend, bound, large
+from rs_localizer.lab.experiments.mapping.surveying import surveys
+from rs_localizer.process.arguments import integer
+
+_PARTS: dict[str, Callable[[int], Iterator[str]]] = {
+    "bend": bend, "bound": bound, "large": large, "surveys": surveys,
+}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m rs_localizer.lab.experiments.mapping")
+    parser.add_argument("names", nargs="+", metavar="PART", choices=_PARTS, help=", ".join(_PARTS))
+    parser.add_argument("--seed", type=integer(0), default=0, metavar="N")
+    options = parser.parse_args()
+    for name in options.names:
+        for text in _PARTS[name](options.seed):
+            sys.stdout.write(f"{text}\n")
+            sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Maps from images: landmarks and markers refined together with the motion that saw them."""

@@ -1,0 +1,234 @@
+"""A first guess of where markers and camera are: single markers' poses, chained over images.
+
+A square seen alone fits two poses (Collins and Bartoli, *Infinitesimal plane-based pose
+estimation*, IJCV 2014). Of two markers, what image after image says of how they lie to each other
+agrees for the true poses only; by what agrees most, all are chained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.mapping.spotting import Spotted
+from rs_localizer.markers.prints import Marker
+
+# Of a pair, evenly, so many images are compared.
+_MOST_IMAGES = 40
+# How far what two images say may differ: in sides, and rad.
+_SAME_PLACE, _SAME_TURN = 0.3, 0.15
+# Poses of an image whose errors are within this factor of the least may be true.
+_ALIKE = 3.0
+# Errors of a corner beyond this (of the focal length) all count the same.
+_GROSS = 0.02
+# What a rolling shutter leaves of a square's pose (px).
+_SHUTTER = 0.5
+# Until then (s) an image is near the one before.
+_NEAR = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Chained:
+    """Markers that hang together, and the images that show them."""
+
+    markers: dict[int, Transform]  # origin_from_marker, by place in the list
+    images: list[int]  # places of those with a pose
+    poses: list[Transform]  # origin_from_camera
+    apart: list[list[int]]  # markers that do not hang together with these, part by part
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """One image: each marker's rays and both of its poses."""
+
+    stamp_ns: int
+    rays: dict[int, Array]  # (4,2)
+    # camera_from_marker, and how far it fits, of 1.
+    poses: dict[int, list[tuple[Transform, float]]]
+
+
+def chain(
+    camera: Camera, spotted: Sequence[Spotted], markers: Sequence[Marker], origin: int | None
+) -> Chained:
+    """Place the markers that hang together with one of them.
+
+    Args:
+        camera: its lens.
+        spotted: images in the order of their stamps.
+        markers: all there may be; only their sizes count.
+        origin: place of the one whose frame is that of the others; None: the first of the most
+            that hang together.
+    """
+    views = [_view(camera, one, markers) for one in spotted]
+    seen = sorted({marker for view in views for marker in view.poses})
+    between, scores = _between(views, markers)
+    parts = _parts(seen, scores)
+    first = parts[0][0] if origin is None else origin
+    own = next(part for part in parts if first in part)
+    placed = _placed(first, own, between, scores)
+    images, poses = _image_poses(views, placed, markers)
+    return Chained(placed, images, poses, [part for part in parts if part is not own])
+
+
+def _view(camera: Camera, spotted: Spotted, markers: Sequence[Marker]) -> _View:
+    rays, poses = {}, {}
+    for marker, quad in zip(spotted.markers.tolist(), spotted.quads, strict=True):
+        own = camera.rays(quad)
+        found = _square_poses(markers[marker].corners, own, _SHUTTER / camera.focal_length)
+        if np.isfinite(own).all() and found:
+            rays[marker], poses[marker] = own, found
+    return _View(spotted.stamp_ns, rays, poses)
+
+
+def _square_poses(corners: Array, rays: Array, doubt: float) -> list[tuple[Transform, float]]:
+    """Poses camera_from_marker that fit rays (4,2), and how far they do, of 1."""
+    try:
+        count, turns, places, errors = cv2.solvePnPGeneric(
+            corners, np.ascontiguousarray(rays), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
+    except cv2.error:
+        return []
+    fits = np.exp(-(np.ravel(errors) - np.min(errors)) / doubt)
+    found = [
+        (
+            Transform(
+                np.asarray(cv2.Rodrigues(turns[k])[0], np.float64),
+                np.asarray(places[k], np.float64).ravel(),
+            ),
+            fits[k],
+        )
+        for k in range(count)
+    ]
+    return [(pose, float(fit)) for pose, fit in found if pose.translation[2] > 0.0]
+
+
+def _between(
+    views: list[_View], markers: Sequence[Marker]
+) -> tuple[dict[tuple[int, int], Transform], dict[tuple[int, int], float]]:
+    """Of each pair a < b, a_from_b, and by how many images it is said."""
+    images: dict[tuple[int, int], list[_View]] = {}
+    for view in views:
+        for pair in combinations(sorted(view.poses), 2):
+            images.setdefault(pair, []).append(view)
+    between, scores = {}, {}
+    for (a, b), among in images.items():
+        step = -(-len(among) // _MOST_IMAGES)
+        said = [
+            (k, first.inverse() @ second, fit * other)
+            for k, view in enumerate(among[::step])
+            for first, fit in view.poses[a]
+            for second, other in view.poses[b]
+        ]
+        size = max(markers[a].size, markers[b].size)
+        between[a, b], scores[a, b] = _agreed(said, size)
+    return between, scores
+
+
+def _agreed(said: list[tuple[int, Transform, float]], size: float) -> tuple[Transform, float]:
+    """What most images say, each of which says several things that fit more or less; and by how
+    many it is said.
+    """
+    image = np.array([k for k, _, _ in said])
+    turns = np.array([of.rotation for _, of, _ in said])
+    places = np.array([of.translation for _, of, _ in said])
+    fits = np.array([fit for _, _, fit in said])
+    cosines = 0.5 * (np.einsum("nij,mij->nm", turns, turns) - 1.0)
+    angles = np.arccos(np.clip(cosines, -1.0, 1.0))
+    # What is far from both is known less well.
+    reach = _SAME_PLACE * size + 0.1 * np.linalg.norm(places, axis=1)
+    apart = np.linalg.norm(places[:, None] - places, axis=2) / reach[:, None]
+    agree = np.exp(-((angles / _SAME_TURN) ** 2) - apart**2) * fits
+    # Of each image only what agrees best counts.
+    firsts = np.flatnonzero(np.diff(image, prepend=-1))
+    per_image = np.maximum.reduceat(agree, firsts, axis=1)
+    support = per_image.sum(axis=1)
+    best = int(np.argmax(support))
+    # The mean of what agrees with it, of each image one.
+    weights = np.where(
+        agree[best] == per_image[best][np.searchsorted(image[firsts], image)], agree[best], 0.0
+    )
+    u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, turns))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return Transform(turn, weights @ places / weights.sum()), float(support[best])
+
+
+def _parts(seen: list[int], scores: dict[tuple[int, int], float]) -> list[list[int]]:
+    """Markers that hang together, the most first."""
+    place = {marker: k for k, marker in enumerate(seen)}
+    pairs = np.array([[place[a], place[b]] for a, b in scores], np.int64).reshape(-1, 2)
+    graph = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(seen),) * 2)
+    count, labels = connected_components(graph, directed=False)
+    parts = [[m for m, of in zip(seen, labels, strict=True) if of == k] for k in range(count)]
+    return sorted(parts, key=lambda part: (-len(part), part[0]))
+
+
+def _placed(
+    origin: int, own: list[int], between: dict[tuple[int, int], Transform],
+    scores: dict[tuple[int, int], float],
+) -> dict[int, Transform]:  # fmt: skip
+    """origin_from_marker along the chains of what most images say."""
+    place = {marker: k for k, marker in enumerate(own)}
+    inside = [(pair, score) for pair, score in scores.items() if pair[0] in place]
+    pairs = np.array([[place[a], place[b]] for (a, b), _ in inside], np.int64).reshape(-1, 2)
+    costs = 1.0 / np.array([score for _, score in inside])
+    tree = minimum_spanning_tree(
+        csr_array((costs, (pairs[:, 0], pairs[:, 1])), shape=(len(own),) * 2)
+    )
+    order, before = breadth_first_order(tree, place[origin], directed=False)
+    placed = {origin: Transform(np.eye(3), np.zeros(3))}
+    for k in order[1:].tolist():
+        here, there = own[k], own[int(before[k])]
+        pair = (min(here, there), max(here, there))
+        step = between[pair] if there < here else between[pair].inverse()
+        placed[here] = placed[there] @ step
+    return placed
+
+
+def _image_poses(
+    views: list[_View], placed: dict[int, Transform], markers: Sequence[Marker]
+) -> tuple[list[int], list[Transform]]:
+    """Images with a pose, and origin_from_camera of each."""
+    images: list[int] = []
+    poses: list[Transform] = []
+    for k, view in enumerate(views):
+        own = [marker for marker in view.poses if marker in placed]
+        if not own:
+            continue
+        points = np.concatenate([_corners(markers[marker], placed[marker]) for marker in own])
+        rays = np.concatenate([view.rays[marker] for marker in own])
+        options = [
+            pose @ placed[marker].inverse() for marker in own for pose, _ in view.poses[marker]
+        ]
+        costs = np.array([_cost(option, points, rays) for option in options])
+        alike = [option for option, cost in zip(options, costs, strict=True)
+                 if cost <= _ALIKE * costs.min()]  # fmt: skip
+        best = options[int(np.argmin(costs))]
+        near = images and (view.stamp_ns - views[images[-1]].stamp_ns) * 1e-9 < _NEAR
+        if near and len(alike) > 1:
+            before = poses[-1].rotation
+            best = max(alike, key=lambda option: float(np.sum(option.rotation.T * before)))
+        images.append(k)
+        poses.append(best.inverse())
+    return images, poses
+
+
+def _corners(marker: Marker, placed: Transform) -> Array:
+    return np.asarray(marker.corners @ placed.rotation.T + placed.translation)
+
+
+def _cost(pose: Transform, points: Array, rays: Array) -> float:
+    """Squared errors of points (n,3) under camera_from_origin, gross ones limited."""
+    local = points @ pose.rotation.T + pose.translation
+    ahead = local[:, 2] > 0.0
+    depth = np.where(ahead, local[:, 2], 1.0)
+    squared = np.sum((local[:, :2] / depth[:, None] - rays) ** 2, axis=1)
+    return float(np.sum(np.where(ahead, np.minimum(squared, _GROSS**2), _GROSS**2)))

@@ -1,0 +1,172 @@
+"""A map refined with the rolling shutter that saw it: bundle adjustment in continuous time.
+
+Landmarks are free, the motion is a spline, each keypoint is seen at the time of its own row. An
+adjustment with a global shutter bends the map by what the camera moved while its rows were read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.mapping.adjustment import MapProblem, sights_of
+from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
+from rs_localizer.mapping.placing import place
+from rs_localizer.mapping.preparation import Preparation
+from rs_localizer.mapping.sightings import MapFreedom, Sightings, Start, check
+from rs_localizer.trajectory.banded import Undetermined
+from rs_localizer.trajectory.descent import settle
+from rs_localizer.trajectory.fit import inflation_of, left_over
+from rs_localizer.trajectory.lens import with_lens
+from rs_localizer.trajectory.model import Freedom, start_state
+from rs_localizer.trajectory.problem import LIMIT, Problem
+from rs_localizer.trajectory.spline import Spline
+from rs_localizer.trajectory.spline_kernels import CONTROL
+
+__all__ = ["MapFreedom", "RefinedMap", "Sightings", "Start", "refine"]
+
+# A landmark that is not known to this part of the map's size is not refined.
+_KNOWN = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedMap:
+    """Landmarks and motion, with what is known of their errors."""
+
+    points: Array  # (p,3) m
+    covariances: Array  # (p,3,3) m^2; NaN where not refined
+    refined: BoolArray  # (p,)
+    sights: IntArray  # (p,) keypoints that fit
+    camera: Camera  # with the readout time and the lens that were found
+    readout_time: float  # s; negative: against the scan direction
+    readout_time_deviation: float  # s; NaN where it was given
+    deviation: float  # px, of the noise of u and of v
+    squared_errors: Array  # (n,) px^2, whitened; infinite for keypoints that took no part
+    inliers: BoolArray  # (n,)
+    before: float  # px, noise that the map left as it was given
+    after: float  # px, noise that it leaves now, likewise
+    spline: Spline  # s since ``start_ns``
+    start_ns: int
+    times: Array  # (g,) s, of the images' middle rows
+
+    def poses(self) -> tuple[Array, Array]:
+        """map_from_camera (g,3,3), (g,3) at the images' middle rows."""
+        states = self.spline.states(self.times)
+        return states.rotations, states.positions
+
+
+def refine(
+    camera: Camera,
+    seen: Sightings,
+    start: Start,
+    freedom: MapFreedom | None = None,
+    *,
+    stamp_offset: float = 0.0,
+    done: Callable[[str], object] = lambda text: None,
+) -> RefinedMap:
+    """The most likely map and motion.
+
+    Args:
+        camera: its lens, scan direction and readout time (0: a global shutter).
+        seen: keypoints of landmarks; those of landmarks that one image alone sees do not count.
+        start: first guess; without landmarks of known places the map as a whole, its size too,
+            stays where this has it.
+        freedom: what is estimated beside (default: landmarks and motion only).
+        stamp_offset: s from a stamp to the first row's exposure.
+        done: called with each part of the work that is done.
+
+    Raises:
+        ValueError: when the images make no single map, or are too many.
+    """
+    freedom = freedom or MapFreedom()
+    check(seen, len(start.points))
+    prepared = Preparation(camera, seen, start, freedom, stamp_offset)
+    try:
+        return _Refinement(prepared).solved(done)
+    except Undetermined as error:
+        raise ValueError(f"the map cannot be refined: {error}") from error
+
+
+class _Refinement:
+    """One map on its way."""
+
+    def __init__(self, prepared: Preparation) -> None:
+        self.prepared, self.camera = prepared, prepared.camera
+        self.observations = prepared.observations()
+        self.state = start_state(
+            self.camera, self.observations, prepared.spline, self.camera.readout_time
+        )
+        given = prepared.freedom
+        self.freedom = Freedom(
+            readout_time=given.readout_time,
+            lens=given.lens,
+            angular_acceleration=given.angular_acceleration,
+            linear_acceleration=given.linear_acceleration,
+            angular_velocity=ANGULAR_VELOCITY,
+            linear_velocity=LINEAR_VELOCITY,
+        )
+
+    def solved(self, done: Callable[[str], object]) -> RefinedMap:
+        # The motion that goes with the map as it is.
+        held = replace(self.freedom, readout_time=False, lens=False)
+        motion = Problem(self.camera, self.observations, self.state, held)
+        self.state, before = settle(motion, self.state, motion.noise(self.state, np.inf))
+        done("motion")
+        problem = self._problem(self.freedom)
+        self.state, deviation = settle(problem, self.state, before)
+        done("map")
+        calmer = calm(self.state, self.freedom)
+        if calmer is not None:
+            self.freedom, problem = calmer, self._problem(calmer)
+            self.state, deviation = settle(problem, self.state, deviation)
+            done("accelerations")
+        return self._result(problem, before, deviation)
+
+    def _problem(self, freedom: Freedom) -> MapProblem:
+        return MapProblem(
+            self.camera, self.observations, self.state, freedom, self.prepared.deviations,
+            self.prepared.floating,
+        )  # fmt: skip
+
+    def _result(self, problem: MapProblem, before: float, deviation: float) -> RefinedMap:
+        state, prepared, seen = self.state, self.prepared, self.observations
+        squared = problem.errors(state)
+        inliers = squared < (LIMIT * deviation) ** 2
+        sights, images = sights_of(seen, inliers)
+        used = _freedoms(state.spline, seen.frames) + 3 * int(np.count_nonzero(images))
+        inflation = inflation_of(squared[inliers], deviation, used + problem.motion.border)
+        placed = place(problem, state, deviation, images > 1)
+        covariances = inflation * placed.covariances
+        spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        refined = (images > 1) & (spread < _KNOWN * prepared.size)
+        all_squared = np.full(len(prepared.used), np.inf)
+        all_squared[prepared.used] = squared
+        readout_time, free = float(state.readout_time), self.freedom.readout_time
+        return RefinedMap(
+            points=np.where(refined[:, None], placed.points, prepared.start.points),
+            covariances=np.where(refined[:, None, None], covariances, np.nan),
+            refined=refined,
+            sights=sights,
+            camera=with_lens(replace(self.camera, readout_time=abs(readout_time)), state.lens),
+            readout_time=readout_time,
+            readout_time_deviation=math.sqrt(inflation * placed.shared[0, 0]) if free else math.nan,
+            deviation=deviation * math.sqrt(left_over(len(inliers), used)),
+            squared_errors=all_squared,
+            inliers=all_squared < (LIMIT * deviation) ** 2,
+            before=before,
+            after=deviation,
+            spline=placed.spline,
+            start_ns=prepared.start_ns,
+            times=prepared.times,
+        )
+
+
+def _freedoms(spline: Spline, frames: IntArray) -> int:
+    """How many numbers of the motion the images determine: a pose each, and an end."""
+    stretches = len(spline.layout.starts)
+    return CONTROL * min(len(np.unique(frames)) + stretches, len(spline.positions))

@@ -1,0 +1,102 @@
+"""What a map is refined from: keypoints of known landmarks, and a first guess of all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+
+# A part of the map hangs together with another by at least so many landmarks.
+_LEAST_IMAGES, _LEAST_SHARED = 3, 3
+# An image with fewer keypoints does not know where it is.
+LEAST_KEYPOINTS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Keypoints of g images.
+
+    Raises:
+        ValueError: for arrays that do not go together.
+    """
+
+    stamps_ns: IntArray  # (g,) ns, of the images' headers; rising
+    images: IntArray  # (n,) rows of ``stamps_ns``
+    landmarks: IntArray  # (n,) rows of ``Start.points``
+    pixels: Array  # (n,2) raw
+
+    def __post_init__(self) -> None:
+        count = len(self.images)
+        if self.landmarks.shape != (count,) or self.pixels.shape != (count, 2):
+            raise ValueError(
+                f"images (n,), landmarks (n,) and pixels (n,2) must be of one length, got "
+                f"{self.images.shape}, {self.landmarks.shape} and {self.pixels.shape}"
+            )
+        if not np.all(np.diff(self.stamps_ns) > 0):
+            raise ValueError("the images' stamps must rise")
+        if count and not 0 <= self.images.min() <= self.images.max() < len(self.stamps_ns):
+            raise ValueError("keypoints are of images without a stamp")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A first guess: a map and where each image was taken."""
+
+    points: Array  # (p,3) m, map frame
+    rotations: Array  # (g,3,3) map_from_camera, of the middle row or of the whole image
+    positions: Array  # (g,3) m, of the camera's centre in the map
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapFreedom:
+    """What is estimated beside landmarks and motion, and what is known of them."""
+
+    readout_time: bool = False
+    lens: bool = False
+    deviations: Array | None = None  # (p,) m, of the landmarks; infinite: not known at all
+    angular_acceleration: float = 20.0  # rad/s^2, of the motion at first
+    linear_acceleration: float = 10.0  # m/s^2
+
+
+def shared_landmarks(seen: Sightings) -> BoolArray:
+    """Which landmarks (up to the last one that is seen) two images or more see."""
+    pairs = np.unique(np.column_stack([seen.landmarks, seen.images]), axis=0)
+    return np.bincount(pairs[:, 0]) > 1
+
+
+def check(seen: Sightings, points: int) -> None:
+    """Raise ValueError when the images do not make one map of so many points, and say why."""
+    if len(seen.landmarks) and not 0 <= seen.landmarks.min() <= seen.landmarks.max() < points:
+        raise ValueError(f"keypoints are of landmarks that are not among the {points} of the map")
+    if len(seen.stamps_ns) < _LEAST_IMAGES:
+        raise ValueError(
+            f"{len(seen.stamps_ns)} images show the map, at least {_LEAST_IMAGES} are needed"
+        )
+    shared = shared_landmarks(seen) if len(seen.images) else np.zeros(0, np.bool_)
+    if not shared.any():
+        raise ValueError("no overlap: no landmark is seen by two images")
+    sizes = _parts(seen, shared[seen.landmarks])
+    if len(sizes) > 1:
+        listed = ", ".join(str(size) for size in sizes[:6]) + (", ..." if len(sizes) > 6 else "")
+        raise ValueError(
+            f"the images fall into {len(sizes)} parts that share fewer than {_LEAST_SHARED} "
+            f"landmarks (of {listed} images): refine each by itself, or record what joins them"
+        )
+
+
+def _parts(seen: Sightings, usable: BoolArray) -> list[int]:
+    """Numbers of images that hang together, largest first."""
+    images, landmarks = seen.images[usable], seen.landmarks[usable]
+    ones = np.ones(len(images))
+    sees = coo_array((ones, (images, landmarks))).tocsr()
+    sees.data[:] = 1.0
+    common = (sees @ sees.T).tocsr()
+    common.data = np.where(common.data >= _LEAST_SHARED, common.data, 0.0)
+    common.eliminate_zeros()
+    _, labels = connected_components(common, directed=False)
+    present = np.unique(images)
+    return sorted(np.unique(labels[present], return_counts=True)[1].tolist(), reverse=True)

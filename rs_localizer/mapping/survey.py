@@ -1,0 +1,182 @@
+"""Where markers are, from one recording that shows them: continuous-time adjustment with the poses
+of the markers free, each a rigid square of known size. The first marker is the origin; whatever
+shows several of them closes loops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.mapping.chaining import Chained, chain
+from rs_localizer.mapping.first_motion import (
+    ANGULAR_VELOCITY,
+    LINEAR_VELOCITY,
+    calm,
+    first_motion,
+)
+from rs_localizer.mapping.spotting import Spotted
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Marker
+from rs_localizer.trajectory.banded import Undetermined
+from rs_localizer.trajectory.bodies import BODY
+from rs_localizer.trajectory.fit import Fit, fit
+from rs_localizer.trajectory.model import Freedom, Observations, start_state
+from rs_localizer.trajectory.problem import Problem
+
+_LEAST_IMAGES = 5
+# Images that show a marker: fewer say hardly anything of it.
+_LEAST_SIGHTS = 3
+# The noise about the first guess is taken for at least and at most this (px).
+_FIRST_NOISE = 5.0, 50.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """Markers and what is known of their errors."""
+
+    markers: tuple[Marker, ...]  # in the frame of the first of them, the origin
+    covariances: Array  # (m,6,6) place (m) and turn (rad) along the map's axes; 0 of the origin
+    sights: tuple[int, ...]  # images of each
+    apart: tuple[tuple[Marker, ...], ...]  # not connected with these, part by part
+    rare: tuple[Marker, ...]  # connected, but too few images show them
+    images: int  # with a pose
+    fit: Fit
+
+    @property
+    def deviations(self) -> Array:
+        """Standard deviations (m,6)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2)))
+
+
+def survey(
+    camera: Camera, spotted: Sequence[Spotted], markers: Sequence[Marker],
+    *, origin: int | None = None, stamp_offset: float = 0.0,
+) -> Survey:  # fmt: skip
+    """Poses of the markers of a recording.
+
+    Args:
+        camera: its lens, scan direction and readout time (0: it is to be found).
+        spotted: images in the order of their stamps.
+        markers: all that may be there, by their sizes; where they are does not matter.
+        origin: place of the marker whose frame is the map's; None: the first one.
+        stamp_offset: s from a stamp to the first row's exposure.
+
+    Raises:
+        ValueError: when the images say too little, with what was found.
+    """
+    images = [one for one in spotted if len(one.markers)]
+    _check(images, markers, origin)
+    chained = chain(camera, images, markers, origin)
+    if len(chained.markers) < 2:
+        raise ValueError(
+            f"no image shows {markers[next(iter(chained.markers))].name} together with another "
+            "marker: there is nothing to survey"
+        )
+    try:
+        return _adjusted(camera, images, markers, chained, stamp_offset)
+    except Undetermined as error:
+        raise ValueError(f"the images do not determine the markers' poses: {error}") from error
+
+
+def _check(images: list[Spotted], markers: Sequence[Marker], origin: int | None) -> None:
+    if len(images) < _LEAST_IMAGES:
+        raise ValueError(
+            f"{len(images)} images show a whole marker, at least {_LEAST_IMAGES} are needed"
+        )
+    if origin is not None and not any(origin in one.markers for one in images):
+        raise ValueError(f"the origin, {markers[origin].name}, is in no image")
+
+
+def _adjusted(
+    camera: Camera, images: list[Spotted], markers: Sequence[Marker], chained: Chained,
+    stamp_offset: float,
+) -> Survey:  # fmt: skip
+    own = _often(images, chained)
+    seen, times = _observations(camera, images, markers, chained, own, stamp_offset)
+    rotations = np.array([pose.rotation for pose in chained.poses])
+    positions = np.array([pose.translation for pose in chained.poses])
+    spline = first_motion(times[chained.images], rotations, positions, camera.readout_time)
+    seen = seen.subset(spline.layout.inside(seen.times))
+    freedom = Freedom(
+        readout_time=not camera.readout_time > 0.0,
+        angular_velocity=ANGULAR_VELOCITY,
+        linear_velocity=LINEAR_VELOCITY,
+    )
+    start = start_state(camera, seen, spline, camera.readout_time)
+    # Where a chain ends far off, its errors are large and no outliers.
+    errors = np.sqrt(Problem(camera, seen, start, freedom).errors(start))
+    found = fit(camera, seen, start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)))
+    calmer = calm(found.state, freedom)
+    if calmer is not None:
+        found = fit(camera, seen, found.state, calmer, found.deviation)
+    corners = found.state.landmarks.reshape(-1, 4, 3)
+    placed = [
+        Marker(markers[m].family, markers[m].id, of) for m, of in zip(own, corners, strict=True)
+    ]
+    shared = len(found.border_covariance) - BODY * (len(own) - 1)
+    covariances = np.zeros((len(own), BODY, BODY))
+    for k in range(len(own) - 1):
+        at = slice(shared + BODY * k, shared + BODY * (k + 1))
+        covariances[k + 1] = found.border_covariance[at, at]
+    counts = np.bincount(seen.points[found.inliers] // 4, minlength=len(own)) // 4
+    known = [k for k in range(1, len(own)) if counts[k] >= _LEAST_SIGHTS]
+    order = [0, *sorted(known, key=lambda k: own[k])]
+    return Survey(
+        tuple(placed[k] for k in order),
+        covariances[order],
+        tuple(int(counts[k]) for k in order),
+        tuple(tuple(markers[m] for m in part) for part in chained.apart),
+        tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
+        len(chained.images),
+        found,
+    )
+
+
+def _often(images: list[Spotted], chained: Chained) -> list[int]:
+    """The origin first, then the other markers that enough images show."""
+    counts: dict[int, int] = dict.fromkeys(chained.markers, 0)
+    for k in chained.images:
+        for marker in images[k].markers.tolist():
+            if marker in counts:
+                counts[marker] += 1
+    origin, *others = chained.markers
+    return [origin, *(marker for marker in others if counts[marker] >= _LEAST_SIGHTS)]
+
+
+def _observations(
+    camera: Camera, images: list[Spotted], markers: Sequence[Marker], chained: Chained,
+    own: list[int], stamp_offset: float,
+) -> tuple[Observations, Array]:  # fmt: skip
+    """All corners, and the times (g,) of the images' middle rows since the first stamp."""
+    start_ns = images[0].stamp_ns
+    delay = stamp_offset - camera.readout_time * camera.first_row_time
+    times = np.array([(image.stamp_ns - start_ns) * 1e-9 for image in images]) + delay
+    place = {marker: k for k, marker in enumerate(own)}
+    frames, points, pixels = [], [], []
+    for k in chained.images:
+        for marker, quad in zip(images[k].markers.tolist(), images[k].quads, strict=True):
+            if marker in place:
+                frames.append(np.full(4, k))
+                points.append(4 * place[marker] + np.arange(4))
+                pixels.append(quad)
+    landmarks = np.concatenate([
+        Pose(chained.markers[m].translation, chained.markers[m].rotation)(markers[m].corners)
+        for m in own
+    ])  # fmt: skip
+    all_pixels, all_frames = np.concatenate(pixels), np.concatenate(frames)
+    seen = Observations(
+        times=times[all_frames],
+        row_times=camera.row_time(all_pixels),
+        pixels=all_pixels,
+        landmarks=landmarks,
+        points=np.concatenate(points),
+        frames=all_frames,
+        trusted=np.ones(len(all_frames), np.bool_),
+        bodies=np.repeat(np.arange(len(own)) - 1, 4),
+    )
+    return seen, times

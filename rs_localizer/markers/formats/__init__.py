@@ -1,0 +1,1 @@
+"""Marker maps of other programs: a format per file, read and written."""

@@ -1,0 +1,68 @@
+"""AprilTag fields of WPILib (FIRST Robotics): JSON.
+
+    {"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 2.0, "z": 1.5},
+                                 "rotation": {"quaternion": {"W": 1, "X": 0, "Y": 0, "Z": 0}}}}],
+     "field": {"length": 16.54, "width": 8.02}}
+
+Metres; z is up, x of a tag comes out of it toward the viewer, y is to the viewer's right. Sizes
+and family are not in the file.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.markers.entries import Entry
+from rs_localizer.markers.formats.common import (
+    Unsaid,
+    identifier,
+    quaternion,
+    rounded,
+    single_markers,
+    vector,
+)
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError
+from rs_localizer.markers.poses import Pose, rotation_of_quaternion
+from rs_localizer.markers.prints import Marker
+
+# Tag of WPILib from print: to the right is y, up z, out of the print x.
+_TAG_FROM_PRINT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
+    """The map of a parsed file; raises ValueError for anything else."""
+    if unsaid.size is None:
+        raise MarkerMapError(
+            "a field of WPILib does not say how large its tags are: give --size (m; 0.1651 of FRC)"
+        )
+    field = Entry(tree, "the field")
+    markers = []
+    for tag in field.entries("tags", "tag"):
+        number = identifier(tag, "ID")
+        pose = Entry(tag.take("pose", dict), f"{tag.where}: pose")
+        place = vector(Entry(pose.take("translation", dict), pose.where), "xyz")
+        turn = Entry(pose.take("rotation", dict), pose.where)
+        x, y, z, w = vector(Entry(turn.take("quaternion", dict), pose.where), "XYZW")
+        with tag.named():
+            rotation = rotation_of_quaternion([x, y, z, w]) @ _TAG_FROM_PRINT
+            markers.append(
+                Marker.at(unsaid.family.name, number, unsaid.size, Pose(place, rotation))
+            )
+    return MarkerMap(tuple(markers), map_frame=unsaid.map_frame)
+
+
+def write(marker_map: MarkerMap) -> str:
+    """The text of a file; the field is as large as its tags need, from the origin on."""
+    tags = []
+    for marker in single_markers(marker_map, "a field of WPILib"):
+        pose = marker.pose
+        x, y, z, w = quaternion(pose.rotation @ _TAG_FROM_PRINT.T)
+        place = dict(zip("xyz", rounded(pose.position), strict=True))
+        turn = {"quaternion": {"W": w, "X": x, "Y": y, "Z": z}}
+        tags.append({"ID": marker.id, "pose": {"translation": place, "rotation": turn}})
+    length, width = np.maximum(marker_map.points.max(axis=0), 0.0)[:2]
+    field = {"length": round(float(length), 6), "width": round(float(width), 6)}
+    return json.dumps({"tags": tags, "field": field}, indent=1) + "\n"

@@ -1,0 +1,81 @@
+"""Maps in another frame: what was wished holds, and nothing else changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.mapping.aligning import Wishes, alignment, moved, moved_markers
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Chessboard, Marker
+
+TURN = so3.exp(np.array([0.4, -0.7, 0.2]))
+
+
+def room() -> Map:
+    """Three landmarks on the floor of a turned room in units of 0.5 m, and more above it."""
+    rng = np.random.default_rng(0)
+    level = rng.uniform(0.2, 2.0, (20, 3))
+    level[:4, 2] = 0.0
+    covariances = np.tile(np.diag([1.0, 4.0, 9.0]) * 1e-4, (20, 1, 1))
+    points = (2.0 * level + [3.0, 1.0, 2.0]) @ TURN.T
+    return Map(points, np.arange(20), None, "map", covariances=covariances)
+
+
+def test_floor_size_and_origin() -> None:
+    wishes = Wishes(distance=(4, 9, 1.5), floor=(0, 1, 2, 3), origin=2)
+    found = moved(room(), alignment(room(), wishes))
+    np.testing.assert_allclose(found.points[:4, 2], 0.0, atol=1e-12)
+    assert np.all(found.points[4:, 2] > 0.0)
+    np.testing.assert_allclose(found.points[2], 0.0, atol=1e-12)
+    assert np.linalg.norm(found.points[4] - found.points[9]) == pytest.approx(1.5)
+    before = np.linalg.norm(room().points[:, None] - room().points, axis=2)
+    after = np.linalg.norm(found.points[:, None] - found.points, axis=2)
+    scale = after[4, 9] / before[4, 9]
+    np.testing.assert_allclose(after, scale * before, atol=1e-12)
+    assert found.covariances is not None
+    traces = np.trace(found.covariances, axis1=1, axis2=2)
+    np.testing.assert_allclose(traces, scale**2 * 14e-4)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 2.0), (0.0, 0.0, -1.0), (1.0, -2.0, 0.5)])
+def test_up(up: tuple[float, float, float]) -> None:
+    by = alignment(room(), Wishes(up=np.array(up)))
+    np.testing.assert_allclose(by.rotation @ up, [0.0, 0.0, np.linalg.norm(up)], atol=1e-12)
+    assert np.linalg.det(by.rotation) == pytest.approx(1.0)
+
+
+def test_markers() -> None:
+    known = np.array([0.001, 0.001, 0.001, 0.01, 0.01, 0.01])
+    hung = Marker.at("4x4_50", 3, 0.2, Pose(np.array([1.0, 2.0, 3.0]), TURN))
+    other = Marker.at("4x4_50", 5, 0.2, Pose(np.array([1.0, 2.0, 5.0])))
+    markers = MarkerMap((replace(hung, deviations=known), other))
+    by = alignment(markers, Wishes(scale=2.0, upright=3, origin=3))
+    found = moved_markers(markers, by).markers
+    np.testing.assert_allclose(found[0].pose.rotation[:, 1], [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(found[0].pose.position, 0.0, atol=1e-12)
+    assert [marker.size for marker in found] == pytest.approx([0.4, 0.4])
+    assert np.linalg.norm(found[1].pose.position) == pytest.approx(4.0)
+    np.testing.assert_allclose(found[0].deviations, known * [2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+
+
+def test_what_cannot_be_wished() -> None:
+    with pytest.raises(ValueError, match="the map has no landmark 77"):
+        alignment(room(), Wishes(origin=77))
+    with pytest.raises(ValueError, match="a floor needs at least 3 ids, got 2"):
+        alignment(room(), Wishes(floor=(0, 1)))
+    line = replace(room(), points=np.outer(np.arange(20.0), [1.0, 2.0, 3.0]))
+    with pytest.raises(ValueError, match="lie on a line"):
+        alignment(line, Wishes(floor=(0, 1, 2)))
+    with pytest.raises(ValueError, match="3 and 3 are at one place"):
+        alignment(room(), Wishes(distance=(3, 3, 1.0)))
+    with pytest.raises(ValueError, match="only markers stand upright"):
+        alignment(room(), Wishes(upright=3))
+    boards = MarkerMap(boards=(Chessboard(6, 4, 0.03),))
+    with pytest.raises(ValueError, match="boards cannot be scaled"):
+        moved_markers(boards, alignment(boards, Wishes(scale=2.0)))

@@ -1,0 +1,213 @@
+"""Refining maps: against dense algebra, and against the truth of an own projector."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import READOUT, Walk, camera, walk
+
+from rs_localizer.mapping.adjustment import MapProblem, MapStep
+from rs_localizer.mapping.gauge import similarity
+from rs_localizer.mapping.preparation import Preparation
+from rs_localizer.mapping.reduced import MapNormal, Reduced
+from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
+from rs_localizer.mapping.sightings import Sightings
+from rs_localizer.trajectory.model import Freedom, State, start_state
+from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
+
+VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
+
+
+def errors(found: RefinedMap, truth: Walk) -> np.ndarray:
+    """Of the refined landmarks (n,), m, but for position, orientation and size of the whole."""
+    ours, true = found.points[found.refined], truth.points[found.refined]
+    return np.linalg.norm(similarity(ours, true)(ours) - true, axis=1)
+
+
+def dense(normal: MapNormal) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and slope of motion, shared numbers and landmarks, from the rows themselves."""
+    rows, motion = normal.rows, normal.motion
+    controls, shared = motion.band.shape[1], len(motion.corner)
+    size, count = controls + shared, len(rows.precisions)
+    matrix = np.zeros((size + 3 * count,) * 2)
+    slope = np.zeros(size + 3 * count)
+    for d in range(len(motion.band)):
+        k = np.arange(controls - d)
+        matrix[k + d, k] = motion.band[d, : controls - d]
+    matrix[controls:size, :controls] = motion.cross.T
+    matrix[controls:size, controls:size] = np.tril(motion.corner)
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    matrix[:size, :size] += normal.held @ normal.held.T
+    slope[:controls], slope[controls:size] = motion.slope, motion.border_slope
+    slope[:size] += normal.held @ normal.held_error
+    for landmark in range(count):
+        at = slice(size + 3 * landmark, size + 3 * landmark + 3)
+        matrix[at, at] += rows.precisions[landmark] * np.eye(3)
+        slope[at] += rows.precisions[landmark] * rows.offsets[landmark]
+        for n in rows.order[rows.starts[landmark] : rows.starts[landmark + 1]]:
+            first = CONTROL * int(rows.first[n])
+            columns = [*range(first, first + LOCAL), *range(controls, size)]
+            by_rest, by_own = rows.values[n, :, : len(columns)], rows.values[n, :, -4:-1]
+            matrix[at, at] += by_own.T @ by_own
+            matrix[columns, at] += by_rest.T @ by_own
+            matrix[at, columns] += by_own.T @ by_rest
+            slope[at] += by_own.T @ rows.values[n, :, -1]
+    return matrix, slope
+
+
+def small_problem() -> tuple[MapProblem, State]:
+    rng = np.random.default_rng(0)
+    scene = walk(rng, np.array([0.0, 0.03, 0.06, 1.0, 2.0]), points=120, count=25)
+    prepared = Preparation(camera(), scene.seen, scene.start, MapFreedom(), 0.0)
+    seen = prepared.observations()
+    state = start_state(camera(), seen, prepared.spline, READOUT)
+    free = Freedom(lens=True, angular_velocity=2.0, linear_velocity=1.0)
+    problem = MapProblem(camera(), seen, state, free, prepared.deviations, floating=True)
+    return problem, state
+
+
+def test_the_elimination_solves_the_dense_system() -> None:
+    problem, state = small_problem()
+    normal = problem.normal(state, 5.0)[1]
+    matrix, slope = dense(normal)
+    step = Reduced(normal).step()
+    expected = -np.linalg.solve(matrix, slope)
+    found = np.concatenate([step[0], step[1], step[2].ravel()])
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+
+
+def test_covariances_are_those_of_the_dense_system() -> None:
+    problem, state = small_problem()
+    normal = problem.normal(state, 5.0)[1]
+    inverse = np.linalg.inv(dense(normal)[0])
+    of_landmarks, shared = Reduced(normal).covariances()
+    size = normal.motion.band.shape[1] + problem.motion.border
+    for k, covariance in enumerate(of_landmarks):
+        at = slice(size + 3 * k, size + 3 * k + 3)
+        np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-12)
+    at = slice(size - problem.motion.border, size)
+    np.testing.assert_allclose(shared, inverse[at, at], rtol=1e-5, atol=1e-12)
+
+
+def test_the_slope_is_the_derivative_of_the_cost() -> None:
+    rng = np.random.default_rng(2)
+    problem, state = small_problem()
+    cost, normal = problem.normal(state, 5.0)
+    slope = dense(normal)[1]
+    controls, shared = len(normal.motion.slope), problem.motion.border
+    direction = rng.normal(size=len(slope)) * 1e-6
+    costs = []
+    for sign in (-1.0, 1.0):
+        step = sign * direction
+        moved = problem.moved(
+            state,
+            normal,
+            MapStep(
+                step[:controls],
+                step[controls : controls + shared],
+                step[controls + shared :].reshape(-1, 3),
+            ),
+        )
+        costs.append(problem.normal(moved, 5.0)[0])
+    # Half the cost; noise moves with the flow, whose own derivative is left out.
+    assert 0.25 * (costs[1] - costs[0]) == pytest.approx(slope @ direction, rel=0.02)
+    assert cost > 0.0
+
+
+@pytest.fixture(scope="module")
+def video() -> Walk:
+    return walk(np.random.default_rng(3), VIDEO)
+
+
+def test_a_global_shutter_bends_the_map_and_the_rolling_one_does_not(video: Walk) -> None:
+    bent = refine(camera(0.0), video.seen, video.start, stamp_offset=0.5 * READOUT)
+    right = refine(camera(), video.seen, video.start)
+    assert np.median(errors(right, video)) < 0.3 * np.median(errors(bent, video))
+    assert right.after < 0.4 < bent.after
+    assert right.before > 2.0 * right.after
+    assert right.deviation == pytest.approx(0.3, rel=0.1)
+    assert np.mean(right.inliers) > 0.98
+
+
+def test_the_readout_time_is_found(video: Walk) -> None:
+    found = refine(
+        camera(0.02), video.seen, video.start, MapFreedom(readout_time=True),
+        stamp_offset=0.0,
+    )  # fmt: skip
+    assert found.readout_time_deviation < 3e-4
+    assert abs(found.readout_time - READOUT) < 4.0 * found.readout_time_deviation
+
+
+def test_the_map_as_a_whole_stays(video: Walk) -> None:
+    found = refine(camera(), video.seen, video.start)
+    ours, given = found.points[found.refined], video.start.points[found.refined]
+    whole = similarity(ours, given)
+    assert whole.scale == pytest.approx(1.0, abs=0.02)
+    assert np.linalg.norm(whole.translation) < 0.04
+
+
+def test_landmarks_of_known_place_hold_frame_and_size(video: Walk) -> None:
+    shrunk = replace(
+        video.start, points=0.8 * video.start.points, positions=0.8 * video.start.positions
+    )
+    deviations = np.full(len(video.points), np.inf)
+    often = np.argsort(-np.bincount(video.seen.landmarks, minlength=len(video.points)))[:10]
+    deviations[often] = 1e-4
+    points = shrunk.points.copy()
+    points[often] = video.points[often]
+    found = refine(
+        camera(), video.seen, replace(shrunk, points=points), MapFreedom(deviations=deviations)
+    )
+    off = found.points - video.points
+    spread = np.sqrt(np.trace(found.covariances, axis1=1, axis2=2))
+    near = found.refined & (spread < 2.0 * np.median(spread[found.refined]))
+    assert np.median(np.linalg.norm(off[near], axis=1)) < 0.02
+    squared = np.einsum(
+        "ni,nij,nj->n", off[near], np.linalg.inv(found.covariances[near]), off[near]
+    )
+    assert 0.3 < np.mean(squared) / 3.0 < 3.0
+
+
+def test_images_that_stand_alone() -> None:
+    scene = walk(np.random.default_rng(5), np.arange(0.0, 8.0, 0.5), points=100, off=0.1)
+    found = refine(camera(), scene.seen, scene.start)
+    assert len(found.spline.layout.starts) == 16
+    before = np.linalg.norm(scene.start.points - scene.points, axis=1)[found.refined]
+    assert np.median(errors(found, scene)) < 0.5 * np.median(before)
+    assert found.after < 0.35
+    with pytest.raises(ValueError, match="at least 20 images that follow each other"):
+        refine(camera(), scene.seen, scene.start, MapFreedom(readout_time=True))
+
+
+def shifted(seen: Sightings, by: int) -> Sightings:
+    """The second half of the images sees other landmarks."""
+    late = seen.images >= len(seen.stamps_ns) // 2
+    return replace(seen, landmarks=seen.landmarks + np.where(late, by, 0))
+
+
+def test_what_is_no_map_is_refused(video: Walk) -> None:
+    count = len(video.points)
+    twice = replace(video.start, points=np.concatenate([video.start.points] * 2))
+    with pytest.raises(ValueError, match=r"fall into 2 parts .* \(of 18, 18 images\)"):
+        refine(camera(), shifted(video.seen, count), twice)
+    own = replace(video.seen, landmarks=np.arange(len(video.seen.landmarks)))
+    many = replace(video.start, points=np.zeros((len(own.landmarks), 3)))
+    with pytest.raises(ValueError, match="no overlap: no landmark is seen by two images"):
+        refine(camera(), own, many)
+    with pytest.raises(ValueError, match="landmarks that are not among the 10"):
+        refine(camera(), video.seen, replace(video.start, points=np.zeros((10, 3))))
+    some = video.seen.images < 2
+    few = Sightings(
+        video.seen.stamps_ns[:2], video.seen.images[some], video.seen.landmarks[some],
+        video.seen.pixels[some],
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="2 images show the map, at least 3"):
+        refine(camera(), few, video.start)
+    one = np.full(count, np.inf)
+    one[0] = 0.001
+    with pytest.raises(ValueError, match="1 landmarks of known place do not hold a map"):
+        refine(camera(), video.seen, video.start, MapFreedom(deviations=one))
+    with pytest.raises(ValueError, match="stamps must rise"):
+        replace(video.seen, stamps_ns=video.seen.stamps_ns[::-1])

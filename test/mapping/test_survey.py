@@ -1,0 +1,96 @@
+"""Surveying markers of an own projector."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import READOUT, camera, ring, spot
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.mapping.spotting import Spotted, every_marker
+from rs_localizer.mapping.survey import Survey, survey
+from rs_localizer.markers.consistency import problems
+from rs_localizer.markers.families import family
+from rs_localizer.markers.maps import MarkerMap
+
+SIZE = 0.15
+STAMPS = np.arange(0.0, 3.0, 1.0 / 30.0)
+MARKERS = every_marker([family("4x4_50")], SIZE, {})
+
+Poses = list[tuple[np.ndarray, np.ndarray]]
+
+
+@pytest.fixture(scope="module")
+def poses() -> Poses:
+    return ring(np.random.default_rng(0), 5, SIZE)
+
+
+@pytest.fixture(scope="module")
+def spotted(poses: Poses) -> list[Spotted]:
+    return spot(np.random.default_rng(1), poses, SIZE, STAMPS)
+
+
+def check(found: Survey, poses: Poses, limit: float) -> None:
+    """Every coordinate within 4.5 deviations and a limit (m)."""
+    turn, origin = poses[found.markers[0].id]
+    for marker, deviations in zip(found.markers, found.deviations, strict=True):
+        own_turn, own_place = poses[marker.id]
+        off = marker.pose.position - turn.T @ (own_place - origin)
+        turned = Rotation.from_matrix(marker.pose.rotation @ (turn.T @ own_turn).T).as_rotvec()
+        assert np.all(np.abs(np.concatenate([off, turned])) <= 4.5 * deviations + 1e-9)
+        assert np.linalg.norm(off) < limit
+
+
+def test_markers_are_where_they_are(spotted: list[Spotted], poses: Poses) -> None:
+    found = survey(camera(), spotted, MARKERS)
+    assert [marker.id for marker in found.markers] == [0, 1, 2, 3, 4]
+    assert np.all(found.deviations[0] == 0.0)
+    assert np.all((found.deviations[1:, :3] > 1e-5) & (found.deviations[1:, :3] < 0.02))
+    check(found, poses, 0.03)
+    assert problems(MarkerMap(found.markers)) == []
+    assert found.apart == found.rare == ()
+    assert all(marker.size == pytest.approx(SIZE) for marker in found.markers)
+
+
+def test_another_origin_and_the_readout_time(spotted: list[Spotted], poses: Poses) -> None:
+    found = survey(camera(0.0), spotted, MARKERS, origin=2, stamp_offset=0.0)
+    assert found.markers[0].id == 2
+    np.testing.assert_allclose(found.markers[0].pose.position, 0.0, atol=1e-12)
+    deviation = found.fit.readout_time_deviation
+    assert abs(found.fit.state.readout_time - READOUT) < 4.0 * deviation < 4e-3
+    check(found, poses, 0.03)
+
+
+def only(spotted: list[Spotted], kept: list[set[int]]) -> list[Spotted]:
+    """Each image shows one of these sets of markers, in turn, as far as it does."""
+    parts = []
+    for k, one in enumerate(spotted):
+        shown = np.isin(one.markers, list(kept[k // 3 % len(kept)]))
+        parts.append(replace(one, markers=one.markers[shown], quads=one.quads[shown]))
+    return parts
+
+
+def test_what_does_not_hang_together_is_named(spotted: list[Spotted]) -> None:
+    found = survey(camera(), only(spotted, [{0, 1, 2}, {3, 4}]), MARKERS)
+    assert [marker.id for marker in found.markers] == [0, 1, 2]
+    assert [[marker.id for marker in part] for part in found.apart] == [[3, 4]]
+
+
+def test_what_says_nothing_is_refused(spotted: list[Spotted]) -> None:
+    with pytest.raises(ValueError, match="0 images show a whole marker, at least 5"):
+        survey(camera(), [], MARKERS)
+    with pytest.raises(ValueError, match=r"no image shows marker 4x4_50 \d together with another"):
+        survey(camera(), only(spotted, [{0}, {1}, {2}]), MARKERS)
+    with pytest.raises(ValueError, match="the origin, marker 4x4_50 40, is in no image"):
+        survey(camera(), spotted, MARKERS, origin=40)
+
+
+def test_a_wrong_size_is_a_wrong_scale(spotted: list[Spotted]) -> None:
+    right = survey(camera(), spotted, MARKERS)
+    twice = survey(camera(), spotted, every_marker([family("4x4_50")], 2.0 * SIZE, {}))
+    first, second = (
+        np.array([marker.pose.position for marker in found.markers]) for found in (right, twice)
+    )
+    np.testing.assert_allclose(second, 2.0 * first, atol=0.01)

@@ -1,0 +1,169 @@
+"""Marker maps of other programs: what their own files say, and there and back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.markers.formats.common import Unsaid
+from rs_localizer.markers.formats.files import FORMATS, OWN, read_any, write_any
+from rs_localizer.markers.maps import MarkerMap, MarkerMapError
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Chessboard, Marker
+
+SIZE = 0.16
+
+# At x = 1, 2 m up: faces along -x, so that its viewer looks along +x and has y to the left.
+FIELD = {
+    "tags": [{
+        "ID": 7,
+        "pose": {"translation": {"x": 1.0, "y": 0.0, "z": 2.0},
+                 "rotation": {"quaternion": {"W": 0.0, "X": 0.0, "Y": 0.0, "Z": 1.0}}},
+    }],
+    "field": {"length": 16.0, "width": 8.0},
+}  # fmt: skip
+BUNDLES = """
+standalone_tags: []
+tag_bundles:
+  [
+    {name: 'wall', layout: [
+      {id: 0, size: 0.16, x: 0.0, y: 0.0, z: 0.0, qw: 1.0, qx: 0.0, qy: 0.0, qz: 0.0},
+      {id: 3, size: 0.08, x: 0.5, qw: 0.7071068, qz: 0.7071068}]},
+  ]
+"""
+TAGSLAM = """
+bodies:
+ - lab:
+     is_static: true
+     default_tag_size: 0.12
+     pose: {position: {x: 1, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 1.5707963267948966}}
+     tags:
+     - {id: 4, pose: {position: {x: 2, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
+     - {id: 5, size: 0.2}
+ - rig: {is_static: false}
+"""
+
+
+def written(folder: Path, text: str, name: str = "map.yaml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_field_of_wpilib(tmp_path: Path) -> None:
+    path = written(tmp_path, json.dumps(FIELD), "field.json")
+    found, kind = read_any(path, Unsaid(size=SIZE))
+    (marker,) = found.markers
+    assert (kind, marker.id, marker.family.name) == ("wpilib", 7, "apriltag_36h11")
+    half = 0.5 * SIZE
+    top_left, top_right = [1.0, half, 2.0 + half], [1.0, -half, 2.0 + half]
+    np.testing.assert_allclose(marker.corners[:2], [top_left, top_right], atol=1e-12)
+    with pytest.raises(MarkerMapError, match="does not say how large its tags are: give --size"):
+        read_any(path)
+
+
+def test_bundles_of_apriltag_ros(tmp_path: Path) -> None:
+    found, kind = read_any(written(tmp_path, BUNDLES))
+    assert (kind, [marker.id for marker in found.markers]) == ("apriltag_ros", [0, 3])
+    # x to the right, y up: turned by a quarter, up is to the left.
+    np.testing.assert_allclose(found.markers[1].corners[0], [0.46, -0.04, 0.0], atol=1e-7)
+    two = BUNDLES.replace("  ]\n", "    {name: floor, layout: []},\n  ]\n")
+    with pytest.raises(MarkerMapError, match="2 bundles, each in a frame of its own"):
+        read_any(written(tmp_path, two))
+    assert len(read_any(written(tmp_path, two), Unsaid(part="wall"))[0].markers) == 2
+
+
+def test_bodies_of_tagslam(tmp_path: Path) -> None:
+    found, kind = read_any(written(tmp_path, TAGSLAM))
+    (marker,) = found.markers
+    assert (kind, marker.id) == ("tagslam", 4)
+    assert marker.size == pytest.approx(0.12)
+    np.testing.assert_allclose(marker.pose.position, [1.0, 2.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(marker.pose.rotation[:, 0], [0.0, 1.0, 0.0], atol=1e-12)
+
+
+def some_map() -> MarkerMap:
+    rng = np.random.default_rng(0)
+    markers = []
+    for number in range(5):
+        pose = Pose(rng.uniform(0.0, 3.0, 3), so3.exp(rng.normal(0.0, 1.0, 3)))
+        markers.append(Marker.at("apriltag_36h11", number, SIZE, pose))
+    return MarkerMap(tuple(markers))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_there_and_back(tmp_path: Path, name: str) -> None:
+    path = tmp_path / ("map.json" if name == "wpilib" else "map.yaml")
+    write_any(path, some_map(), name)
+    found, kind = read_any(path, Unsaid(size=SIZE))
+    assert kind == name
+    np.testing.assert_allclose(found.points, some_map().points, atol=1e-9)
+
+
+def test_deviations_of_a_survey_are_kept(tmp_path: Path) -> None:
+    known = np.array([0.001, 0.002, 0.0031, 0.01, 0.02, 0.03])
+    marker = Marker(some_map().markers[0].family, 0, some_map().markers[0].corners, known)
+    path = tmp_path / "map.yaml"
+    write_any(path, MarkerMap((marker,)), OWN)
+    (found,) = read_any(path)[0].markers
+    assert found.deviations is not None
+    np.testing.assert_allclose(found.deviations, known)
+    broken = path.read_text().replace("rotation_deviation: [0.01", "rotation_deviation: [-0.01")
+    with pytest.raises(MarkerMapError, match="deviations must not be negative"):
+        read_any(written(tmp_path, broken))
+
+
+def field(number: object, turn: str) -> str:
+    """A field of one tag."""
+    rotation = f'{{"quaternion": {turn}}}'
+    return (
+        f'{{"tags": [{{"ID": {number}, "pose": {{"translation": {{}}, "rotation": {rotation}}}}}]}}'
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{", "is not a JSON file"),
+        ("[]", "must hold a mapping"),
+        ("[" * 90 + "]" * 90, "nests deeper than 50"),
+        ('{"tags": [{"ID": "x"}]}', "tag 1: ID cannot be 'x'"),
+        ('{"tags": [{"ID": 3}]}', r"tag 1 \(id 3\) has no pose"),
+        (field(3, '{"W": 3}'), "must have the length 1, found 3"),
+        (field(900, '{"W": 1}'), "has the ids 0 to 586, found 900"),
+    ],
+)
+def test_broken_json(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(MarkerMapError, match=said):
+        read_any(written(tmp_path, text, "a.json"), Unsaid(size=SIZE))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: [", "is not a YAML file"),
+        ("a: 1", "is not a marker map of a known format .*: it has a"),
+        ("bodies: 3", "bodies cannot be 3"),
+        ("bodies: [{a: {tags: [{id: 1, pose: {}}]}}]", r"\(id 1\) has no size"),
+        ("bodies: []", "none of its static bodies has tags with a pose"),
+        ("standalone_tags: []", "standalone tags have no place"),
+        ("tag_bundles: [{layout: [{id: 1}]}]", "has no size"),
+        ("tag_bundles: [{layout: [{id: 1, size: -1}]}]", "size must be a length"),
+    ],
+)
+def test_broken_yaml(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(MarkerMapError, match=said):
+        read_any(written(tmp_path, text))
+
+
+def test_what_a_format_cannot_hold(tmp_path: Path) -> None:
+    board = MarkerMap(boards=(Chessboard(6, 4, 0.03),))
+    mixed = MarkerMap((*some_map().markers, Marker.at("4x4_50", 0, SIZE)))
+    with pytest.raises(MarkerMapError, match="a field of WPILib cannot hold boards"):
+        write_any(tmp_path / "a.json", board, "wpilib")
+    with pytest.raises(MarkerMapError, match="TagSLAM holds markers of one family, found 4x4 and"):
+        write_any(tmp_path / "a.yaml", mixed, "tagslam")
