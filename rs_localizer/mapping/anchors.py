@@ -19,6 +19,8 @@ from rs_localizer.markers.maps import MarkerMap
 
 # Corners of markers are where their map says to this part of their extent, or one of both is wrong.
 _MOST_MISFIT = 0.02
+# Corners that are further off than both, m and part of their extent, are off for a reason.
+_USUAL_MISFIT = 0.005, 0.002
 # Distances contradict each other when the scales that they ask for differ by more than this part.
 _MOST_CONTRADICTION = 0.03
 _LEAST_CORNERS = 4
@@ -87,6 +89,7 @@ class Placement:
     scaled: bool
     levelled: bool  # z is up by what was measured, and not only by how the camera was held
     told: str
+    doubt: str = ""  # why it may be wrong
 
 
 def place(anchors: Anchors, found: Triangulated, rotations: Array, positions: Array) -> Placement:
@@ -157,10 +160,15 @@ def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
             f"mm (rms) over {extent:.2f} m; check sizes and places in the marker map"
         )
     corners = int(np.count_nonzero(known))
-    return Placement(
-        similarity, True, True,
-        f"{corners} corners of markers, within {1e3 * misfit:.1f} mm (rms) of their map",
-    )  # fmt: skip
+    told = f"{corners} corners of markers, within {1e3 * misfit:.1f} mm (rms) of their map"
+    metres, part = _USUAL_MISFIT
+    doubt = ""
+    if misfit > max(metres, part * extent):
+        doubt = (
+            f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be the "
+            "landmarks: check sizes and places in the marker map, and the readout time"
+        )
+    return Placement(similarity, True, True, told, doubt)
 
 
 def _down(rotations: Array) -> Array:

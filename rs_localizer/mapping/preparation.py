@@ -87,15 +87,22 @@ class Preparation:
         )  # fmt: skip
 
     def _check_stretches(self) -> None:
-        """Images on their own tell turn and way per readout only, and not how long it takes."""
-        own = self.times[np.unique(self.seen.images[self.used])]
-        stretches = self.spline.layout.stretches(own)
-        longest = int(np.bincount(stretches).max())
-        if longest < _LEAST_STRETCH:
+        """Raise ValueError when the readout time cannot be found."""
+        if not self.tells_readout:
             raise ValueError(
                 f"the readout time is found from at least {_LEAST_STRETCH} images that follow each "
-                f"other within {LONGEST_GAP} s, found {longest}: give it, or more of the recording"
+                f"other within {LONGEST_GAP} s, found {self._longest()}: give it, or more of the recording"
             )
+
+    @property
+    def tells_readout(self) -> bool:
+        """Images on their own tell turn and way per readout only, and not how long it takes."""
+        return self._longest() >= _LEAST_STRETCH
+
+    def _longest(self) -> int:
+        """Images in the longest stretch."""
+        own = self.times[np.unique(self.seen.images[self.used])]
+        return int(np.bincount(self.spline.layout.stretches(own)).max())
 
     def observations(self) -> Observations:
         images, pixels = self.seen.images[self.used], self.seen.pixels[self.used]

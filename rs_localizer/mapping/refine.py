@@ -15,6 +15,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.mapping.adjustment import MapProblem, sights_of
+from rs_localizer.mapping.asked_readout import AskedReadout, asked_readout
 from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
 from rs_localizer.mapping.placing import place
 from rs_localizer.mapping.preparation import Preparation
@@ -45,6 +46,7 @@ class RefinedMap:
     camera: Camera  # with the readout time and the lens that were found
     readout_time: float  # s; negative: against the scan direction
     readout_time_deviation: float  # s; NaN where it was given
+    asked_readout: AskedReadout | None  # of a given one; None: the images do not tell, or found
     deviation: float  # px, of the noise of u and of v
     squared_errors: Array  # (n,) px^2, whitened; infinite for keypoints that took no part
     inliers: BoolArray  # (n,)
@@ -155,6 +157,7 @@ class _Refinement:
             camera=with_lens(replace(self.camera, readout_time=abs(readout_time)), state.lens),
             readout_time=readout_time,
             readout_time_deviation=math.sqrt(inflation * placed.shared[0, 0]) if free else math.nan,
+            asked_readout=self._asked(deviation),
             deviation=deviation * math.sqrt(left_over(len(inliers), used)),
             squared_errors=all_squared,
             inliers=all_squared < (LIMIT * deviation) ** 2,
@@ -164,6 +167,17 @@ class _Refinement:
             start_ns=prepared.start_ns,
             times=prepared.times,
         )
+
+    def _asked(self, deviation: float) -> AskedReadout | None:
+        """Whether a readout time that was given is the one of the images."""
+        given = self.camera.readout_time > 0.0 and not self.freedom.readout_time
+        if not given or not self.prepared.tells_readout:
+            return None
+        free = self._problem(replace(self.freedom, readout_time=True))
+        try:
+            return asked_readout(free, self.state, deviation)
+        except Undetermined:
+            return None
 
 
 def _freedoms(spline: Spline, frames: IntArray) -> int:

@@ -153,6 +153,11 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
             "warning: nothing tells the scale: poses and velocities are in units of the map; give "
             "--markers, or --point and --distance"
         )
+    asked = built.refined.asked_readout
+    if asked is not None and asked.differs:
+        print(f"warning: {asked.told}")
+    if built.placement.doubt:
+        print(f"warning: {built.placement.doubt}")
     out = shlex.quote(str(args.out))
     print(
         "next, for images of another walk: rs_localizer detect IMAGES --features sift --out seen "

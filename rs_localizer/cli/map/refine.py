@@ -150,6 +150,8 @@ def _tell(known: RecordedMap, found: RefinedMap) -> None:
         print(f"{name:26} {text}")
     if found.readout_time < 0.0:
         print("the readout time is negative: the scan direction is the reverse of what was set")
+    if found.asked_readout is not None and found.asked_readout.differs:
+        print(f"warning: {found.asked_readout.told}; see --shutter estimated")
 
 
 def _millimetres(lengths: Array) -> str:
