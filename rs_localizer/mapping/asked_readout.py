@@ -18,7 +18,7 @@ _DEVIATIONS, _LEAST = 6.0, 0.001
 
 @dataclass(frozen=True, slots=True)
 class AskedReadout:
-    """A readout time, one step of Newton's from the one that was given."""
+    """The readout time that keypoints ask for, beside the one that was given."""
 
     given: float  # s
     asked: float  # s; negative: against the scan direction

@@ -6,12 +6,13 @@ shows several of them closes loops.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.mapping.asked_readout import AskedReadout
 from rs_localizer.mapping.chaining import Chained, chain
 from rs_localizer.mapping.first_motion import (
     ANGULAR_VELOCITY,
@@ -33,6 +34,10 @@ _LEAST_IMAGES = 5
 _LEAST_SIGHTS = 3
 # The noise about the first guess is taken for at least and at most this (px).
 _FIRST_NOISE = 5.0, 50.0
+# px; an image of one marker has two numbers more than its pose.
+_LEAST_NOISE = 0.05
+# Share of the corners that fit where nothing is wrong: nearly all do.
+_LEAST_FIT = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +51,7 @@ class Survey:
     rare: tuple[Marker, ...]  # connected, but too few images show them
     images: int  # with a pose
     fit: Fit
+    asked_readout: AskedReadout | None = None  # where it was given
 
     @property
     def deviations(self) -> Array:
@@ -106,6 +112,7 @@ def _adjusted(
         readout_time=not camera.readout_time > 0.0,
         angular_velocity=ANGULAR_VELOCITY,
         linear_velocity=LINEAR_VELOCITY,
+        least_noise=_LEAST_NOISE,
     )
     start = start_state(camera, seen, spline, camera.readout_time)
     # Where a chain ends far off, its errors are large and no outliers.
@@ -114,6 +121,7 @@ def _adjusted(
     calmer = calm(found.state, freedom)
     if calmer is not None:
         found = fit(camera, seen, found.state, calmer, found.deviation)
+    _check_fit(found)
     corners = found.state.landmarks.reshape(-1, 4, 3)
     placed = [
         Marker(markers[m].family, markers[m].id, of) for m, of in zip(own, corners, strict=True)
@@ -134,7 +142,26 @@ def _adjusted(
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
         len(chained.images),
         found,
+        None if found.freedom.readout_time else _asked(camera, seen, found),
     )
+
+
+def _check_fit(found: Fit) -> None:
+    share = float(np.mean(found.inliers))
+    if share < _LEAST_FIT:
+        raise ValueError(
+            f"{100 * share:.0f} % of the corners fit the survey, {100 * _LEAST_FIT:.0f} % should: "
+            "check the readout time, the calibration, and that no id hangs twice"
+        )
+
+
+def _asked(camera: Camera, seen: Observations, found: Fit) -> AskedReadout:
+    """The readout time that the corners ask for where one was given."""
+    free = fit(
+        camera, seen, found.state, replace(found.freedom, readout_time=True), found.deviation
+    )
+    given = float(found.state.readout_time)
+    return AskedReadout(given, float(free.state.readout_time), free.readout_time_deviation)
 
 
 def _often(images: list[Spotted], chained: Chained) -> list[int]:

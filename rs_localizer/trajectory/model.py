@@ -51,6 +51,9 @@ class Freedom:
     # nothing is known of it.
     angular_velocity: float = math.inf  # rad/s
     linear_velocity: float = math.inf  # m/s
+    # The noise is at least this (px). Where images have hardly more keypoints than numbers of their
+    # own, a robust estimate rejects all but those it can run through, and ends at no noise at all.
+    least_noise: float = 1e-4  # recordings without noise are simulated
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,7 +31,6 @@ LIMIT = 6.0
 _SCALE_LIMIT = 4.0
 # Median of a squared error in two dimensions, in variances.
 _MEDIAN = 2.0 * np.log(2.0)
-_LEAST_DEVIATION = 1e-4  # px; recordings without noise are simulated
 _LOOSE_BODY = 100.0  # m, rad
 # Kernels and OpenCV leave the interpreter free for each other.
 _PARTS = 2
@@ -129,7 +128,7 @@ class Problem:
         near = squared[squared < (_SCALE_LIMIT * deviation) ** 2]
         if len(near) == 0:
             raise Undetermined("no keypoint agrees with the motion of the frames")
-        return max(float(np.sqrt(np.median(near) / _MEDIAN)), _LEAST_DEVIATION)
+        return max(float(np.sqrt(np.median(near) / _MEDIAN)), self.freedom.least_noise)
 
     def normal(self, state: State, deviation: float) -> tuple[float, Normal]:
         """Cost and normal equations."""

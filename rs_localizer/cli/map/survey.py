@@ -182,6 +182,8 @@ def _tell(found: Survey, images: int) -> None:
         turn = np.degrees(np.linalg.norm(deviations[3:]))
         name = marker.name.removeprefix("marker ")
         print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}")
+    if found.asked_readout is not None and found.asked_readout.differs:
+        print(f"warning: {found.asked_readout.told}; without one it is found")
     for part in found.apart:
         print(
             f"not connected: {_listed(part)}: no image shows one of them together with those above"
