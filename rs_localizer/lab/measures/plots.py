@@ -215,7 +215,9 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
         predicted: (n,2) where each method's pose puts them.
         title: what image it is.
     """
-    low, high = pixels.min(axis=0) - _RIM, pixels.max(axis=0) + _RIM
+    corner = np.array(image.shape[::-1]) - 0.5
+    low = np.maximum(pixels.min(axis=0) - _RIM, -0.5)
+    high = np.minimum(pixels.max(axis=0) + _RIM, corner)
     wide, tall = np.maximum(high - low, 1.0)
     # As high as the pictures are, side by side, with their titles: no band stays blank.
     height = float(np.clip(_WIDTH / len(predicted) * tall / wide, 1.0, _WIDTH)) + TITLES
