@@ -165,8 +165,8 @@ def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
     doubt = ""
     if misfit > max(metres, part * extent):
         doubt = (
-            f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be the "
-            "landmarks: check sizes and places in the marker map, and the readout time"
+            f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be "
+            "the landmarks: check sizes and places in the marker map, and the readout time"
         )
     return Placement(similarity, True, True, told, doubt)
 

@@ -59,4 +59,3 @@ def asked_readout(problem: MapProblem, state: State, deviation: float) -> AskedR
     variance = reduced.solve(unit, np.zeros((*state.landmarks.shape, 1)))[0][place, 0]
     given = float(state.readout_time)
     return AskedReadout(given, given + change, float(np.sqrt(variance)))
-

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.maps.colmap import medoid
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.mapping.anchors import Anchors, Placement, place
@@ -31,7 +31,6 @@ from rs_localizer.mapping.structure import Effort, Stage, Structure, build_struc
 from rs_localizer.mapping.tied import tied
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
 from rs_localizer.mapping.views import View
-from rs_localizer.trajectory.online import REVERSED
 
 # Settings of the localizer are in metres: so far (m) is the median landmark taken to be from where
 # it is seen, until it is known how far it is.
@@ -165,7 +164,7 @@ def build_map(given: Given, work: Workshop) -> Built:
     rotations, positions = motion.poses()
     return Built(
         landmarks=landmarks,
-        camera=_as_found(refined),
+        camera=refined.camera_as_found,
         placement=placement,
         keyframes=keyframes,
         structure=structure.moved(placement.similarity),
@@ -246,14 +245,6 @@ def _check_fit(refined: RefinedMap) -> None:
             f"{100 * _LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
             "check the readout time and the calibration"
         )
-
-
-def _as_found(refined: RefinedMap) -> Camera:
-    """The camera, with its scan direction reversed where the images say so."""
-    if refined.readout_time >= 0.0:
-        return refined.camera
-    direction = REVERSED[ScanDirection(refined.camera.scan_direction)]
-    return replace(refined.camera, scan_direction=direction)
 
 
 def _placement(given: Given, motion: Motion) -> Placement:

@@ -91,7 +91,8 @@ class Preparation:
         if not self.tells_readout:
             raise ValueError(
                 f"the readout time is found from at least {_LEAST_STRETCH} images that follow each "
-                f"other within {LONGEST_GAP} s, found {self._longest()}: give it, or more of the recording"
+                f"other within {LONGEST_GAP} s, found {self._longest()}: give it, or more "
+                "of the recording"
             )
 
     @property

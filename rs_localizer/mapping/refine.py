@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.camera import Camera
+from rs_localizer.core.camera import Camera, ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, sights_of
 from rs_localizer.mapping.asked_readout import AskedReadout, asked_readout
 from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
@@ -25,6 +25,7 @@ from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over
 from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, start_state
+from rs_localizer.trajectory.online import REVERSED
 from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
@@ -55,6 +56,14 @@ class RefinedMap:
     spline: Spline  # s since ``start_ns``
     start_ns: int
     times: Array  # (g,) s, of the images' middle rows
+
+    @property
+    def camera_as_found(self) -> Camera:
+        """The camera, its scan direction reversed where the readout time is negative."""
+        if self.readout_time >= 0.0:
+            return self.camera
+        direction = REVERSED[ScanDirection(self.camera.scan_direction)]
+        return replace(self.camera, scan_direction=direction)
 
     def poses(self) -> tuple[Array, Array]:
         """map_from_camera (g,3,3), (g,3) at the images' middle rows."""

@@ -128,6 +128,8 @@ def test_files_that_are_broken(
         (("--distance", "a", "b", "-1"), "must be two points and metres"),
         (("--distance", "a", "a", "1"), "must be two points and metres"),
         (("--point", "a", "0", "x", "3"), "must be a number"),
+        (("--point", "a", "0", "2", "3"), "says nothing without a --distance"),
+        (("--distance", "a", "b", "1", "--point", "a", "0", "2", "3"), "in two images or more"),
         (("--markers", "wall.yaml", "--point", "a", "0", "1", "2"), "give either --markers"),
     ],
 )
@@ -147,7 +149,9 @@ def test_a_point_after_the_end(
     tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images = written(tmp_path / "images", [picture(0)])
-    assert build(images, calibration, tmp_path / "map", "--point", "a", "5", "1", "2") == 2
+    points = [word for name in "ab" for s in "05" for word in ("--point", name, s, "1", "2")]
+    given = [*points, "--distance", "a", "b", "1"]
+    assert build(images, calibration, tmp_path / "map", *given) == 2
     assert "the images end before 5 s" in capsys.readouterr().err
     assert not (tmp_path / "map").exists()
 

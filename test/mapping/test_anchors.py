@@ -39,6 +39,14 @@ def test_markers_give_frame_and_scale() -> None:
     assert placement.scaled
     assert placement.levelled
     assert np.allclose(placement.similarity(back(WALL.points)), WALL.points)
+    assert placement.doubt == ""
+
+
+def test_markers_that_are_off_are_named() -> None:
+    points = WALL.points.copy()
+    points[:4] += [0.0, 0.02, 0.0]
+    placement = placed(Anchors(WALL), back(points))
+    assert "mm (rms) off their map" in placement.doubt
 
 
 def test_corners_that_are_not_seen_do_not_count() -> None:

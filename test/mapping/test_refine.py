@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scenes import READOUT, Walk, camera, walk
 
+from rs_localizer.core.camera import ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, MapStep
 from rs_localizer.mapping.gauge import similarity
 from rs_localizer.mapping.preparation import Preparation
@@ -138,6 +139,27 @@ def test_the_readout_time_is_found(video: Walk) -> None:
     )  # fmt: skip
     assert found.readout_time_deviation < 3e-4
     assert abs(found.readout_time - READOUT) < 4.0 * found.readout_time_deviation
+
+
+def test_a_wrong_readout_time_is_named(video: Walk) -> None:
+    right = refine(camera(), video.seen, video.start).asked_readout
+    assert right is not None
+    assert not right.differs
+    wrong = refine(camera(0.4 * READOUT), video.seen, video.start).asked_readout
+    assert wrong is not None
+    assert wrong.differs
+    # One step brings it most of the way.
+    assert abs(wrong.asked - READOUT) < 0.3 * READOUT
+    assert f"{0.4e3 * READOUT:.1f} ms was given" in wrong.told
+
+
+def test_the_reverse_scan_direction_is_found(video: Walk) -> None:
+    reverse = replace(camera(0.0), scan_direction=ScanDirection.BOTTOM_TO_TOP)
+    found = refine(reverse, video.seen, video.start, MapFreedom(readout_time=True))
+    assert found.readout_time == pytest.approx(-READOUT, abs=2e-3)
+    as_found = found.camera_as_found
+    assert as_found.scan_direction == ScanDirection.TOP_TO_BOTTOM
+    assert as_found.readout_time == pytest.approx(READOUT, abs=2e-3)
 
 
 def test_the_map_as_a_whole_stays(video: Walk) -> None:

@@ -94,3 +94,31 @@ def test_a_wrong_size_is_a_wrong_scale(spotted: list[Spotted]) -> None:
         np.array([marker.pose.position for marker in found.markers]) for found in (right, twice)
     )
     np.testing.assert_allclose(second, 2.0 * first, atol=0.01)
+
+
+def test_images_of_one_marker_do_not_hide_the_noise(spotted: list[Spotted], poses: Poses) -> None:
+    """All but every tenth image show one marker: two numbers more than a pose."""
+    few = []
+    for k, one in enumerate(spotted):
+        count = len(one.markers) if k % 10 == 0 else 1
+        few.append(replace(one, markers=one.markers[:count], quads=one.quads[:count]))
+    found = survey(camera(), few, MARKERS)
+    assert found.fit.deviation >= 0.05
+    assert np.mean(found.fit.inliers) > 0.95
+    check(found, poses, 0.1)
+
+
+def test_a_wrong_readout_time_is_named(spotted: list[Spotted]) -> None:
+    right = survey(camera(), spotted, MARKERS).asked_readout
+    assert right is not None
+    assert not right.differs
+    wrong = survey(camera(0.7 * READOUT), spotted, MARKERS).asked_readout
+    assert wrong is not None
+    assert wrong.differs
+    assert wrong.asked == pytest.approx(READOUT, abs=3e-3)
+    assert survey(camera(0.0), spotted, MARKERS).asked_readout is None
+
+
+def test_a_survey_that_few_corners_fit_is_refused(spotted: list[Spotted]) -> None:
+    with pytest.raises(ValueError, match=r"% of the corners fit .* check the readout time"):
+        survey(camera(0.3 * READOUT), spotted, MARKERS)

@@ -93,6 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     if args.markers is not None and (args.point or args.distance):
         raise UsageError("give either --markers or --point and --distance")
+    _check_points(args)
     require()
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
@@ -105,6 +106,19 @@ def run(args: argparse.Namespace) -> None:
         built = _build(args, looked, shutter, markers)
         _write(args.out, built, looked)
     _tell(args, built, looked)
+
+
+def _check_points(args: argparse.Namespace) -> None:
+    """Before minutes of work: that each point of a distance is given in two images."""
+    given = [name for name, *_ in args.point]
+    if given and not args.distance:
+        raise UsageError("--point says nothing without a --distance")
+    for name in (end for distance in args.distance for end in (distance.one, distance.other)):
+        if given.count(name) < 2:
+            raise UsageError(
+                f"--distance: the point {name} must be given by --point in two images or more, "
+                f"it is in {given.count(name)}"
+            )
 
 
 def _marker_map(path: Path) -> MarkerMap:
