@@ -167,3 +167,9 @@ def test_what_a_format_cannot_hold(tmp_path: Path) -> None:
         write_any(tmp_path / "a.json", board, "wpilib")
     with pytest.raises(MarkerMapError, match="TagSLAM holds markers of one family, found 4x4 and"):
         write_any(tmp_path / "a.yaml", mixed, "tagslam")
+
+
+def test_wpilib_has_one_size(tmp_path: Path) -> None:
+    markers = [Marker.at("apriltag_36h11", id_, 0.1 * id_, Pose()) for id_ in (1, 2)]
+    with pytest.raises(MarkerMapError, match=r"tags of one size, found 0\.1 to 0\.2 m"):
+        write_any(tmp_path / "field.json", MarkerMap(tuple(markers)), "wpilib")

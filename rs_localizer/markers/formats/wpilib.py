@@ -31,6 +31,9 @@ from rs_localizer.markers.prints import Marker
 # Tag of WPILib from print: to the right is y, up z, out of the print x.
 _TAG_FROM_PRINT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
+# The file does not say sizes: all are the same to this part.
+_SAME_SIZE = 1e-3
+
 
 def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
     """The map of a parsed file; raises ValueError for anything else."""
@@ -57,7 +60,13 @@ def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
 def write(marker_map: MarkerMap) -> str:
     """The text of a file; the field is as large as its tags need, from the origin on."""
     tags = []
-    for marker in single_markers(marker_map, "a field of WPILib"):
+    markers = single_markers(marker_map, "a field of WPILib")
+    sizes = sorted({rounded([marker.size])[0] for marker in markers})
+    if sizes and sizes[-1] > sizes[0] * (1.0 + _SAME_SIZE):
+        raise MarkerMapError(
+            f"a field of WPILib holds tags of one size, found {sizes[0]:g} to {sizes[-1]:g} m"
+        )
+    for marker in markers:
         pose = marker.pose
         x, y, z, w = quaternion(pose.rotation @ _TAG_FROM_PRINT.T)
         place = dict(zip("xyz", rounded(pose.position), strict=True))
