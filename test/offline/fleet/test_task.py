@@ -161,6 +161,16 @@ def test_the_first_one_compiles_alone(tmp_path: Path, cache: Path) -> None:
         pass
 
 
+def test_another_compiler_has_kernels_of_its_own(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for version in ("0.60.0", "0.61.0", "0.61.0"):
+        monkeypatch.setattr(first.numba, "__version__", version)
+        with first.alone_until_compiled("k"):
+            pass
+    assert len(list((cache / "fleet").glob("*.lock"))) == 2
+
+
 def test_a_first_one_that_fails_leaves_the_next_one_first(tmp_path: Path, cache: Path) -> None:
     def marks() -> list[Path]:
         return [file for file in (cache / "fleet").iterdir() if file.suffix != ".lock"]
