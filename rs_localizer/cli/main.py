@@ -81,8 +81,8 @@ COMMANDS = {
     ),
     "map": Command(
         "rs_localizer.cli.map",
-        "what a map of landmarks holds; one file from another: COLMAP, PLY, NPZ",
-        "rs_localizer map convert sparse/0 map.npz",
+        "make a map of a room or of markers, refine, align and convert it, say what it holds",
+        "rs_localizer map build walk.mp4 --calibration lens.yaml --rate 30 --out room",
     ),
     "watch": Command(
         "rs_localizer.cli.watch",

@@ -215,13 +215,17 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
         predicted: (n,2) where each method's pose puts them.
         title: what image it is.
     """
-    low, high = pixels.min(axis=0) - _RIM, pixels.max(axis=0) + _RIM
+    longest = max(float(np.linalg.norm(pixels - seen, axis=1).max()) for seen in predicted.values())
+    magnification = _round_down(_RIM / longest) if longest > 0.0 else 1.0
+    tips = np.vstack([seen + magnification * (pixels - seen) for seen in predicted.values()])
+    # Beyond the image only as far as arrows reach.
+    corner = np.array(image.shape[::-1]) - 0.5
+    low = np.minimum(np.maximum(pixels.min(axis=0) - _RIM, -0.5), tips.min(axis=0))
+    high = np.maximum(np.minimum(pixels.max(axis=0) + _RIM, corner), tips.max(axis=0))
     wide, tall = np.maximum(high - low, 1.0)
     # As high as the pictures are, side by side, with their titles: no band stays blank.
     height = float(np.clip(_WIDTH / len(predicted) * tall / wide, 1.0, _WIDTH)) + TITLES
     figure = new_figure(f"{title}: from where the pose puts points to where they are seen", height)
-    longest = max(float(np.linalg.norm(pixels - seen, axis=1).max()) for seen in predicted.values())
-    magnification = _round_down(_RIM / longest) if longest > 0.0 else 1.0
     panels = figure.subplots(1, len(predicted), squeeze=False)[0]
     for axes, (name, style), seen in zip(
         panels, methods(predicted), predicted.values(), strict=True

@@ -12,9 +12,9 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.refine import apply_step
-from rs_localizer.lab.experiments import bound, robustness, tracking
+from rs_localizer.lab.experiments import bound, tracking
 from rs_localizer.lab.experiments.results import Verdict
-from rs_localizer.lab.experiments.robustness import Case
+from rs_localizer.lab.experiments.robustness_cases import Case, camera_of, view_of
 from rs_localizer.lab.experiments.trials import Setting, draw_trials
 from rs_localizer.lab.experiments.views import (
     NO_POSE,
@@ -158,7 +158,7 @@ def test_gross_errors_and_those_that_hide() -> None:
     ],
 )
 def test_the_scenes_of_robustness(case: Case, bad: float) -> None:
-    one = robustness._view(case, robustness._camera(45.0), np.random.default_rng(0))
+    one = view_of(case, camera_of(45.0), np.random.default_rng(0))
     assert np.mean(~one.inliers) == pytest.approx(bad)
     # About the points: far from the origin the projection is not exact enough to settle.
     centre = one.points.mean(axis=0)
@@ -175,7 +175,7 @@ def test_the_scenes_of_robustness(case: Case, bad: float) -> None:
 
 def test_the_second_object_is_rigid_too() -> None:
     case = Case("a", "", second=0.3)
-    one = robustness._view(case, robustness._camera(45.0), np.random.default_rng(0))
+    one = view_of(case, camera_of(45.0), np.random.default_rng(0))
     flipped = dataclasses.replace(one, inliers=~one.inliers)
     from rs_localizer.localizer import Localizer
 
