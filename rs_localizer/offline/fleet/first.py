@@ -12,7 +12,7 @@ import hashlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numba
 from llvmlite import binding
@@ -45,7 +45,8 @@ def alone_until_compiled(kernels: str) -> Iterator[bool]:
 
 
 def _name(kernels: str) -> str:
-    cpu = numba.config.CPU_NAME or binding.get_host_cpu_name()
+    config: Any = numba.config
+    cpu = config.CPU_NAME or binding.get_host_cpu_name()
     # Numba takes no machine code of another version of itself or of Python.
     compiler = f"{numba.__version__} {sys.implementation.cache_tag}"
     said = f"{program()} {kernels} {compiler} {cpu}"
