@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import re
 from collections.abc import Iterator
-from types import ModuleType
 from typing import Any
 
 import pages
@@ -17,6 +15,7 @@ from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.node.health import State
 from rs_localizer.settings import Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
 
@@ -112,50 +111,11 @@ def test_every_notice_is_explained_and_given_somewhere() -> None:
     assert given == {notice.name for notice in Notice}
 
 
-def states(node: str) -> set[str]:
-    """What a node's functions return beside a level, as far as it is written there."""
-    found = set()
-    for path in sorted((PACKAGE / "ros").glob("*/health.py")):
-        if path.parent.name in (node, "node"):
-            module = importlib.import_module(f"rs_localizer.ros.{path.parent.name}.health")
-            for item in ast.walk(ast.parse(path.read_text())):
-                match item:
-                    case ast.Return(ast.Tuple([ast.Attribute() | ast.Name(), state, _])):
-                        found.add(spelled(state, module))
-    return found - {""}
-
-
-def spelled(node: ast.AST, module: ModuleType) -> str:
-    """A text of the code: as it stands, by its name, or put together."""
-    match node:
-        case ast.Constant(str(text)):
-            return text
-        case ast.Name(name):
-            return str(getattr(module, name, ""))
-        case ast.JoinedStr(values):
-            return "".join(spelled(value, module) for value in values)
-        case ast.FormattedValue(value):
-            return spelled(value, module)
-    return ""
-
-
-@pytest.mark.parametrize(
-    ("node", "heading"),
-    [
-        ("localizer", "## States of the localizer"),
-        ("detector", "## States of the detectors"),
-    ],
-)
-def test_every_state_is_explained(node: str, heading: str) -> None:
-    page = pages.text("docs/reasons.md").split(heading)[1].split("\n## ")[0]
-    rows = [line.split("|")[2] for line in page.splitlines() if line.startswith("| ")][1:]
-    said = {name.split(" for")[0] for cell in rows for name in pages.names_in(cell)}
-    told = {name.split(" for")[0] for name in states(node)}
-    assert len(told) >= 4
-    assert told <= said
-    # The others are variables there: a pose was tracked or not, something is waited for.
-    code = (PACKAGE / "ros" / node / "health.py").read_text().lower()
-    assert {name for name in said - told if name not in code} == set()
+def test_every_state_is_explained() -> None:
+    page = pages.text("docs/reasons.md").split("## States of the localizer")[1]
+    rows = [line.split("|")[2] for line in page.splitlines() if line.startswith("| ")]
+    said = {name.partition(" for ")[0] for cell in rows for name in pages.names_in(cell)}
+    assert said == {state.removesuffix(" for") for state in State}
 
 
 def test_commands_are_all_told_of() -> None:

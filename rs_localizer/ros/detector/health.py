@@ -8,10 +8,10 @@ from typing import Protocol
 
 from rs_localizer.ros.node.health import (
     SOME,
-    WAITING,
     Health,
     Judgement,
     Level,
+    State,
     lost_on_the_way,
     milliseconds,
     out_of_service,
@@ -49,9 +49,9 @@ class Condition:
 
 def diagnose(condition: Condition, summary: Summary[Sight]) -> Health:
     """Judge the node: ``inactive``, ``idle``, ``waiting for images`` or ``detecting``."""
-    level, state, message = _judge(condition, summary)
+    judgement = _judge(condition, summary)
     values = {
-        "State": state,
+        "State": judgement.state_in_words,
         "Images in (Hz)": f"{summary.rate_in:.1f}",
         "Images done (Hz)": f"{summary.rate_out:.1f}",
         **milliseconds("Latency", summary.latency),
@@ -65,32 +65,34 @@ def diagnose(condition: Condition, summary: Summary[Sight]) -> Health:
         "Images refused": str(summary.refused),
     }
     values |= refused(summary)
-    return Health(level, state, message, values)
+    return Health(judgement.level, judgement.state, judgement.message, values)
 
 
 def _judge(condition: Condition, summary: Summary[Sight]) -> Judgement:
     if (idle := out_of_service(condition.life_cycle)) is not None:
         return idle
     if not condition.wanted:
-        return Level.OK, "idle", f"nobody listens to the {condition.output} or the debug image"
+        message = f"nobody listens to the {condition.output} or the debug image"
+        return Judgement(Level.OK, State.IDLE, message)
     causes = [f"{item.topic}: {item.cause}" for item in condition.silence.values() if item.cause]
     if causes or not condition.silence:
-        state = f"{WAITING} images"
-        return Level.WARN, state, "; ".join([state, *causes])
+        message = "; ".join([f"{State.WAITING} images", *causes])
+        return Judgement(Level.WARN, State.WAITING, message, "images")
     bad = sum(summary.recently_refused.values())
     if bad > SOME * summary.recently_received:
         reasons = ", ".join(sorted(summary.recently_refused))
         message = f"{bad} images were refused in the last {WINDOW:.0f} s: {reasons}"
-        return Level.WARN, "detecting", message
+        return Judgement(Level.WARN, State.DETECTING, message)
     if summary.recently_replaced > SOME * summary.recently_received:
         message = (
             f"{summary.recently_replaced} images came while another was looked at in the last "
             f"{WINDOW:.0f} s"
         )
-        return Level.WARN, "detecting", message
+        return Judgement(Level.WARN, State.DETECTING, message)
     if summary.recently_missing > SOME * summary.recently_received:
-        return Level.WARN, "detecting", lost_on_the_way(summary)
+        return Judgement(Level.WARN, State.DETECTING, lost_on_the_way(summary))
     if condition.oddities:
-        return Level.WARN, "detecting", told(condition.oddities)
+        return Judgement(Level.WARN, State.DETECTING, told(condition.oddities))
     last = summary.last
-    return Level.OK, "detecting", "no image has been looked at yet" if last is None else last.text
+    message = "no image has been looked at yet" if last is None else last.text
+    return Judgement(Level.OK, State.DETECTING, message)

@@ -10,13 +10,11 @@ from rs_localizer.pipeline.inputs import INPUTS, Role
 from rs_localizer.ros.localizer.answers import Answer
 from rs_localizer.ros.localizer.imu_health import imu_values
 from rs_localizer.ros.node.health import (
-    COMPILING,
-    LOST,
     SOME,
-    WAITING,
     Health,
     Judgement,
     Level,
+    State,
     lost_on_the_way,
     milliseconds,
     out_of_service,
@@ -74,17 +72,20 @@ def diagnose(condition: Condition, summary: Summary[Answer]) -> Health:
     ``busy``, ``lost``, ``localized`` (by a search) and ``tracking``. What is odd is a warning where
     nothing worse is to be said.
     """
-    level, state, message = _judge(condition, summary)
-    return Health(level, state, message, {"State": state} | _values(condition, summary))
+    judgement = _judge(condition, summary)
+    values = {"State": judgement.state_in_words} | _values(condition, summary)
+    return Health(judgement.level, judgement.state, judgement.message, values)
 
 
 def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
     if (idle := out_of_service(condition.life_cycle)) is not None:
         return idle
     if condition.changing:
-        return Level.WARN, COMPILING, "the kernels for the new settings are being compiled"
+        message = "the kernels for the new settings are being compiled"
+        return Judgement(Level.WARN, State.COMPILING, message)
     if summary.busy is not None and summary.busy > _LONG_WORK:
-        return Level.WARN, "busy", f"a frame has been worked on for {summary.busy:.1f} s"
+        message = f"a frame has been worked on for {summary.busy:.1f} s"
+        return Judgement(Level.WARN, State.BUSY, message)
     silent = _silent_frames(condition)
     if condition.missing:
         level = Level.WARN if silent else Level.ERROR
@@ -95,8 +96,8 @@ def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
                 causes.append(f"{count} came and cannot be used: {reason} in the log says why")
         if any(item.mismatch for item in condition.silence.values()):
             level = Level.ERROR
-        state = f"{WAITING} {what}"
-        return level, state, "; ".join([state, *causes])
+        message = "; ".join([f"{State.WAITING} {what}", *causes])
+        return Judgement(level, State.WAITING, message, what)
     if silent is not None:
         return silent
     return _judge_frames(summary, condition.oddities)
@@ -114,30 +115,35 @@ def _silent_frames(condition: Condition) -> Judgement | None:
     else:
         level = Level.STALE if latest.heard else Level.WARN
     since = f" for {latest.seconds:.0f} s" if latest.heard else ""
-    return level, f"{WAITING} frames", "; ".join([f"no frame has come{since}", *causes])
+    message = "; ".join([f"no frame has come{since}", *causes])
+    return Judgement(level, State.WAITING, message, "frames")
 
 
 def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Judgement:
     last = summary.last
     if last is None or summary.refused_since_answer >= _LOST:
         if summary.refused_since_answer == 0:
-            return Level.WARN, f"{WAITING} frames", "no frame has been localized yet"
+            message = "no frame has been localized yet"
+            return Judgement(Level.WARN, State.WAITING, message, "frames")
         message = f"the last {summary.refused_since_answer} frames gave no pose"
         if reasons := summary.recently_refused:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
-        return Level.ERROR, LOST, "; ".join(filter(None, [message, told(oddities)]))
-    state = "tracking" if last.tracked else "localized"
+        message = "; ".join(filter(None, [message, told(oddities)]))
+        return Judgement(Level.ERROR, State.LOST, message)
+    state = State.TRACKING if last.tracked else State.LOCALIZED
     bad, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
     if bad > SOME * summary.recently_received:
-        return Level.WARN, state, f"{bad} frames were refused in the last {WINDOW:.0f} s"
+        message = f"{bad} frames were refused in the last {WINDOW:.0f} s"
+        return Judgement(Level.WARN, state, message)
     if replaced > SOME * summary.recently_received:
         message = f"{replaced} frames came while another was localized in the last {WINDOW:.0f} s"
-        return Level.WARN, state, message
+        return Judgement(Level.WARN, state, message)
     if summary.recently_missing > SOME * summary.recently_received:
-        return Level.WARN, state, lost_on_the_way(summary)
+        return Judgement(Level.WARN, state, lost_on_the_way(summary))
     if oddities:
-        return Level.WARN, state, told(oddities)
-    return Level.OK, state, f"{state} with {last.inliers} of {last.points} points"
+        return Judgement(Level.WARN, state, told(oddities))
+    message = f"{state} with {last.inliers} of {last.points} points"
+    return Judgement(Level.OK, state, message)
 
 
 def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:

@@ -9,7 +9,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from rs_localizer.io.topics import DIAGNOSTICS
-from rs_localizer.ros.node.health import INACTIVE, LOST, WAITING, Health, Level
+from rs_localizer.ros.node.health import Health, Level, State
 
 _PERIOD = 1.0  # s
 # The same state for so many periods is worth a line in the log.
@@ -40,7 +40,7 @@ class Diagnostics:
         self._examine = examine
         self._notice = notice
         self._lack = lack
-        self._state: tuple[Level, str] | None = None
+        self._state: tuple[Level, State] | None = None
         self._periods = 0
         # As diagnostic_updater in C++: with the namespace and without the first slash.
         self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {task}"
@@ -69,8 +69,8 @@ class Diagnostics:
         state = health.level, health.state
         self._periods = self._periods + 1 if state == self._state else 1
         self._state = state
-        if health.level != Level.OK and health.state != INACTIVE and self._worth_a_line():
-            lacking = health.state.startswith(WAITING) or health.state == LOST
+        if health.level != Level.OK and health.state is not State.INACTIVE and self._worth_a_line():
+            lacking = health.state in (State.WAITING, State.LOST)
             self._notice(self._lack if lacking else health.state, health.message)
 
     def _worth_a_line(self) -> bool:

@@ -4,18 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum
-from typing import Any
+from enum import IntEnum, StrEnum
+from typing import Any, NamedTuple
 
 from rs_localizer.ros.node.statistics import WINDOW, Percentiles, Summary
 
 SOME = 0.05
 """Share of the messages that may be refused, replaced or lost before it is worth a warning."""
 
-COMPILING = "compiling"
-INACTIVE = "inactive"
-WAITING = "waiting for"
-LOST = "lost"
+
+class State(StrEnum):
+    """Of nodes: THE list; docs/reasons.md says what each means and what to do."""
+
+    COMPILING = "compiling"
+    INACTIVE = "inactive"
+    WAITING = "waiting for"  # what, is the subject
+    # Of the localizer.
+    BUSY = "busy"
+    LOST = "lost"
+    LOCALIZED = "localized"
+    TRACKING = "tracking"
+    # Of nodes that look at images.
+    IDLE = "idle"
+    DETECTING = "detecting"
+
 
 # What a node that is not active needs, by the label of its state.
 _STEPS = {"unconfigured": "configure and activate it", "finalized": "start it again"}
@@ -35,24 +47,36 @@ class Health:
     """A diagnosis."""
 
     level: Level
-    state: str
+    state: State
     message: str
     values: dict[str, str]
 
 
-Judgement = tuple[Level, str, str]
-"""Level, state, message."""
+class Judgement(NamedTuple):
+    """What to say first."""
+
+    level: Level
+    state: State
+    message: str
+    subject: str = ""  # of the state
+
+    @property
+    def state_in_words(self) -> str:
+        """The state with its subject."""
+        return f"{self.state} {self.subject}".strip()
 
 
 def out_of_service(life_cycle: str) -> Judgement | None:
     """What to say of a node that is not active, by the label of its state; None if it is."""
     if life_cycle == "configuring":
-        return Level.WARN, COMPILING, "the node is being configured: kernels are compiled"
+        return Judgement(
+            Level.WARN, State.COMPILING, "the node is being configured: kernels are compiled"
+        )
     if life_cycle == "active":
         return None
     # Somebody wants it so: no fault, which an aggregator would make of STALE.
     steps = _STEPS.get(life_cycle, "activate it")
-    return Level.OK, INACTIVE, f"the node is {life_cycle}: {steps}"
+    return Judgement(Level.OK, State.INACTIVE, f"the node is {life_cycle}: {steps}")
 
 
 def told(oddities: Mapping[str, str]) -> str:

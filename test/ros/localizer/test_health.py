@@ -265,7 +265,7 @@ def test_what_is_missing_comes_first(
 ) -> None:
     world.pass_frames(3, rate=50.0)
     health = world.diagnose(replace(GOOD, **change))
-    assert (health.level, health.state) == (level, state)
+    assert (health.level, health.values["State"]) == (level, state)
     assert health.message.startswith(message)
 
 
@@ -285,7 +285,7 @@ def test_a_frame_that_takes_long(world: World) -> None:
     assert (health.level, health.state) == (Level.WARN, "busy")
     assert health.message == "a frame has been worked on for 3.0 s"
     world.statistics.ended()
-    assert world.diagnose().state == "waiting for frames"
+    assert world.diagnose().values["State"] == "waiting for frames"
 
 
 def test_topics_that_nothing_waits_for_are_left_out() -> None:

@@ -10,14 +10,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 
 from rs_localizer.ros.node.diagnostics import Diagnostics
-from rs_localizer.ros.node.health import Health, Level
+from rs_localizer.ros.node.health import Health, Level, State
 
 
 class Bench:
     """Diagnostics without a graph, whose timer is turned by hand."""
 
     def __init__(self) -> None:
-        self.health = Health(Level.OK, "tracking", "all is well", {"State": "tracking"})
+        self.health = Health(Level.OK, State.TRACKING, "all is well", {"State": "tracking"})
         self.lines: list[str] = []
         self.published: list[DiagnosticArray] = []
         node: Any = SimpleNamespace(
@@ -58,9 +58,9 @@ def test_the_message(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("level", "state", "name"),
     [
-        (Level.STALE, "waiting for frames", "no_pose"),
+        (Level.STALE, State.WAITING, "no_pose"),
         (Level.ERROR, "lost", "no_pose"),
-        (Level.WARN, "tracking", "tracking"),
+        (Level.WARN, State.TRACKING, "tracking"),
     ],
 )
 def test_lines_of_a_lasting_state(bench: Bench, level: Level, state: str, name: str) -> None:
@@ -76,17 +76,17 @@ def test_lines_of_a_lasting_state(bench: Bench, level: Level, state: str, name: 
 
 
 def test_another_state_is_told_afresh(bench: Bench) -> None:
-    for state in ("lost", "waiting for frames"):
+    for state in (State.LOST, State.WAITING):
         bench.health = Health(Level.ERROR, state, f"because {state}", {})
         for _ in range(7):
             bench.tick()
-    assert bench.lines == ["no_pose: because lost", "no_pose: because waiting for frames"]
+    assert bench.lines == ["no_pose: because lost", "no_pose: because waiting for"]
 
 
 def test_a_warning_after_a_long_good_time(bench: Bench) -> None:
     for _ in range(1000):
         bench.tick()
-    bench.health = Health(Level.WARN, "tracking", "frames were refused", {})
+    bench.health = Health(Level.WARN, State.TRACKING, "frames were refused", {})
     for _ in range(5):
         bench.tick()
     assert bench.lines == ["tracking: frames were refused"]
