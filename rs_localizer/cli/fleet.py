@@ -147,7 +147,9 @@ def _check(tasks: list[Task], plan: Plan) -> None:
     for task in tasks:
         if not task.folder.exists() or finished(task) is not None:
             continue
-        if read_marker(task.folder) is None:
+        made = read_marker(task.folder)
+        # What another command made may be the only one there is, or even the recording itself.
+        if made is None or made.get("command") != plan.kind.command:
             raise ValueError(
                 f"{task.folder} exists and is no result of {plan.kind.command}; choose another "
                 "--out, or remove it"

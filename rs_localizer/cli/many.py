@@ -20,7 +20,9 @@ _SHUTTER = "shutter.yaml"
 def replay(args: Namespace, config: NodeConfig) -> None:
     """``replay`` of many recordings."""
     kernels = f"replay {config.solver}{' smooth' if args.smooth else ''}"
-    files = _given(args.params, config.map_file and Path(config.map_file))
+    if config.map_file:  # where it is from here, whatever directory a worker is in
+        args = Namespace(**vars(args) | {"map": Path(config.map_file)})
+    files = _given(args.params, args.map)
     kind = Kind("replay", replay_of_many, kernels, None if args.smooth else replay_warm)
     run_fleet(args, Plan(kind, lambda _: files, args.overwrite))
 

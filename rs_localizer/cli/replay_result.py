@@ -20,6 +20,8 @@ from rs_localizer.io.topics import TF
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms.rigid import TransformError, make_transform
 from rs_localizer.io.whole import told, whole
+from rs_localizer.offline.fleet.identity import MARKER
+from rs_localizer.offline.fleet.task import LOG
 from rs_localizer.offline.replay import TF_TYPE
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -53,6 +55,9 @@ def fresh(out: Path, overwrite: bool) -> Iterator[None]:
 
 
 def _remove_results(out: Path) -> None:
+    if (out / MARKER).exists():  # of many recordings: what follows is no result of what it says
+        (out / MARKER).unlink()
+        (out / LOG).unlink(missing_ok=True)
     for name in (POSES, TWISTS, BRIDGED, VIEW):
         (out / name).unlink(missing_ok=True)
     for path in written_names(out):

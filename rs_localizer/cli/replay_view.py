@@ -16,6 +16,8 @@ from rs_localizer.offline.viewing.stream import write_view
 from rs_localizer.pipeline.frames import FrameLocalizer
 
 _SUFFIX = ".rrd"
+# Known by being this very object: a user's view.rrd is in the current directory, as any other name.
+_BESIDE_POSES = Path(VIEW)
 
 
 def add_view_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +30,7 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
         "--rerun",
         nargs="?",
         type=Path,
-        const=Path(VIEW),
+        const=_BESIDE_POSES,
         metavar="FILE.rrd",
         help=f"write a file for the viewer (default: {VIEW} beside the poses)",
     )
@@ -67,7 +69,7 @@ def write_file(
 ) -> None:
     """Write what ``--rerun`` asks for; of no pose there is nothing to be seen."""
     if args.rerun is not None and tally.frames:
-        file = out / VIEW if args.rerun == Path(VIEW) else args.rerun
+        file = out / VIEW if args.rerun is _BESIDE_POSES else args.rerun
         write_view(bag, topics, localizer, tally.written, file)
         print(f"to look at: rerun {file}")
 

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import NODE_NAME
+
+# As ROS has it for topics, which begin with the name of the node.
+_NAME = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*/?", re.ASCII)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "node",
         nargs="?",
+        type=_node,
         default=f"/{NODE_NAME}",
         metavar="NODE",
         help="the localizer, with its namespace (default: %(default)s)",
@@ -24,6 +29,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="seconds from one look to the next (default: 0.2 on a terminal, else 1)",
     )
+
+
+def _node(text: str) -> str:
+    if not _NAME.fullmatch(text):
+        raise argparse.ArgumentTypeError(
+            f"must be a node's name, such as /front/{NODE_NAME}, got {text!r}"
+        )
+    return text
 
 
 def run(args: argparse.Namespace) -> None:

@@ -102,7 +102,9 @@ def test_results_of_other_settings_are_in_the_way(
     (out / "a_flight" / "mine").write_text("")
     assert main([*words, "--overwrite"]) == 1
     assert f"{out}/a_flight exists and is no result of replay; choose" in capsys.readouterr().err
-    (out / "a_flight" / "fleet.json").write_text('{"identity": "another", "figures": {}}')
+    (out / "a_flight" / "fleet.json").write_text(
+        '{"identity": "another", "command": "replay", "figures": {}}'
+    )
     assert main(words) == 1
     assert "a_flight is a result of other settings, another recording or another version; " in (
         capsys.readouterr().err
@@ -110,6 +112,19 @@ def test_results_of_other_settings_are_in_the_way(
     assert main([*words, "--overwrite"]) == 0
     assert (out / "a_flight" / "mine").exists()  # until there is a better one
     assert rows(out)["b_flight"]["state"] == "not done"
+
+
+@pytest.mark.usefixtures("undone")
+def test_results_of_another_command_stay_whatever_may_be_overwritten(
+    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As ``replay seen/*/ --out seen --overwrite`` would replace what it reads."""
+    made = tmp_path / "seen" / "flight"
+    shutil.copytree(recordings[0], made)
+    (made / "fleet.json").write_text('{"identity": "x", "command": "detect", "figures": {}}')
+    words = ["replay", str(made), *SHUTTER, "--workers", "1", "--out", str(made.parent)]
+    assert main([*words, "--overwrite"]) == 1
+    assert f"{made} exists and is no result of replay; choose" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("undone")
@@ -157,6 +172,37 @@ def test_two_commands_do_not_write_into_one_directory(
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """As by a worker, without the time that its start takes."""
     monkeypatch.setattr(fleet, "perform_all", lambda tasks, where: map_closed(perform, tasks))
+
+
+@pytest.mark.usefixtures("in_process")
+def test_what_one_recording_s_replay_replaces_is_no_result_of_the_fleet(
+    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    many = ["replay", *recordings[:2], *SHUTTER, "--out", str(out)]
+    assert main(many) == 0
+    alone = ["replay", recordings[0], "-p", "readout_time:=0.01", "--overwrite"]
+    assert main([*alone, "--out", str(out / "a_flight")]) == 0
+    assert not (out / "a_flight" / "log.txt").exists()
+    assert main(many) == 1
+    assert f"{out}/a_flight exists and is no result of replay" in capsys.readouterr().err
+
+
+def test_maps_are_found_from_any_directory(
+    recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker of a scheduler has a working directory of its own."""
+    seen: list[Path] = []
+
+    def elsewhere(task: Task) -> Outcome:
+        seen.append(task.arguments.map)
+        return Outcome(task.name, None, "not tried")
+
+    monkeypatch.setattr(fleet, "perform_all", lambda tasks, where: map_closed(elsewhere, tasks))
+    monkeypatch.chdir(tmp_path)
+    words = [recordings[0], "--workers", "1", "-p", "map_file:=map.npz", "--out", "out"]
+    assert main(["replay", *words]) == 1
+    assert seen == [tmp_path / "map.npz"]
 
 
 def map_closed(function: Callable[[Task], Outcome], tasks: list[Task]) -> Iterator[Outcome]:

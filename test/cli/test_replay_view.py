@@ -101,6 +101,15 @@ def test_nothing_else_changes(
     assert not (tmp_path / "plain" / "view.rrd").exists()
 
 
+def test_a_name_of_one_s_own_is_in_the_current_directory(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(flight), *SHUTTER, "--out", "out", "--rerun", "view.rrd"]) == 0
+    assert (tmp_path / "view.rrd").is_file()
+    assert not (tmp_path / "out" / "view.rrd").exists()
+
+
 def test_a_file_that_cannot_be_written_is_one_line(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

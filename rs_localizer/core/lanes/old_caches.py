@@ -38,7 +38,11 @@ def remove_others(used: Path) -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether there is nothing but kernels of this package: ``NUMBA_CACHE_DIR`` is everybody's."""
+    """Whether there are kernels of this package, and nothing else.
+
+    ``NUMBA_CACHE_DIR`` is everybody's, and an empty folder may be anybody's.
+    """
     if not _OURS.fullmatch(folder.name) or not folder.is_dir():
         return False
-    return all(item.name.startswith("rs_localizer.") for item in folder.iterdir())
+    names = [item.name for item in folder.iterdir()]
+    return bool(names) and all(name.startswith("rs_localizer.") for name in names)

@@ -78,8 +78,21 @@ def _given_up(left: Iterable[str], reason: str) -> Iterator[Outcome]:
 def _cluster(where: Where, tasks: int) -> AbstractContextManager[Any]:
     """What a client connects to."""
     if where.scheduler is not None:
+        _check_address(where.scheduler)
         return contextlib.nullcontext(where.scheduler)
     return _local(where.processes(tasks))
+
+
+def _check_address(address: str) -> None:
+    """Refuse what is none: a client would, too, and then wait for itself with a traceback."""
+    from distributed.comm.addressing import get_address_host_port
+
+    try:
+        get_address_host_port(address)
+    except ValueError as error:
+        raise ClusterError(
+            f"--scheduler needs an address such as tcp://host:8786, got {address!r}: {error}"
+        ) from error
 
 
 def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Iterator[Outcome]:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
+import numba
 from llvmlite import binding
 
 from rs_localizer.core.lanes.jit import cache_directory
@@ -43,7 +45,11 @@ def alone_until_compiled(kernels: str) -> Iterator[bool]:
 
 
 def _name(kernels: str) -> str:
-    said = f"{program()} {kernels} {binding.get_host_cpu_name()}"
+    config: Any = numba.config
+    cpu = config.CPU_NAME or binding.get_host_cpu_name()
+    # Numba takes no machine code of another version of itself or of Python.
+    compiler = f"{numba.__version__} {sys.implementation.cache_tag}"
+    said = f"{program()} {kernels} {compiler} {cpu}"
     return hashlib.sha256(said.encode()).hexdigest()[:16]
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import pickle
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 import time
 import uuid
@@ -26,6 +29,11 @@ PARTIAL = ".partial"
 
 Figures = dict[str, float | int | str]
 """What the summary says of a recording, by the name of the column."""
+
+_WARM = (
+    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "warm, arguments = pickle.load(sys.stdin.buffer); warm(arguments)"
+)
 
 # What is printed can be told apart only while one task of a process prints.
 _PRINTING = threading.Lock()
@@ -141,8 +149,19 @@ def _work(task: Task, folder: Path) -> Figures:
         if first and kind.warm is None:
             return kind.work(task.arguments, task.recording, folder)
         if first and kind.warm is not None:
-            kind.warm(task.arguments)
+            _warm_elsewhere(kind.warm, task.arguments)
     return kind.work(task.arguments, task.recording, folder)
+
+
+def _warm_elsewhere(warm: Callable[[Namespace], None], arguments: Namespace) -> None:
+    """Compile in another process.
+
+    One that has compiled kernels itself rounds differently than those that load them.
+    """
+    given = pickle.dumps(sys.path) + pickle.dumps((warm, arguments))
+    words = [sys.executable, "-c", _WARM]
+    if subprocess.run(words, input=given, capture_output=True, check=False).returncode != 0:
+        warm(arguments)  # says why
 
 
 def _complete(task: Task, inner: Path, figures: Figures) -> None:

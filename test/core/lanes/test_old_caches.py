@@ -38,6 +38,10 @@ def test_what_nobody_used_for_a_month_is_removed(cache: Path) -> None:
         folder(cache, "2" * 16, 100, inside="somebody.elses"),
     ]
     (cache / "3333333333333333").write_text("a file")
+    empty = cache / ("4" * 16)  # of anybody
+    empty.mkdir()
+    os.utime(empty, times=(time.time() - 100 * DAY,) * 2)
+    staying.append(empty)
     old_caches.remove_others(used)
     assert not old.exists()
     assert all(path.is_dir() for path in [used, *staying])

@@ -10,6 +10,7 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
+import killing
 import pytest
 
 from rs_localizer.offline.fleet import first
@@ -161,6 +162,16 @@ def test_the_first_one_compiles_alone(tmp_path: Path, cache: Path) -> None:
         pass
 
 
+def test_another_compiler_has_kernels_of_its_own(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for version in ("0.60.0", "0.61.0", "0.61.0"):
+        monkeypatch.setattr(first.numba, "__version__", version)
+        with first.alone_until_compiled("k"):
+            pass
+    assert len(list((cache / "fleet").glob("*.lock"))) == 2
+
+
 def test_a_first_one_that_fails_leaves_the_next_one_first(tmp_path: Path, cache: Path) -> None:
     def marks() -> list[Path]:
         return [file for file in (cache / "fleet").iterdir() if file.suffix != ".lock"]
@@ -172,8 +183,12 @@ def test_a_first_one_that_fails_leaves_the_next_one_first(tmp_path: Path, cache:
 
 
 def test_who_can_compile_alone_does_no_more_alone(tmp_path: Path, cache: Path) -> None:
-    """While the first one works, having compiled, a second one may come."""
-    given = task(tmp_path, kernels="k")
+    """While the first one works, a second one may come; who works has compiled nothing itself.
+
+    Kernels round differently in the process that has compiled them than in those that load them.
+    """
+    log = tmp_path / "said"
+    given = replace(task(tmp_path, kernels="k"), arguments=Namespace(said=log))
     said: list[str] = []
 
     def work(args: Namespace, recording: Path, out: Path) -> Figures:
@@ -181,10 +196,19 @@ def test_who_can_compile_alone_does_no_more_alone(tmp_path: Path, cache: Path) -
             said.append(f"work, first: {is_first}")
         return {}
 
-    kind = Kind("count", work, "k", lambda args: said.append("compiled"))
+    kind = Kind("count", work, "k", killing.tell)
     assert perform(replace(given, kind=kind)).figures == {}
     perform(replace(given, kind=kind, name="again"))
-    assert said == ["compiled", "work, first: False", "work, first: False"]
+    assert said == ["work, first: False", "work, first: False"]
+    (compiled,) = log.read_text().splitlines()
+    assert compiled.startswith("compiled by ")
+    assert compiled != f"compiled by {os.getpid()}"
+
+
+def test_what_cannot_be_compiled_says_why(tmp_path: Path) -> None:
+    given = replace(task(tmp_path, kernels="k"), arguments=Namespace(said=tmp_path))
+    kind = Kind("count", count_letters, "k", killing.tell)
+    assert "Is a directory" in perform(replace(given, kind=kind)).reason
 
 
 def test_without_a_cache_nobody_waits(tmp_path: Path, cache: Path) -> None:

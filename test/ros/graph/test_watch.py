@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.cli.main import main
 from rs_localizer.ros.graph.watched import Status, Values, Watched, euler, line, table
 
 WATCH = [sys.executable, "-m", "rs_localizer", "watch"]
@@ -172,3 +173,11 @@ def test_without_ros_it_says_what_is_missing(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("rs_localizer watch: watch needs ROS 2 (No module named 'rclpy')")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["a b", "", "/", "1x", "~", "a//b", "front/1"])
+def test_what_is_no_name_of_a_node_is_wrong_usage(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["watch", name]) == 2
+    assert "must be a node's name, such as /front/rs_localizer, got" in capsys.readouterr().err
