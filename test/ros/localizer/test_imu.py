@@ -99,6 +99,8 @@ class Robot:
         """The camera, and the first reading, at which the node begins to listen to TF."""
         for topic in ("/camera_info", "/imu"):
             self.send(next(item for item in items if item[0] == topic))
+        # Without tf2_ros it never does.
+        self.peer.spin_until(lambda: self.peer.node.count_subscribers("/tf_static"), 3.0)
         self.peer.spin_until(lambda: False, 1.0)
 
     def send(self, item: Item) -> None:

@@ -340,9 +340,8 @@ def test_names_can_be_remapped_and_qos_overridden(
     talk.localize(*inputs(recording)[0])
 
     def reliability(topic: str, infos: Any) -> Any:
-        return next(
-            info.qos_profile.reliability for info in infos(topic) if info.node_name != "peer"
-        )
+        others = [info for info in infos(topic) if info.node_name != "peer"]
+        return others[0].qos_profile.reliability if others else None
 
     subscriptions = peer.node.get_subscriptions_info_by_topic
     # Where nothing is overridden, that of the publisher.
