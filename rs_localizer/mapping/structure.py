@@ -10,6 +10,7 @@ the first pixel at 0.5, 0.5.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -68,14 +69,13 @@ class Effort:
 
     threads: int = 1  # of COLMAP; with more than one, the last digits vary
     seed: int = 0
-    adjusted: int = (
-        150  # keypoints of a view that are adjusted: more say little more, and cost time
-    )
+    # Keypoints of a view that are adjusted: more say little more, and cost time.
+    adjusted: int = 150
 
 
 def require() -> None:
     """Raise ImportError where pycolmap is not installed, before any work is done."""
-    import pycolmap  # noqa: F401
+    importlib.import_module("pycolmap")
 
 
 def build_structure(

@@ -62,9 +62,9 @@ def _similarity(before: Gray, after: Gray) -> Array:
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _DISTANCE)
     if corners is None or len(corners) < _LEAST_CORNERS:
         return lost
-    # OpenCV declares the start of the search as required, and takes None for it.
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)  # type: ignore[call-overload]
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None)  # type: ignore[call-overload]
+    # The last argument is filled: without a flag it is no start of the search.
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.empty_like(corners))
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(corners))
     near = np.linalg.norm(back - corners, axis=2)[:, 0] < _ROUND_TRIP
     good = near & (found[:, 0] > 0) & (returned[:, 0] > 0)
     if np.count_nonzero(good) < _LEAST_CORNERS:
