@@ -20,6 +20,8 @@ from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline_kernels import CONTROL
 
 _FEW_STEPS = 6
+# Richer models must lower the cost by this much per new parameter (Akaike).
+_COST_PER_PARAMETER = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +92,13 @@ def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time
     problem = Problem(camera, observations, start, held)
     least = minimise(problem, start, found.deviation, _FEW_STEPS)
     return problem.normal(least, found.deviation)[0]
+
+
+def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
+    """Whether so many more parameters are worth it, by the noise that the richer model leaves."""
+    limit = (LIMIT * richer.deviation) ** 2
+    left = [float(np.sum(found.squared_errors.clip(max=limit))) for found in (plainer, richer)]
+    return (left[0] - left[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
 
 
 def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:
