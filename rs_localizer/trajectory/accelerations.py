@@ -18,8 +18,9 @@ from rs_localizer.trajectory.model import Freedom
 from rs_localizer.trajectory.prior_kernels import changes
 from rs_localizer.trajectory.sight_kernels import Curve
 
-# Those of a camera at rest are expected to be at least this (rad/s^2, m/s^2).
-_LEAST = 0.1
+# What is known beforehand: as much as so many numbers of this size (rad/s^2, m/s^2) would tell. A
+# few images that happen to lie on a line say nothing of those that follow.
+_NUMBERS, _USUAL = 6.0, np.array([2.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +32,10 @@ class Told:
 
     def most_likely(self, freedom: Freedom) -> Freedom:
         """The same with accelerations one step nearer to the greatest marginal likelihood."""
-        angular, linear = np.sqrt(self.squares / np.maximum(self.numbers, 1.0))
+        squares = self.squares + _NUMBERS * _USUAL**2
+        angular, linear = np.sqrt(squares / (np.maximum(self.numbers, 0.0) + _NUMBERS))
         return replace(
-            freedom,
-            angular_acceleration=max(float(angular), _LEAST),
-            linear_acceleration=max(float(linear), _LEAST),
+            freedom, angular_acceleration=float(angular), linear_acceleration=float(linear)
         )
 
 

@@ -16,18 +16,17 @@ from rs_localizer.trajectory.accelerations import told
 from rs_localizer.trajectory.fit import Fit, cheaper, fit
 from rs_localizer.trajectory.model import Freedom, Observations, start_state
 from rs_localizer.trajectory.observe import Observed, collect
-from rs_localizer.trajectory.start import first_spline, refined
+from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
 
 # Between images the motion is told as long as its deviations stay within so many of the usual ones.
 _MOST_UNCERTAIN = 5.0
 # A sample is bridged where the images with a pose lie farther apart than this many intervals.
 _BRIDGED = 1.5
-# The prior of the accelerations bridges the knots (s) between images: they need not be as wide as a
-# hand's motion would allow, and narrow ones follow all of it.
-_LONGEST_SPACING = 0.025
+# Where images show how accelerations fade, that bridges the knots (s) between them: these need not
+# be as wide as a hand's motion would allow, and narrow ones follow all of it.
+_NARROW_SPACING = 0.025
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
-_FREEDOM = Freedom(readout_time=False, fading=FADING)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +130,8 @@ def smooth(
     readout_time = camera.readout_time
     if not readout_time > 0.0:
         raise ValueError("smoothing needs the readout time of the camera, which is 0 (unknown)")
+    if not images:
+        raise ValueError("no image has a pose: there is nothing to smooth")
     known = [
         replace(one, inliers=np.ones(len(image.points), dtype=np.bool_))
         for one, image in zip(estimates, images, strict=True)
@@ -139,11 +140,14 @@ def smooth(
     posed = collect(camera, images, list(known), delay)
     seen = posed.observations
     interval = float(np.median(np.diff(posed.times))) if len(posed.times) > 1 else 1.0
-    spacing = min(_LONGEST_SPACING, interval)
+    fading = FADING if interval < 0.5 * FADING else 0.0
+    spacing = min(_NARROW_SPACING if fading else LONGEST_SPACING, interval)
     spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, readout_time)
     seen = seen.subset(spline.layout.inside(seen.times))
     state = start_state(camera, seen, spline, readout_time)
-    found = _lively(camera, seen, fit(camera, seen, state, _FREEDOM))
+    found = _lively(
+        camera, seen, fit(camera, seen, state, Freedom(readout_time=False, fading=fading))
+    )
     halved = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
     finer = _lively(camera, seen, fit(camera, seen, halved, found.freedom, found.deviation))
     more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
