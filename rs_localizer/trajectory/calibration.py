@@ -81,6 +81,13 @@ class Calibration:
         return self.determined and abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
 
     @property
+    def held(self) -> int:
+        """Landmarks that are seen often enough to have a shape estimated, but are too many."""
+        seen = self.posed.observations
+        often = len(seen.points) >= _LEAST_SIGHTS * len(seen.landmarks)
+        return len(seen.landmarks) if often and self.fit.freedom.landmarks == 0.0 else 0
+
+    @property
     def scatter(self) -> float:
         """Standard deviation of the blocks' values, s."""
         values = [block.readout_time for block in self.blocks]
