@@ -23,7 +23,7 @@ from rs_localizer.cli.image_source import (
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.config import DetectorConfig
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import STORAGES
 from rs_localizer.offline.detect import Options, Recorded, record
 from rs_localizer.pipeline.images import FrameDetector

@@ -16,7 +16,7 @@ from rs_localizer.cli.image_source import (
     write_shutter,
 )
 from rs_localizer.config import FeatureConfig, FeatureKind
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.offline.detect import Options
 from rs_localizer.offline.detect_features import Extraction, record_features
 from rs_localizer.pipeline.features import FrameExtractor

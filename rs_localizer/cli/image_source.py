@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rs_localizer.cli import UsageError
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.calibration.files import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault

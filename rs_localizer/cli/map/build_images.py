@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.image_source import opened, tell_left_out, time_faults
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import is_bag
 from rs_localizer.io.images import Image
 from rs_localizer.io.recording import PARAMETERS
