@@ -13,7 +13,7 @@ from rs_localizer.trajectory.blocks import disagreement
 from rs_localizer.trajectory.gyro import NoMount
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.mean_accelerations import Means, mean_accelerations
-from rs_localizer.trajectory.metric import Lever, Metric, metric
+from rs_localizer.trajectory.metric import Lever, Metric, NoMetric, metric
 from rs_localizer.trajectory.mount_on_motion import MountOnMotion, mount_on_motion
 
 # Where the IMU is, m: as TF says, which is drawn on paper; where nothing says so, in the same box.
@@ -23,8 +23,6 @@ _DRAWN, _SAME_BOX = 0.02, 0.1
 _SPACING, _IMAGES = 0.15, 2.0
 # A scale is determined to this part of it.
 _MOST_SHARE = 0.05
-# So much of the accelerations that images show must be the accelerometer's.
-_LEAST_EXPLAINED = 0.5
 # The mean of the readings in the map's axes is gravity, but for a bias and how speed changed.
 _MOST_OFF = 0.1
 # Axes are known to this (rad), or TF's count.
@@ -97,13 +95,10 @@ def inertial_metres(refined: RefinedMap, imu: ImuRecording) -> InertialMetres:
     spacing = max(_SPACING, _IMAGES * float(np.median(np.diff(refined.times))))
     means = mean_accelerations(refined.spline, samples, mount.mount.camera_from_imu, spacing)
     _check(means, refined)
-    found = metric(means, _lever(imu))
-    if found is None or not found.explained > _LEAST_EXPLAINED:
-        explained = 0.0 if found is None else max(found.explained, 0.0)
-        raise NoMetres(
-            f"camera and accelerometer agree in {100.0 * explained:.0f} % of their accelerations: "
-            "either the camera hardly moved, or the accelerometer's axes are not the gyroscope's"
-        )
+    try:
+        found = metric(means, _lever(imu))
+    except NoMetric as error:
+        raise NoMetres(str(error)) from error
     parts = np.array(found.parts)
     inflation = disagreement(parts[:, 0], parts[:, 0] * parts[:, 1])
     covered = found.means * spacing / _length(refined)

@@ -31,7 +31,7 @@ _STEPS = 20
 # Without a sample for longer than this (s), or than so many usual steps, there is a gap.
 _LONGEST_STEP, _MOST_STEPS = 0.02, 2.5
 # So many means at once.
-_MOST = 40
+_MOST = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,11 +34,12 @@ _GRAVITY_DEVIATION, _BIAS_DEVIATION, _SCALE_DEVIATION = 0.02, 0.5, 0.01
 # Unknowns: 1 / s as the forces say it, and gravity, bias, lever arm and 1 / s by s.
 _FORCE, _GRAVITY, _BIAS, _LEVER, _INVERSE = 0, slice(1, 4), slice(4, 7), slice(7, 10), 10
 _UNKNOWNS = 11
-# Variance of accelerations by that of positions, s^-4, of means a second apart.
+# Variance of accelerations by that of positions, s^-4: what may be, and where to begin.
 _RATIOS = np.geomspace(1e-3, 1e7, 41)
 _PLAIN = 1e3
 _ROUNDS = 5
-_LEAST_MEANS = 12
+# So much of the accelerations that images show must be the accelerometer's.
+_LEAST_EXPLAINED = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,23 +134,28 @@ class _Fitted:
     explained: float
 
 
-def metric(means: Sequence[Means], lever: Lever) -> Metric | None:
-    """Scale and gravity; None where camera and forces do not accelerate the same way.
+class NoMetric(ValueError):
+    """Camera and accelerometer do not go together; the message says why."""
+
+
+def metric(means: Sequence[Means], lever: Lever) -> Metric:
+    """Scale and gravity.
 
     Args:
         means: of all parts of a motion.
         lever: where the IMU is, as far as that is known.
+
+    Raises:
+        NoMetric: where camera and accelerometer are not accelerated alike.
     """
     first = _start(means)
-    if first is None:
-        return None
     whitened = [_Whitened(means, float(ratio)) for ratio in _RATIOS]
     fitted = [_fit(of, first, lever) for of in whitened]
     best = int(np.argmax([each.likelihood for each in fitted]))
     fit, ratio = fitted[best], float(_RATIOS[best])
     inverse = float(fit.found[_INVERSE])
-    if not inverse > 0.0:
-        return None
+    if not (inverse > 0.0 and fit.explained > _LEAST_EXPLAINED):
+        raise NoMetric(_too_little(max(fit.explained, 0.0)))
     gravity = fit.found[_GRAVITY] / inverse
     across = np.eye(3) - np.outer(gravity, gravity) / (gravity @ gravity)
     tilt = across @ fit.covariance[_GRAVITY, _GRAVITY] @ across / (gravity @ gravity) / inverse**2
@@ -167,14 +173,28 @@ def metric(means: Sequence[Means], lever: Lever) -> Metric | None:
     )
 
 
-def _start(means: Sequence[Means]) -> Array | None:
+def _start(means: Sequence[Means]) -> Array:
     """Forces' scale and gravity (4,) of least squares."""
-    if sum(len(part.times) for part in means) < _LEAST_MEANS:
-        return None
     plain = _Whitened(means, _PLAIN)
     alone = slice(_FORCE, _GRAVITY.stop)
-    found = np.linalg.solve(plain.normal[alone, alone], plain.right[alone])
-    return found if found[_FORCE] > 0.0 else None
+    found: Array = np.linalg.solve(plain.normal[alone, alone], plain.right[alone])
+    explained = float(found @ plain.right[alone]) / plain.squared
+    if not found[_FORCE] > 0.0:
+        if explained < _LEAST_EXPLAINED:
+            raise NoMetric(_too_little(0.0))
+        raise NoMetric(
+            "the accelerometer shows the reverse of how the camera is accelerated: at rest it must "
+            "show +g upwards"
+        )
+    return found
+
+
+def _too_little(explained: float) -> str:
+    return (
+        f"camera and accelerometer agree in {100.0 * explained:.0f} % of their accelerations: "
+        "either the camera hardly moved (move it to and fro by some decimetres, briskly), or the "
+        "accelerometer's axes are not the gyroscope's"
+    )
 
 
 def _fit(whitened: _Whitened, first: Array, lever: Lever) -> _Fitted:

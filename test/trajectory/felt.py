@@ -16,6 +16,9 @@ from rs_localizer.trajectory.spline import Layout, Spline
 GRAVITY = 9.80665  # m/s^2
 # Sines of a second or so, in three angles (rad) and three coordinates (m).
 TURN, WAY = 0.2, 0.06
+MAP_FROM_WORLD = Rotation.from_rotvec([0.4, -1.9, 0.8])
+CAMERA_FROM_IMU = Rotation.from_rotvec([0.3, -1.2, 0.7])
+UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -25,8 +28,8 @@ class Felt:
     frequencies: np.ndarray  # (6,4) rad/s
     phases: np.ndarray
     scale: float = 0.37  # m per unit of the map
-    map_from_world: Rotation = Rotation.from_rotvec([0.4, -1.9, 0.8])
-    camera_from_imu: Rotation = Rotation.from_rotvec([0.3, -1.2, 0.7])
+    map_from_world: Rotation = MAP_FROM_WORLD
+    camera_from_imu: Rotation = CAMERA_FROM_IMU
     lever: tuple[float, float, float] = (0.06, -0.04, 0.08)  # m, camera axes
     bias: tuple[float, float, float] = (0.2, -0.15, 0.16)  # m/s^2, 0.3 long
     gyroscope_bias: tuple[float, float, float] = (0.02, -0.01, 0.03)  # rad/s
@@ -83,4 +86,4 @@ class Felt:
 
         acceleration = (place(h) - 2.0 * place(0.0) + place(-h)) / h**2
         axes = self.world(t)[0] * self.camera_from_imu
-        return axes.inv().apply(acceleration + [0.0, 0.0, GRAVITY]) + self.bias
+        return axes.inv().apply(acceleration + GRAVITY * UP) + self.bias

@@ -43,7 +43,6 @@ def test_both_sides_are_the_same_number() -> None:
 def test_all_is_found() -> None:
     felt = Felt.random(1)
     found = metric(means_of(felt), UNKNOWN)
-    assert found is not None
     assert found.scale == pytest.approx(felt.scale, rel=2e-3)
     assert np.linalg.norm(found.gravity) == pytest.approx(GRAVITY, rel=2e-3)
     assert angle(found.gravity, felt.down) < 0.05
@@ -63,7 +62,6 @@ def test_an_accelerometer_that_shows_too_much_makes_nothing_larger() -> None:
     felt = Felt.random(2)
     parts = [replace(part, forces=1.02 * part.forces) for part in means_of(felt)]
     found = metric(parts, Lever(np.array(felt.lever), 0.005))
-    assert found is not None
     assert found.scale == pytest.approx(felt.scale, rel=0.008)
     assert abs(found.scale / felt.scale - 1.0) < 3.0 * found.share
 
@@ -89,7 +87,6 @@ def noisy(seed: int, noise: float = 3e-3) -> tuple[Felt, Metric]:
     samples = ForceSamples(stamps + felt.delay, forces)
     parts = mean_accelerations(moved, samples, felt.camera_from_imu.as_matrix(), 0.15)
     found = metric(parts, UNKNOWN)
-    assert found is not None
     return felt, found
 
 
@@ -120,7 +117,7 @@ def test_the_covariance_is_that_of_white_noise() -> None:
     times = np.arange(0.0, 80.0, 0.01)
     samples = ForceSamples(times, np.zeros((len(times), 3)))
     parts = mean_accelerations(spline, samples, np.eye(3), spacing)
-    seen = np.concatenate([part.seen for part in parts if len(part.times) == 40])
+    seen = np.concatenate([part.seen for part in parts if len(part.times) == 20])
     expected = 0.004 * _covariance(4, spacing, 0.0)[0]
     for lag in range(4):
         pairs = np.mean(seen[: len(seen) - lag] * seen[lag:])
@@ -159,5 +156,4 @@ def test_gaps_are_left_out() -> None:
     times = np.concatenate([part.times for part in parts])
     assert not np.any((times > 4.0 - 0.4) & (times < 4.3 + 0.4))
     found = metric(parts, UNKNOWN)
-    assert found is not None
     assert found.scale == pytest.approx(felt.scale, rel=3e-3)
