@@ -69,7 +69,7 @@ def mean_accelerations(
         count = int((end - start) / spacing - _SUPPORT + 1.0 + 1e-9)
         for first in range(0, count, _MOST):
             numbers = np.arange(first, min(first + _MOST, count))
-            times = start + spacing * (0.5 * _SUPPORT + numbers)
+            times = np.asarray(start + spacing * (0.5 * _SUPPORT + numbers), np.float64)
             found.append(_means(spline, samples, camera_from_imu, spacing, times))
     return found
 

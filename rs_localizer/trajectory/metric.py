@@ -21,23 +21,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.linalg import cholesky, solve_triangular, toeplitz
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
-from rs_localizer.trajectory.mean_accelerations import DEGREE, Means
+from rs_localizer.trajectory.mean_accelerations import Means
+from rs_localizer.trajectory.metric_equations import (
+    BIAS,
+    FORCE,
+    GRAVITY,
+    INVERSE,
+    LEVER,
+    UNKNOWNS,
+    Whitened,
+    design,
+)
 
 # What is known beforehand (m/s^2): gravity by place, biases of consumer accelerometers; their
 # scale, by itself.
 _GRAVITY_DEVIATION, _BIAS_DEVIATION, _SCALE_DEVIATION = 0.02, 0.5, 0.01
-# Unknowns: 1 / s as the forces say it, and gravity, bias, lever arm and 1 / s by s.
-_FORCE, _GRAVITY, _BIAS, _LEVER, _INVERSE = 0, slice(1, 4), slice(4, 7), slice(7, 10), 10
-_UNKNOWNS = 11
 # Variance of accelerations by that of positions, s^-4: what may be, and where to begin.
 _RATIOS = np.geomspace(1e-3, 1e7, 41)
 _PLAIN = 1e3
-_ROUNDS = 5
+_ROUNDS, _TRIALS = 5, 4
+# Squared errors of three axes count up to so many times their median: 6 deviations.
+_OUTLIER = 15.0
 # So much of the accelerations that images show must be the accelerometer's.
 _LEAST_EXPLAINED = 0.5
 
@@ -66,70 +73,14 @@ class Metric:
     means: int  # number of mean accelerations
 
 
-class _Whitened:
-    """Equations of means, their noise made white at a ratio of variances."""
-
-    def __init__(self, means: Sequence[Means], ratio: float) -> None:
-        self.normal = np.zeros((_INVERSE, _INVERSE))
-        self.right = np.zeros(_INVERSE)
-        self.squared, self.log_determinant, self.count = 0.0, 0.0, 0
-        factors: dict[int, Array] = {}
-        for part in means:
-            size = len(part.times)
-            if size not in factors:
-                factors[size] = cholesky(_covariance(size, part.spacing, ratio), lower=True)
-            factor = factors[size]
-            rows = solve_triangular(factor, _design(part).reshape(size, -1), lower=True)
-            errors = solve_triangular(factor, part.seen, lower=True).ravel()
-            rows = rows.reshape(3 * size, _INVERSE)
-            self.normal += rows.T @ rows
-            self.right += rows.T @ errors
-            self.squared += float(errors @ errors)
-            self.log_determinant += 6.0 * float(np.sum(np.log(np.diag(factor))))
-            self.count += 3 * size
-
-    def left(self, found: Array) -> float:
-        """Sum of squares that a solution leaves."""
-        x = found[:_INVERSE]
-        return float(self.squared - 2.0 * x @ self.right + x @ self.normal @ x)
-
-
-def _design(part: Means) -> Array:
-    """(n,3,10)."""
-    rows = np.zeros((len(part.times), 3, _INVERSE))
-    rows[:, :, _FORCE] = part.forces
-    rows[:, :, _GRAVITY] = part.weights[:, None, None] * np.eye(3)
-    rows[:, :, _BIAS] = -part.axes
-    rows[:, :, _LEVER] = -part.arms
-    return rows
-
-
-def _covariance(count: int, spacing: float, ratio: float) -> Array:
-    """Of means (n,n): white noise of positions (1), and of accelerations (``ratio``)."""
-    differences = np.zeros((count, count + 2))
-    for offset, factor in enumerate((1.0, -2.0, 1.0)):
-        differences[np.arange(count), np.arange(count) + offset] = factor / spacing**2
-    of_positions = differences @ _overlaps(DEGREE - 2, count + 2) @ differences.T
-    return np.asarray((of_positions + ratio * _overlaps(DEGREE, count)) / spacing)
-
-
-def _overlaps(degree: int, count: int) -> Array:
-    """Integrals (n,n) of the products of B-splines a spacing apart, by it: one of twice the degree
-    and one more.
-    """
-    order = 2 * degree + 1
-    knots = np.arange(order + 2) - 0.5 * (order + 1)
-    values = BSpline.basis_element(knots, extrapolate=False)(np.arange(count, dtype=float))
-    return np.asarray(toeplitz(np.nan_to_num(values)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fitted:
     """The most likely unknowns at a ratio of variances."""
 
     found: Array  # (11,)
     covariance: Array  # (11,11)
-    variance: float  # of the white noise
+    ratio: float  # of the variances, s^-4
+    variance: float  # of the noise of positions
     likelihood: float  # its logarithm, restricted
     explained: float
 
@@ -148,38 +99,57 @@ def metric(means: Sequence[Means], lever: Lever) -> Metric:
     Raises:
         NoMetric: where camera and accelerometer are not accelerated alike.
     """
-    first = _start(means)
-    whitened = [_Whitened(means, float(ratio)) for ratio in _RATIOS]
-    fitted = [_fit(of, first, lever) for of in whitened]
-    best = int(np.argmax([each.likelihood for each in fitted]))
-    fit, ratio = fitted[best], float(_RATIOS[best])
-    inverse = float(fit.found[_INVERSE])
+    kept = [np.ones(len(part.times), np.bool_) for part in means]
+    for _ in range(_TRIALS):
+        fit = _best(means, kept, lever)
+        before, kept = kept, _fitting(means, fit)
+        if all(map(np.array_equal, before, kept)):
+            break
+    inverse = float(fit.found[INVERSE])
     if not (inverse > 0.0 and fit.explained > _LEAST_EXPLAINED):
         raise NoMetric(_too_little(max(fit.explained, 0.0)))
-    gravity = fit.found[_GRAVITY] / inverse
+    gravity = fit.found[GRAVITY] / inverse
     across = np.eye(3) - np.outer(gravity, gravity) / (gravity @ gravity)
-    tilt = across @ fit.covariance[_GRAVITY, _GRAVITY] @ across / (gravity @ gravity) / inverse**2
+    tilt = across @ fit.covariance[GRAVITY, GRAVITY] @ across / (gravity @ gravity) / inverse**2
     return Metric(
         scale=1.0 / inverse,
-        share=float(np.sqrt(fit.covariance[_INVERSE, _INVERSE])) / inverse,
+        share=float(np.sqrt(fit.covariance[INVERSE, INVERSE])) / inverse,
         gravity=gravity,
         gravity_deviation=float(np.sqrt(np.linalg.eigvalsh(tilt)[-1])),
-        bias=fit.found[_BIAS] / inverse,
-        lever=fit.found[_LEVER] / inverse,
-        force=float(fit.found[_FORCE]) / inverse,
+        bias=fit.found[BIAS] / inverse,
+        lever=fit.found[LEVER] / inverse,
+        force=float(fit.found[FORCE]) / inverse,
         explained=fit.explained,
-        parts=tuple(_part(part, ratio, fit) for part in means),
-        means=sum(len(part.times) for part in means),
+        parts=tuple(
+            _part(part, chosen, fit)
+            for part, chosen in zip(means, kept, strict=True)
+            if np.any(chosen)
+        ),
+        means=int(sum(map(np.count_nonzero, kept))),
     )
 
 
-def _start(means: Sequence[Means]) -> Array:
+def _best(means: Sequence[Means], kept: Sequence[BoolArray], lever: Lever) -> _Fitted:
+    """At the ratio of variances that is most likely."""
+    first = _start(Whitened(means, kept, _PLAIN))
+    fitted = [_fit(Whitened(means, kept, ratio), ratio, first, lever) for ratio in _RATIOS.tolist()]
+    return max(fitted, key=lambda each: each.likelihood)
+
+
+def _fitting(means: Sequence[Means], fit: _Fitted) -> list[BoolArray]:
+    """Which means (n,) of each part are no outliers: a knock, images that were matched wrongly."""
+    x = fit.found[:INVERSE]
+    squared = [np.sum(np.square(part.seen - design(part) @ x), axis=1) for part in means]
+    limit = _OUTLIER * float(np.median(np.concatenate(squared)))
+    return [np.asarray(errors < limit) for errors in squared]
+
+
+def _start(plain: Whitened) -> Array:
     """Forces' scale and gravity (4,) of least squares."""
-    plain = _Whitened(means, _PLAIN)
-    alone = slice(_FORCE, _GRAVITY.stop)
-    found: Array = np.linalg.solve(plain.normal[alone, alone], plain.right[alone])
+    alone = slice(FORCE, GRAVITY.stop)
+    found = np.asarray(np.linalg.solve(plain.normal[alone, alone], plain.right[alone]), np.float64)
     explained = float(found @ plain.right[alone]) / plain.squared
-    if not found[_FORCE] > 0.0:
+    if not found[FORCE] > 0.0:
         if explained < _LEAST_EXPLAINED:
             raise NoMetric(_too_little(0.0))
         raise NoMetric(
@@ -197,44 +167,45 @@ def _too_little(explained: float) -> str:
     )
 
 
-def _fit(whitened: _Whitened, first: Array, lever: Lever) -> _Fitted:
-    inverse, down = float(first[_FORCE]), first[_GRAVITY] / np.linalg.norm(first[_GRAVITY])
+def _fit(whitened: Whitened, ratio: float, first: Array, lever: Lever) -> _Fitted:
+    inverse, down = float(first[FORCE]), first[GRAVITY] / np.linalg.norm(first[GRAVITY])
     variance = whitened.squared / whitened.count
     for _ in range(_ROUNDS):
         rows, values = _known(inverse, down, lever)
         normal = rows.T @ rows
-        normal[:_INVERSE, :_INVERSE] += whitened.normal / variance
+        normal[:INVERSE, :INVERSE] += whitened.normal / variance
         right = rows.T @ values
-        right[:_INVERSE] += whitened.right / variance
-        found = np.linalg.solve(normal, right)
+        right[:INVERSE] += whitened.right / variance
+        found = np.asarray(np.linalg.solve(normal, right), np.float64)
         left = whitened.left(found)
-        variance = left / (whitened.count - _INVERSE)
-        inverse, down = float(found[_INVERSE]), found[_GRAVITY] / np.linalg.norm(found[_GRAVITY])
+        variance = left / (whitened.count - INVERSE)
+        inverse, down = float(found[INVERSE]), found[GRAVITY] / np.linalg.norm(found[GRAVITY])
     likelihood = -0.5 * (
         whitened.count * (1.0 + np.log(variance))
         + whitened.log_determinant
         + np.linalg.slogdet(normal)[1]
     )
     explained = 1.0 - left / whitened.squared
-    return _Fitted(found, np.linalg.inv(normal), variance, float(likelihood), explained)
+    covariance = np.asarray(np.linalg.inv(normal), np.float64)
+    return _Fitted(found, covariance, ratio, variance, float(likelihood), explained)
 
 
 def _known(inverse: float, down: Array, lever: Lever) -> tuple[Array, Array]:
     """What is known beforehand: equations (8,11) of deviation 1, at a scale and a direction."""
-    rows = np.zeros((8, _UNKNOWNS))
-    rows[:3, _BIAS] = np.eye(3) / (_BIAS_DEVIATION * inverse)
-    rows[3:6, _LEVER] = np.eye(3) / (lever.deviation * inverse)
-    rows[3:6, _INVERSE] = -lever.position / (lever.deviation * inverse)
-    rows[6, _FORCE], rows[6, _INVERSE] = np.array([1.0, -1.0]) / (_SCALE_DEVIATION * inverse)
-    rows[7, _GRAVITY] = down / (_GRAVITY_DEVIATION * inverse)
-    rows[7, _INVERSE] = -STANDARD_GRAVITY / (_GRAVITY_DEVIATION * inverse)
+    rows = np.zeros((8, UNKNOWNS))
+    rows[:3, BIAS] = np.eye(3) / (_BIAS_DEVIATION * inverse)
+    rows[3:6, LEVER] = np.eye(3) / (lever.deviation * inverse)
+    rows[3:6, INVERSE] = -lever.position / (lever.deviation * inverse)
+    rows[6, FORCE], rows[6, INVERSE] = np.array([1.0, -1.0]) / (_SCALE_DEVIATION * inverse)
+    rows[7, GRAVITY] = down / (_GRAVITY_DEVIATION * inverse)
+    rows[7, INVERSE] = -STANDARD_GRAVITY / (_GRAVITY_DEVIATION * inverse)
     return rows, np.zeros(8)
 
 
-def _part(part: Means, ratio: float, fit: _Fitted) -> tuple[float, float]:
+def _part(part: Means, kept: BoolArray, fit: _Fitted) -> tuple[float, float]:
     """The scale of a part with gravity, bias and lever of the whole, and its deviation (share)."""
-    alone = _Whitened([part], ratio)
-    metres = fit.found[:_INVERSE] / fit.found[_INVERSE]  # of accelerations in m/s^2
+    alone = Whitened([part], [kept], fit.ratio)
+    metres = fit.found[:INVERSE] / fit.found[INVERSE]  # of accelerations in m/s^2
     weight = float(metres @ alone.normal @ metres)
     inverse = float(metres @ alone.right) / weight
     return 1.0 / inverse, float(np.sqrt(fit.variance / weight) / abs(inverse))

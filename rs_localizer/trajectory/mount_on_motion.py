@@ -115,8 +115,8 @@ class _Shown:
         since = (times - self._times[place])[:, None]
         step = (self._times[place + 1] - self._times[place])[:, None]
         rate, change = self._rates[place], self._rates[place + 1] - self._rates[place]
-        turned: Array = so3.exp_many(-since * (rate + 0.5 * since / step * change))
-        return turned @ self._turned[place]
+        turned = so3.exp_many(-since * (rate + 0.5 * since / step * change))
+        return np.asarray(turned @ self._turned[place], np.float64)
 
 
 def _times(layout: Layout, sampled: Array) -> Array:
@@ -130,7 +130,8 @@ def _times(layout: Layout, sampled: Array) -> Array:
     last = np.searchsorted(sampled, times + _WHILE + _MARGIN)
     gaps = np.concatenate([[0], np.cumsum(np.diff(sampled) > _LONGEST_STEP)])
     inside = (first > 0) & (last < len(sampled))
-    return times[inside & (gaps[first - 1] == gaps[np.minimum(last, len(gaps) - 1)])]
+    whole = gaps[first - 1] == gaps[np.minimum(last, len(gaps) - 1)]
+    return np.asarray(times[inside & whole], np.float64)
 
 
 def _errors(shown: _Shown, times: Array, seen: Array, mount: GyroMount) -> tuple[Array, Array]:

@@ -10,7 +10,8 @@ from felt import GRAVITY, Felt
 
 from rs_localizer.trajectory.gyro import GyroSamples, NoMount
 from rs_localizer.trajectory.mean_accelerations import ForceSamples, Means, mean_accelerations
-from rs_localizer.trajectory.metric import Lever, Metric, _covariance, metric
+from rs_localizer.trajectory.metric import Lever, Metric, metric
+from rs_localizer.trajectory.metric_equations import covariance
 from rs_localizer.trajectory.mount_on_motion import mount_on_motion
 from rs_localizer.trajectory.spline import Layout, Spline
 
@@ -118,10 +119,24 @@ def test_the_covariance_is_that_of_white_noise() -> None:
     samples = ForceSamples(times, np.zeros((len(times), 3)))
     parts = mean_accelerations(spline, samples, np.eye(3), spacing)
     seen = np.concatenate([part.seen for part in parts if len(part.times) == 20])
-    expected = 0.004 * _covariance(4, spacing, 0.0)[0]
+    expected = 0.004 * covariance(4, spacing, 0.0)[0]
     for lag in range(4):
         pairs = np.mean(seen[: len(seen) - lag] * seen[lag:])
         assert pairs == pytest.approx(expected[lag], abs=0.12 * expected[0])
+
+
+def test_a_knock_does_not_count() -> None:
+    """30 m/s^2 for 20 ms that the images do not show."""
+    felt = Felt.random(9)
+    stamps = felt.stamps(SECONDS)
+    forces = felt.forces(stamps)
+    forces += np.random.default_rng(0).normal(0.0, 0.05, forces.shape)
+    forces[1200:1204] += [30.0, -10.0, 5.0]
+    samples = ForceSamples(stamps + felt.delay, forces)
+    parts = mean_accelerations(
+        felt.spline(SECONDS), samples, felt.camera_from_imu.as_matrix(), 0.15
+    )
+    assert metric(parts, UNKNOWN).scale == pytest.approx(felt.scale, rel=3e-3)
 
 
 def test_the_mount_is_found() -> None:
