@@ -40,11 +40,13 @@ from rs_localizer.trajectory.metric_equations import (
 # scale, by itself.
 _GRAVITY_DEVIATION, _BIAS_DEVIATION, _SCALE_DEVIATION = 0.02, 0.5, 0.01
 # Variance of accelerations by that of positions, s^-4: what may be, and where to begin.
-_RATIOS = np.geomspace(1e-3, 1e7, 41)
+_RATIOS = np.geomspace(1e-3, 1e7, 21)
 _PLAIN = 1e3
 _ROUNDS, _TRIALS = 5, 4
 # Squared errors of three axes count up to so many times their median: 6 deviations.
 _OUTLIER = 15.0
+# Orientations by images have errors (rad) that last, which residuals do not show.
+_BEND = 5e-4
 # So much of the accelerations that images show must be the accelerometer's.
 _LEAST_EXPLAINED = 0.5
 
@@ -115,7 +117,7 @@ def metric(means: Sequence[Means], lever: Lever) -> Metric:
         scale=1.0 / inverse,
         share=float(np.sqrt(fit.covariance[INVERSE, INVERSE])) / inverse,
         gravity=gravity,
-        gravity_deviation=float(np.sqrt(np.linalg.eigvalsh(tilt)[-1])),
+        gravity_deviation=float(np.hypot(np.sqrt(np.linalg.eigvalsh(tilt)[-1]), _BEND)),
         bias=fit.found[BIAS] / inverse,
         lever=fit.found[LEVER] / inverse,
         force=float(fit.found[FORCE]) / inverse,
