@@ -28,10 +28,8 @@ from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
 from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.offline.image_sources import (
-    INFO_TYPE,
     Carried,
     Shot,
-    find_topic,
 )
 from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
 from rs_localizer.offline.recordings import read_recording
