@@ -36,6 +36,7 @@ class InertialPlace:
     placement: Placement
     metres: InertialMetres | None = None  # what the IMU says; None: there is none, or nothing
     doubts: tuple[str, ...] = ()
+    checked: bool = False  # the scale is another's, and the IMU says something of it
 
     @property
     def larger(self) -> float:
@@ -73,36 +74,53 @@ def place_by_imu(placement: Placement, refined: RefinedMap, imu: GivenImu | None
         metres = inertial_metres(refined, imu.recording)
     except NoMetres as error:
         return InertialPlace(placement, None, (_missing(placement, imu, str(error)),))
-    doubts = metres.doubts
-    _, positions = refined.poses()
-    if not metres.determined and not placement.scaled:
-        doubts = (*doubts, _missing(placement, imu, metres.undetermined))
+    origin = refined.poses()[1][0]
     if not placement.levelled and metres.metric.gravity_deviation < _MOST_TILT:
-        placement = replace(
-            placement,
-            similarity=_level(placement.similarity.scale, metres.metric.gravity, positions[0]),
-            levelled=True,
-            up="by the IMU",
-        )
-    if metres.determined and not placement.scaled:
-        scale = metres.metric.scale
-        told = f"the IMU, to {100.0 * metres.share:.2f} % (standard deviation)"
-        similarity = replace(
-            placement.similarity,
-            scale=scale,
-            translation=-scale * placement.similarity.rotation @ positions[0],
-        )
-        placement = replace(placement, similarity=similarity, scaled=True, told=told)
-        return InertialPlace(placement, metres, doubts)
-    place = InertialPlace(placement, metres, doubts)
-    if placement.scaled and abs(place.larger) > max(_DISAGREE, _SIGMAS * metres.share):
-        doubts = (*doubts, _disagreement(place.larger, metres.share))
-    return replace(place, doubts=doubts)
+        placement = _levelled(placement, metres, origin)
+    if placement.scaled:
+        return _compared(InertialPlace(placement, metres, metres.doubts, checked=True))
+    if not metres.determined:
+        missing = _missing(placement, imu, metres.undetermined)
+        return InertialPlace(placement, metres, (*metres.doubts, missing))
+    return InertialPlace(_scaled(placement, metres, origin), metres, metres.doubts)
 
 
-def _level(scale: float, gravity: Array, origin: Array) -> Similarity:
-    turn = upright(gravity)
-    return Similarity(scale, turn, -scale * turn @ origin)
+def _levelled(placement: Placement, metres: InertialMetres, origin: Array) -> Placement:
+    """With z up."""
+    scale, turn = placement.similarity.scale, upright(metres.metric.gravity)
+    deviation = np.degrees(metres.metric.gravity_deviation)
+    return replace(
+        placement,
+        similarity=Similarity(scale, turn, -scale * turn @ origin),
+        levelled=True,
+        up=f"by the IMU, to {deviation:.2f} deg (standard deviation)",
+    )
+
+
+def _scaled(placement: Placement, metres: InertialMetres, origin: Array) -> Placement:
+    """In metres."""
+    scale, turn = metres.metric.scale, placement.similarity.rotation
+    return replace(
+        placement,
+        similarity=Similarity(scale, turn, -scale * turn @ origin),
+        scaled=True,
+        told=f"the IMU, to {100.0 * metres.share:.2f} % (standard deviation)",
+    )
+
+
+def _compared(place: InertialPlace) -> InertialPlace:
+    """With a doubt where the IMU says another scale."""
+    assert place.metres is not None
+    larger, share = place.larger, place.metres.share
+    if abs(larger) <= max(_DISAGREE, _SIGMAS * share):
+        return place
+    size = "larger" if larger > 0.0 else "smaller"
+    doubt = (
+        f"by the IMU everything is {100.0 * abs(larger):.1f} % {size} (deviation "
+        f"{100.0 * share:.1f} %): check the sizes of the markers, or the distances, and the "
+        "accelerometer"
+    )
+    return replace(place, doubts=(*place.doubts, doubt))
 
 
 def _missing(placement: Placement, imu: GivenImu, why: str) -> str:
@@ -112,12 +130,3 @@ def _missing(placement: Placement, imu: GivenImu, why: str) -> str:
     if imu.asked:
         raise MappingError(f"the IMU gives no scale: {why}")
     return f"the IMU gives no scale: {why}"
-
-
-def _disagreement(larger: float, share: float) -> str:
-    size = "larger" if larger > 0.0 else "smaller"
-    return (
-        f"by the IMU everything is {100.0 * abs(larger):.1f} % {size} (deviation "
-        f"{100.0 * share:.1f} %): check the sizes of the markers, or the distances, and the "
-        "accelerometer"
-    )

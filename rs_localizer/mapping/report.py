@@ -50,24 +50,20 @@ def written(built: Built, images: int, views: int) -> str:
 
 
 def _of_imu(place: InertialPlace) -> list[tuple[str, str]]:
-    """What an IMU says, beside the scale where it gives that."""
+    """What an IMU says, beside scale and up where it gives them."""
     metres = place.metres
     if metres is None:
         return []
     mount, found = metres.mount, metres.metric
-    tilts = np.degrees([place.tilt, found.gravity_deviation])
+    rows = []
+    if place.checked:
+        more = "larger" if place.larger > 0.0 else "smaller"
+        share = 100.0 * np.array([abs(place.larger), metres.share])
+        tilts = np.degrees([place.tilt, found.gravity_deviation])
+        rows = [
+            ("scale by the IMU", f"{share[0]:.2f} % {more}, +- {share[1]:.2f} %"),
+            ("gravity by the IMU", f"{tilts[0]:.2f} deg from -z, +- {tilts[1]:.2f} deg"),
+        ]
     offset = f"{1e3 * mount.mount.delay:+.2f} +- {1e3 * mount.delay_deviation:.2f} ms"
     bias = " ".join(f"{value:.2f}" for value in found.bias)
-    more = "larger" if place.larger > 0.0 else "smaller"
-    return [
-        (
-            "scale by the IMU",
-            f"{100.0 * abs(place.larger):.2f} % {more}, +- {100.0 * metres.share:.2f} %",
-        ),
-        (
-            "gravity by the IMU",
-            f"{tilts[0]:.2f} deg from -z, +- {tilts[1]:.2f} deg",
-        ),
-        ("imu.time_offset", offset),
-        ("bias of the accelerometer", f"{bias} m/s^2"),
-    ]
+    return [*rows, ("imu.time_offset", offset), ("bias of the accelerometer", f"{bias} m/s^2")]

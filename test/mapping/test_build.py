@@ -148,7 +148,9 @@ def test_the_report_says_it(built: Built) -> None:
 def test_the_report_says_what_an_imu_says(built: Built) -> None:
     felt = Felt.random(0)
     metres = inertial_metres(refined_of(felt), imu_of(felt))
-    page = written(replace(built, place=InertialPlace(built.placement, metres)), 60, 27)
+    place = InertialPlace(built.placement, metres, checked=True)
+    page = written(replace(built, place=place), 60, 27)
+    assert "| gravity by the IMU | " in page
     assert f"{100 * abs(felt.scale / built.placement.similarity.scale - 1):.0f}" in page
     assert "| imu.time_offset | +5.0" in page
     assert "| z is up | as in the marker map |" in page

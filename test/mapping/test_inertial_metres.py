@@ -104,6 +104,18 @@ def test_tf_is_checked_and_not_believed(felt: Felt, refined: RefinedMap, imu: Im
     assert found.metric.scale == pytest.approx(felt.scale, rel=5e-3)
 
 
+def test_where_turns_do_not_tell_the_rotation_tf_does() -> None:
+    """About one axis alone."""
+    felt = Felt.random(10, turn=np.array([0.2, 0.0, 0.0]))
+    refined, imu = refined_of(felt), imu_of(felt)
+    with pytest.raises(NoMetres, match="turn the camera about all axes"):
+        inertial_metres(refined, imu)
+    given = replace(imu, camera_from_imu=felt.camera_from_imu.as_matrix())
+    found = inertial_metres(refined, given)
+    assert found.metric.scale == pytest.approx(felt.scale, rel=0.01)
+    assert angle(found.metric.gravity, felt.down) < 0.3
+
+
 def without_accelerometer(imu: ImuRecording) -> ImuRecording:
     return replace(imu, specific_forces=None)
 
