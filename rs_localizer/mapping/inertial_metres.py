@@ -17,7 +17,7 @@ from rs_localizer.trajectory.metric import Lever, Metric, NoMetric, metric
 from rs_localizer.trajectory.mount_on_motion import MountOnMotion, mount_on_motion
 
 # Where the IMU is, m: as TF says, which is drawn on paper; where nothing says so, in the same box.
-_DRAWN, _SAME_BOX = 0.02, 0.1
+_DRAWN, _SAME_BOX = 0.05, 0.1
 # Quicker motion than of twice this period (s) or so many images counts for nothing: the images'
 # spline lacks some of it.
 _SPACING, _IMAGES = 0.15, 2.0

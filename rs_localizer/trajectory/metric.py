@@ -40,13 +40,15 @@ from rs_localizer.trajectory.metric_equations import (
 # scale, by itself.
 _GRAVITY_DEVIATION, _BIAS_DEVIATION, _SCALE_DEVIATION = 0.02, 0.5, 0.01
 # Variance of accelerations by that of positions, s^-4: what may be, and where to begin.
-_RATIOS = np.geomspace(1e-3, 1e7, 21)
+_RATIOS = np.geomspace(1e-3, 1e7, 41)
 _PLAIN = 1e3
 _ROUNDS, _TRIALS = 5, 4
 # Squared errors of three axes count up to so many times their median: 6 deviations.
 _OUTLIER = 15.0
 # Orientations by images have errors (rad) that last, which residuals do not show.
 _BEND = 5e-4
+# Rounding leaves at least this share of squares, and a camera at rest has none.
+_EXACT, _NOTHING = 1e-12, 1e-30
 # So much of the accelerations that images show must be the accelerometer's.
 _LEAST_EXPLAINED = 0.5
 
@@ -149,8 +151,10 @@ def _fitting(means: Sequence[Means], fit: _Fitted) -> list[BoolArray]:
 def _start(plain: Whitened) -> Array:
     """Forces' scale and gravity (4,) of least squares."""
     alone = slice(FORCE, GRAVITY.stop)
-    found = np.asarray(np.linalg.solve(plain.normal[alone, alone], plain.right[alone]), np.float64)
-    explained = float(found @ plain.right[alone]) / plain.squared
+    # At rest, forces and gravity are one column.
+    normal, right = plain.normal[alone, alone], plain.right[alone]
+    found = np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], np.float64)
+    explained = float(found @ right) / max(plain.squared, _NOTHING)
     if not found[FORCE] > 0.0:
         if explained < _LEAST_EXPLAINED:
             raise NoMetric(_too_little(0.0))
@@ -171,7 +175,7 @@ def _too_little(explained: float) -> str:
 
 def _fit(whitened: Whitened, ratio: float, first: Array, lever: Lever) -> _Fitted:
     inverse, down = float(first[FORCE]), first[GRAVITY] / np.linalg.norm(first[GRAVITY])
-    variance = whitened.squared / whitened.count
+    variance = max(whitened.squared, _NOTHING) / whitened.count
     for _ in range(_ROUNDS):
         rows, values = _known(inverse, down, lever)
         normal = rows.T @ rows
@@ -179,7 +183,7 @@ def _fit(whitened: Whitened, ratio: float, first: Array, lever: Lever) -> _Fitte
         right = rows.T @ values
         right[:INVERSE] += whitened.right / variance
         found = np.asarray(np.linalg.solve(normal, right), np.float64)
-        left = whitened.left(found)
+        left = max(whitened.left(found), _EXACT * whitened.squared, _NOTHING)
         variance = left / (whitened.count - INVERSE)
         inverse, down = float(found[INVERSE]), found[GRAVITY] / np.linalg.norm(found[GRAVITY])
     likelihood = -0.5 * (
@@ -187,7 +191,7 @@ def _fit(whitened: Whitened, ratio: float, first: Array, lever: Lever) -> _Fitte
         + whitened.log_determinant
         + np.linalg.slogdet(normal)[1]
     )
-    explained = 1.0 - left / whitened.squared
+    explained = 1.0 - left / max(whitened.squared, _NOTHING)
     covariance = np.asarray(np.linalg.inv(normal), np.float64)
     return _Fitted(found, covariance, ratio, variance, float(likelihood), explained)
 

@@ -10,7 +10,7 @@ from felt import GRAVITY, Felt
 
 from rs_localizer.trajectory.gyro import GyroSamples, NoMount
 from rs_localizer.trajectory.mean_accelerations import ForceSamples, Means, mean_accelerations
-from rs_localizer.trajectory.metric import Lever, Metric, metric
+from rs_localizer.trajectory.metric import Lever, Metric, NoMetric, metric
 from rs_localizer.trajectory.metric_equations import covariance
 from rs_localizer.trajectory.mount_on_motion import mount_on_motion
 from rs_localizer.trajectory.spline import Layout, Spline
@@ -137,6 +137,18 @@ def test_a_knock_does_not_count() -> None:
         felt.spline(SECONDS), samples, felt.camera_from_imu.as_matrix(), 0.15
     )
     assert metric(parts, UNKNOWN).scale == pytest.approx(felt.scale, rel=3e-3)
+
+
+def test_a_camera_at_rest_determines_nothing() -> None:
+    """Nor does it divide by nothing."""
+    felt = Felt.random(10, way=0.0, turn=0.0)
+    stamps = felt.stamps(SECONDS)
+    samples = ForceSamples(stamps + felt.delay, felt.forces(stamps))
+    parts = mean_accelerations(
+        felt.spline(SECONDS), samples, felt.camera_from_imu.as_matrix(), 0.15
+    )
+    with pytest.raises(NoMetric, match="the camera hardly moved"):
+        metric(parts, UNKNOWN)
 
 
 def test_the_mount_is_found() -> None:
