@@ -7,6 +7,7 @@ The map has a size and an orientation of its own: gravity points anywhere in it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,10 +39,10 @@ class Felt:
     way: float = WAY
 
     @staticmethod
-    def random(seed: int, **other: object) -> Felt:
+    def random(seed: int, **other: Any) -> Felt:
         rng = np.random.default_rng(seed)
         frequencies = 2.0 * np.pi * rng.uniform(0.15, 1.3, (6, 4))
-        return Felt(frequencies, rng.uniform(0.0, 6.28, (6, 4)), **other)  # type: ignore[arg-type]
+        return Felt(frequencies, rng.uniform(0.0, 6.28, (6, 4)), **other)
 
     def _sines(self, t: np.ndarray) -> np.ndarray:
         return np.sum(np.sin(self.frequencies * t[:, None, None] + self.phases), axis=2)
