@@ -18,7 +18,7 @@ from rs_localizer.inertial import turning
 from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
 from rs_localizer.inertial.gaps import span_of
 from rs_localizer.inertial.gravity import gravity_seen
-from rs_localizer.inertial.offset_search import OffsetSearch
+from rs_localizer.inertial.offset_search import OffsetSearch, warm_up
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.sight import Sight
@@ -94,6 +94,7 @@ class GyroscopeAid:
         assert within is not None
         assert between is not None
         span_of(times, 0, 1)
+        warm_up()
         within.known.at(0.0)
         within.known.late(0.0)
         contradicts(np.zeros(3), within.known.error[:3, :3])

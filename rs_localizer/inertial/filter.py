@@ -196,7 +196,9 @@ class GyroscopeFilter:
         """``known``: places of a step that the prediction ``before`` was of."""
         whole = len(known) == PARAMETERS
         after = np.ascontiguousarray(posterior if whole else posterior[np.ix_(known, known)])
-        gain, gained, tied = _gain(before, after, np.ascontiguousarray(with_parameters))
+        gain, gained, tied = _gain(
+            np.ascontiguousarray(before), after, np.ascontiguousarray(with_parameters)
+        )
         covariance = self.errors.covariance - gained
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain @ step
         if not whole:

@@ -25,6 +25,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
+from rs_localizer.core.state import PARAMETERS
 from rs_localizer.inertial.settings import BIAS_DEVIATION, OFFSET_DEVIATION, SCALE_DEVIATION
 from rs_localizer.inertial.sight import Sight
 
@@ -35,6 +36,7 @@ _OFFSETS = np.arange(-round(_FARTHEST / _STEP), round(_FARTHEST / _STEP) + 1) * 
 # costs so much more (odds of a million to one).
 _OTHER, _CLEARLY = 3e-3, 28.0
 _FEWEST = 6  # frames
+_AGREE = 4.0  # squared errors per degree of freedom of turns that agree
 # Samples on both sides, s; frames farther apart than this are not connected by their turn.
 _AROUND_NS, _LONGEST_NS = 10_000_000, 200_000_000
 # A frame says nothing where the gyroscope's rates differ by less than this, rad/s.
@@ -68,7 +70,8 @@ class OffsetSearch:
     def __init__(self, about: float = 0.0) -> None:
         self._about = about
         self._waiting: deque[Sight] = deque()
-        self._costs = (_OFFSETS / OFFSET_DEVIATION) ** 2
+        self._costs = (_OFFSETS / OFFSET_DEVIATION) ** 2  # of rows, and what is assumed
+        self._closed = np.zeros(len(_OFFSETS))  # of orientations in chains that have ended
         self._frames = self._seen = 0
         self._begin(None)
 
@@ -162,19 +165,24 @@ class OffsetSearch:
         self._by_gyroscope[:, 3:] += step * np.einsum("nji,nj->ij", here, shown)
         self._turned = then.T @ self._turned
 
-    def _orientation_costs(self) -> Array:
+    def _open(self) -> Array:
+        """Costs of the orientations in this chain."""
         solved = np.linalg.solve(self._normal, self._slopes.T)
         costs: Array = self._squares - np.einsum("gi,ig->g", self._slopes, solved)
         return costs
 
     def _close(self) -> None:
         """Keep what a chain of orientations said."""
-        self._costs += self._orientation_costs()
+        self._closed += self._open()
         self._begin(None)
 
     def _decided(self) -> FoundOffset | None:
-        costs = self._costs + self._orientation_costs()
+        turns = self._closed + self._open()
+        costs = self._costs + turns
         best = int(np.argmin(costs))
+        # One that is not on this body, or turned on it, agrees nowhere.
+        if turns[best] > _AGREE * 3.0 * _WORTH * self._frames:
+            return None
         far = np.abs(_OFFSETS - _OFFSETS[best]) > _OTHER
         if not 0 < best < len(costs) - 1 or np.any(costs[far] < costs[best] + _CLEARLY):
             return None
@@ -185,6 +193,19 @@ class OffsetSearch:
         shift = 0.5 * _STEP * (before - after) / bend
         deviation = _STEP * np.sqrt(2.0 / bend)
         return FoundOffset(self._about + float(_OFFSETS[best] + shift), float(deviation))
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them from the cache."""
+    still, rows = np.tile(np.eye(3), (2, 1, 1)), np.zeros(2)
+    base = np.zeros((2, 2, PARAMETERS))
+    times = np.arange(-4.0, 5.0)
+    cubics = spline(times, np.zeros((9, 3)))
+    knots = rotations_at_knots(times, cubics)
+    _row_costs(
+        np.zeros((2, 2)), np.zeros((2, 2, 3)), base, np.zeros((3, PARAMETERS)), rows, still,
+        times, cubics, knots, rows,
+    )  # fmt: skip
 
 
 def _is_whole(times_ns: IntArray) -> bool:
