@@ -178,7 +178,7 @@ class Tracker:
                     self._track = None
             return result
         self._track = _followed(self._track, prior, result, time_ns)
-        if self._aid is not None and imu is not None and self._aid.searches:
+        if self._aid is not None and imu is not None and self._aid.wants_sight():
             camera = self.localizer.camera
             self._aid.seek(sight_of(camera, points, pixels, result, time_ns))
         return result

@@ -83,6 +83,7 @@ class GyroscopeAid:
         self._state = Alone.NO_SAMPLES
         self._status: InertialStatus | None = None  # until it is asked for
         self._search = OffsetSearch() if settings.estimate_time_offset else None
+        self._shaken = False  # in this frame, by the gyroscope
 
     def warm_up(self) -> None:
         """Compile every kernel that frames may need, or load it from the cache."""
@@ -124,6 +125,10 @@ class GyroscopeAid:
         """Whether the time offset is still looked for among all that are possible."""
         return self._search is not None
 
+    def wants_sight(self) -> bool:
+        """Whether this frame is to help in that: only where the camera vibrates one may err."""
+        return self._shaken and self._search is not None and self._search.wants()
+
     def seek(self, sight: Sight | None) -> None:
         """Look for the time offset with one more frame."""
         if self._search is None or sight is None:
@@ -151,7 +156,7 @@ class GyroscopeAid:
             localized: localizes the frame with what is foreseen, or with the camera alone; and the
                 prior that it did so with.
         """
-        self._status = None
+        self._status, self._shaken = None, False
         if self._last_ns is not None and middle_ns > self._last_ns:
             self.filter.walk(1e-9 * (middle_ns - self._last_ns))
         self._last_ns = middle_ns
@@ -186,6 +191,7 @@ class GyroscopeAid:
         if turn is None:
             self._state = Alone.NOT_COVERED
             return None
+        self._shaken = turn.known.roughness > turning.MOST_ROUGH
         last = before()
         if last is not None:
             errors = self.filter.errors

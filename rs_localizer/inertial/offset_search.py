@@ -38,11 +38,11 @@ _OTHER, _CLEARLY = 3e-3, 28.0
 _FEWEST = 6  # frames
 _AGREE = 4.0  # squared errors per degree of freedom of turns that agree
 # Samples on both sides, s; frames farther apart than this are not connected by their turn.
-_AROUND_NS, _LONGEST_NS = 10_000_000, 200_000_000
+_AROUND_NS, _LONGEST_NS = 10_000_000, 500_000_000
 # A frame says nothing where the gyroscope's rates differ by less than this, rad/s.
 _LEAST_SWING = 0.03
 # After so many frames without a decision only some are looked at: nothing new is to be seen.
-_PATIENCE, _LATER = 90, 10
+_PATIENCE, _LATER = 60, 10
 # What orientations are off by beside their noise, rad: the model, and what neighbours share.
 _LEAST_DEVIATION = 5e-4
 # Costs of a frame are worth this part: errors of neighbouring frames are alike.
@@ -85,11 +85,14 @@ class OffsetSearch:
         self._squares = np.zeros(len(_OFFSETS))
         self._first = None if sight is None else sight.rotation
 
+    def wants(self) -> bool:
+        """Whether the next frame is to be looked at."""
+        self._seen += 1
+        return self._seen < _PATIENCE or self._seen % _LATER == 0
+
     def add(self, sight: Sight) -> None:
         """A frame; it is looked at when there are samples for all offsets."""
-        self._seen += 1
-        if self._seen < _PATIENCE or self._seen % _LATER == 0:
-            self._waiting.append(sight)
+        self._waiting.append(sight)
 
     def look(self, times_ns: IntArray, rates: Array) -> FoundOffset | None:
         """Look at the frames whose samples have come; the offset if it is found.

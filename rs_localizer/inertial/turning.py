@@ -34,8 +34,7 @@ _LEAST_SHIFT = 1e-4
 # A vibration of more than this (rad per readout) of whose phase nothing is known, because the
 # offset is not known this well (s), says nothing of bias and offset: one that is in step with the
 # frames is the same in all of them, as a bias is.
-_MOST_ROUGH, _NEAR = 2e-3, 5e-4
-_DIAGONAL = np.diag_indices(3)
+MOST_ROUGH, _NEAR = 2e-3, 5e-4
 _WAVE_SLOPE = 60.0  # squared slope of a line through a wave, to its mean square; at most
 
 
@@ -91,7 +90,6 @@ def turn_within(
     rate_noise = errors.noise * readout_time / math.sqrt(period)
     delay = math.sqrt(errors.covariance[OFFSET, OFFSET] + JITTER**2) / readout_time
     rate_error = readout_time**2 * errors.covariance[BIAS, BIAS]
-    rate_error[_DIAGONAL] += SCALE_DEVIATION**2 * float(turn[3] @ turn[3])
     known = KnownTurn(*turn, error, rate_noise, delay, rate_error)
     return TurnWithin(known, by_parameters, variances)
 
@@ -137,7 +135,7 @@ def _within(
             variances[k] += _WALK_SLOPE * walk + scale * turned
         else:
             variances[k] += _WALK_CURVATURE * walk + scale * changed
-    if rough * min(deviation / _NEAR, 1.0) > _MOST_ROUGH:
+    if rough * min(deviation / _NEAR, 1.0) > MOST_ROUGH:
         for k in range(6):
             variances[k] += rough * rough * (2.0 if k < 3 else 2.0 * _WAVE_SLOPE)
             uncertain = 0.0

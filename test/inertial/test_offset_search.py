@@ -12,7 +12,7 @@ from rs_localizer.lab.experiments.honesty.estimating import believed
 from rs_localizer.lab.experiments.inertial.recordings import record
 from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.lab.independent.gyroscopes import Imu
-from rs_localizer.lab.independent.motions import rest, shaken_hand
+from rs_localizer.lab.independent.motions import hand, rest, shaken_hand
 from rs_localizer.lab.independent.scenes import Rich
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
@@ -50,6 +50,13 @@ def test_a_camera_at_rest_says_nothing():
     going, status = followed(tracker_of(recorded), recorded, 12)
     assert all(going)
     assert status.time_offset_deviation > 5e-3
+
+
+def test_a_hand_alone_is_left_to_the_filter():
+    recorded = record(Camera(), hand, Rich(), (1, 8), 5)
+    tracker = tracker_of(recorded)
+    followed(tracker, recorded, 8)
+    assert not tracker._aid.wants_sight()
 
 
 def test_a_given_offset_is_not_searched():
