@@ -31,7 +31,8 @@ from rs_localizer.inertial.sight import Sight
 
 # Offsets to try, s: three standard deviations; a vibration of 120 Hz has 16 steps in a cycle.
 _FARTHEST, _STEP = 3.0 * OFFSET_DEVIATION, 5e-4
-_OFFSETS = np.arange(-round(_FARTHEST / _STEP), round(_FARTHEST / _STEP) + 1) * _STEP
+_EACH = round(_FARTHEST / _STEP)
+_OFFSETS: Array = _STEP * np.arange(-_EACH, _EACH + 1, dtype=np.float64)
 # Offsets farther than this from the best one (s) are another mode; it is no longer possible when it
 # costs so much more (odds of a million to one).
 _OTHER, _CLEARLY = 3e-3, 28.0

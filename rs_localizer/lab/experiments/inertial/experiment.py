@@ -138,7 +138,8 @@ def _offsets(context: Context) -> Step:
         " and ".join(f"{hertz:g} Hz" for _, hertz in shaking): partial(shaken_hand, shaking=shaking)
         for shaking in (_SHAKING, *(((0.3, hertz),) for hertz in (60.0, 61.3, 120.0)))
     }
-    for name, motion in {"hand": hand, **shaken}.items():
+    motions: dict[str, MakeMotions] = {"hand": hand, **shaken}
+    for name, motion in motions.items():
         imu = replace(Imu(), offset=_OFFSET)
         recorded = record(Camera(), motion, Rich(), (count, _TEN_SECONDS), context.seed, imu)
         followed = follow(recorded, 1.0, True, _SECOND)
