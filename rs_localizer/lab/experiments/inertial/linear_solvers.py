@@ -13,11 +13,12 @@ are rotated by what was found before the next iteration, where ``v`` is small.
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array
 from rs_localizer.solvers.table import Solver
 
 
@@ -34,18 +35,9 @@ def linear_solver(
     return Solver(solve, solve, size, 1, rolling_shutter=True)
 
 
-def _solve(
-    turn_known: bool,
-    vertical: tuple[Array, Array] | None,
-    points: Array,
-    rays: Array,
-    tau: Array,
-    samples: IntArray,
-    rotations: Array,
-    iterations: int,
-    models: Array,
-) -> None:
-    """Arguments and result as in :mod:`rs_localizer.solvers.batch`, the first two apart."""
+def _solve(turn_known: bool, vertical: tuple[Array, Array] | None, *batch: Any) -> None:
+    """``batch`` is what kernels take, see :mod:`rs_localizer.solvers.batch`."""
+    points, rays, tau, samples, rotations, iterations, models = batch
     axes = np.eye(3) if vertical is None else vertical[1][:, None]
     rotation = np.broadcast_to(rotations, (len(samples), 3, 3))
     if vertical is not None:
