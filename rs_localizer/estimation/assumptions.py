@@ -120,7 +120,7 @@ def turn_seen(terms: PriorTerms, turn: KnownTurn | None) -> TurnSeen | None:
     """What a known turn says of the speed, beside the prior of the configuration."""
     if turn is None:
         return None
-    variance = float(np.trace(turn.error[:3, :3])) / 3.0 + turn.rate_noise**2
-    precision = float(terms.informations[0][ANGULAR, ANGULAR][0, 0])
+    variance = sum(turn.error.diagonal()[:3].tolist()) / 3.0 + turn.rate_noise**2
+    precision = float(terms.informations[0, ANGULAR.start, ANGULAR.start])
     typical = 1.0 / precision if precision > 0.0 else math.inf
     return TurnSeen(float(turn.rate @ turn.rate), variance, typical)
