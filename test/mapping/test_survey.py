@@ -142,13 +142,14 @@ def turned_over(chained: Chained, marker: int) -> Chained:
     )
 
 
-@pytest.mark.parametrize("origin", [0, 1])
+@pytest.mark.parametrize("origin", [0, 2])
 def test_a_marker_that_was_turned_over_is_turned_back(
     spotted: list[Spotted], poses: Poses, origin: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "rs_localizer.mapping.survey.chain", lambda *given: turned_over(chain(*given), 1)
+        "rs_localizer.mapping.survey.chain", lambda *given: turned_over(chain(*given), 2)
     )
-    found = survey(camera(), spotted, MARKERS, origin=origin)
+    # All of it would turn it back on the way.
+    found = survey(camera(), spotted[:40], MARKERS, origin=origin)
     assert found.rare == ()
     check(found, poses, 0.03)

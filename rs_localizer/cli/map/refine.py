@@ -170,4 +170,7 @@ def _write(args: argparse.Namespace, landmarks: Map, found: RefinedMap) -> None:
     print(f"written: {', '.join(map(str, files))}")
     left = np.count_nonzero(~found.refined)
     if left:
-        print(f"{left} landmarks stayed as they were: fewer than two images determine them")
+        print(
+            f"{left} landmarks stayed as they were: seen by fewer than two images, or from "
+            "too few sides to be known better"
+        )
