@@ -1,6 +1,6 @@
 """The figures of ``docs/mapping.md``:
 
-python -m rs_localizer.lab.experiments.mapping bend bound large surveys
+python -m rs_localizer.lab.experiments.mapping bend bound large surveys rendered
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ import sys
 from collections.abc import Callable, Iterator
 
 from rs_localizer.lab.experiments.mapping.refining import bend, bound, large
-from rs_localizer.lab.experiments.mapping.surveying import surveys
+from rs_localizer.lab.experiments.mapping.surveying import rendered, surveys
 from rs_localizer.process.arguments import integer
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
     "bend": bend, "bound": bound, "large": large, "surveys": surveys,
+    "rendered": rendered,
 }  # fmt: skip
 
 
