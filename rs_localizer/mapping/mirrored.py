@@ -66,10 +66,10 @@ def _turned_over(seen: Observations, state: State) -> Array:
     layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
     times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
     markers, middles = seen.points // 4, corners.mean(axis=1)
-    toward = state.spline.states(times).positions - middles[markers]
+    toward: Array = state.spline.states(times).positions - middles[markers]
     toward /= np.linalg.norm(toward, axis=1)[:, None]
     sums = [np.bincount(markers, of, len(corners)) for of in toward.T]
-    sight = np.column_stack(sums)
+    sight: Array = np.column_stack(sums)
     sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
     depth = np.einsum("mci,mi->mc", corners - middles[:, None], sight)
     return np.asarray(corners - 2.0 * depth[..., None] * sight[:, None]).reshape(-1, 3)
@@ -90,7 +90,7 @@ def _costs(problem: Problem, state: State, deviation: float) -> Array:
     rest = np.maximum(1.0 - problem.errors(state) / limit, 0.0)
     costs = (1.0 - rest**3) * limit / (3.0 * deviation**2)
     points = problem.observations.points
-    return np.bincount(points // 4, costs, len(state.landmarks) // 4)
+    return np.asarray(np.bincount(points // 4, costs, len(state.landmarks) // 4), np.float64)
 
 
 def _normals(state: State) -> Array:

@@ -174,7 +174,7 @@ class _Refinement:
             camera=with_lens(replace(self.camera, readout_time=abs(readout_time)), state.lens),
             readout_time=readout_time,
             readout_time_deviation=math.sqrt(inflation * placed.shared[0, 0]) if free else math.nan,
-            asked_readout=self._asked(deviation),
+            asked_readout=self._asked(deviation, inflation),
             deviation=deviation * math.sqrt(left_over(len(inliers), used)),
             squared_errors=all_squared,
             inliers=all_squared < (LIMIT * deviation) ** 2,
@@ -197,16 +197,17 @@ class _Refinement:
         own *= left_over(len(inside), _freedoms(self.state.spline, seen.frames))
         return Pull(own * pull.found, pull.expected).inflation(independent)
 
-    def _asked(self, deviation: float) -> AskedReadout | None:
+    def _asked(self, deviation: float, inflation: float) -> AskedReadout | None:
         """Whether a readout time that was given is the one of the images."""
         given = self.camera.readout_time > 0.0 and not self.freedom.readout_time
         if not given or not self.prepared.tells_readout:
             return None
         free = self._problem(replace(self.freedom, readout_time=True))
         try:
-            return asked_readout(free, self.state, deviation)
+            asked = asked_readout(free, self.state, deviation)
         except Undetermined:
             return None
+        return replace(asked, deviation=math.sqrt(inflation) * asked.deviation)
 
 
 def _freedoms(spline: Spline, frames: IntArray) -> int:

@@ -74,7 +74,7 @@ class Survey:
     def poor(self) -> BoolArray:
         """Which markers (m,) are known worse, beside the others, than a tenth of their size."""
         off = np.linalg.norm(self.deviations_of_shape[:, :PLACE], axis=1)
-        return off > _POOR * np.array([marker.size for marker in self.markers])
+        return np.asarray(off > _POOR * np.array([marker.size for marker in self.markers]))
 
     @property
     def deviations_of_shape(self) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.lab.experiments.mapping.rendered import Lighting, rendered_spots
 from rs_localizer.lab.experiments.mapping.rooms import (
     SQUARE,
@@ -22,6 +22,8 @@ from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.mapping.spotting import Spotted, every_marker
 from rs_localizer.mapping.survey import Survey, survey
 from rs_localizer.markers.families import family
+from rs_localizer.trajectory.fit import Fit
+from rs_localizer.trajectory.problem import LIMIT
 
 FAMILY = "4x4_50"
 _NOISE = 0.1  # px
@@ -78,8 +80,8 @@ class _Errors:
     turns: Array  # deg
     places_of_shape: Array
     turns_of_shape: Array
-    within: Array  # of each: share of the coordinates within three deviations
-    within_of_shape: Array
+    within: BoolArray  # of each: share of the coordinates within three deviations
+    within_of_shape: BoolArray
     squared: float  # mean squared error by the own covariance
     squared_by_bound: float
     readout: float  # in its own deviations
@@ -129,16 +131,25 @@ def _errors(found: Survey, poses: list[tuple[Array, Array]], size: float) -> _Er
     shape = _off(found, true, over, squares.mean(axis=0) - over @ ours.mean(axis=0))
     own, free = off[1:].ravel(), found.covariance[6:, 6:]
     squared = float(own @ np.linalg.solve(free, own)) / len(own)
-    asked, of_noise = found.asked_readout, found.fit.deviation**2 * found.fit.inflation
+    asked = found.asked_readout
     return _Errors(
         *_sizes(off[1:]),
         *_sizes(shape),
         np.abs(off[1:]) < 3.0 * found.deviations[1:],
         np.abs(shape) < 3.0 * found.deviations_of_shape,
         squared,
-        squared * of_noise / _NOISE**2,
+        squared * _by_bound(found.fit),
         np.nan if asked is None else (asked.asked - asked.given) / asked.deviation,
     )
+
+
+def _by_bound(found: Fit) -> float:
+    """The survey's covariance by that of the bound: the inverse of the normal matrix at the true
+    noise, all weights one.
+    """
+    squared, limit = found.squared_errors[found.inliers], (LIMIT * found.deviation) ** 2
+    weight = float(np.mean((1.0 - squared / limit) ** 2))
+    return found.inflation * found.deviation**2 / (weight * _NOISE**2)
 
 
 def _off(found: Survey, true: list[tuple[Array, Array]], turn: Array, shift: Array) -> Array:
