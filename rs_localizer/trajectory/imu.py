@@ -8,7 +8,8 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.fit import Fit, fit
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, first_mount
