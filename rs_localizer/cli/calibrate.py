@@ -28,13 +28,10 @@ from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
 from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.offline.image_sources import (
-    INFO_TYPE,
     Carried,
     Shot,
-    SourceError,
-    find_topic,
 )
-from rs_localizer.offline.imu_recording import read_imu_recording
+from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
 from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
@@ -163,20 +160,11 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
     with open_bag(path) as bag:
         imu = None
         if args.imu is not None:
-            imu = read_imu_recording(bag, args.imu or None, _camera_frame(args, bag))
+            imu = read_imu_recording(bag, args.imu or None, optical_frame(bag, args.camera_info))
         if args.image is None and has_frames(bag):
             return replace(_correspondences(args, bag, config), imu=imu)
         given = None if args.calibration is None else read_calibration(args.calibration)
         return replace(_detected(args, of_bag(bag, given, args).shots), imu=imu)
-
-
-def _camera_frame(args: argparse.Namespace, bag: BagReader) -> str:
-    """Optical frame of the camera, by its first camera_info; without one, TF cannot be asked."""
-    try:
-        topic = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
-    except SourceError:
-        return ""
-    return next((str(m.header.frame_id) for _, _, m in bag.messages([topic])), "")
 
 
 def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:
