@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 
 from rs_localizer.lab.experiments.mapping.refining import bend, bound, large
 from rs_localizer.lab.experiments.mapping.surveying import rendered, surveys
-from rs_localizer.lab.experiments.mapping.surveying import surveys
 from rs_localizer.lab.experiments.mapping.weighing import weighing
 from rs_localizer.process.arguments import integer
 
