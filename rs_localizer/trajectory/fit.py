@@ -141,11 +141,17 @@ def inflation_of(squared: Array, deviation: float, used: int) -> float:
     Huber's formula, ``E psi^2 / (E psi')^2``, where the matrix has the mean weight instead; and
     the freedoms that the motion used up.
     """
+    weight = (1.0 - squared / (LIMIT * deviation) ** 2) ** 2
+    psi_squared = np.mean(weight**2 * squared) / (2.0 * deviation**2)
+    steep = steepness(squared, deviation)
+    return float(psi_squared / np.mean(weight)) * steep**2 * left_over(len(squared), used)
+
+
+def steepness(squared: Array, deviation: float) -> float:
+    """Mean weight by ``E psi'``: how much the normal matrix is too steep for Tukey's estimator."""
     share = squared / (LIMIT * deviation) ** 2
     weight = (1.0 - share) ** 2
-    psi_squared = np.mean(weight**2 * squared) / (2.0 * deviation**2)
-    slope = np.mean(weight - 2.0 * share * (1.0 - share))
-    return float(psi_squared * np.mean(weight) / slope**2 * left_over(len(squared), used))
+    return float(np.mean(weight) / np.mean(weight - 2.0 * share * (1.0 - share)))
 
 
 def left_over(keypoints: int, used: int) -> float:
