@@ -80,14 +80,16 @@ class Inliers:
         found = fit(self.observations, start, self.inliers, terms, self.noise)
         return found[0], found[2]
 
-    def examined(self, state: Array, terms: PriorTerms, degree: int) -> Examined:
+    def examined(
+        self, state: Array, terms: PriorTerms, degree: int, neighbours: bool = True
+    ) -> Examined:
         """Shaking, up to a degree (0: none), and field at the best motion."""
         observations = self.observations
         found: Examined = examine(
             observations.packed, state, observations.row_time_gradient, observations.rays,
             observations.tau, self.inliers, terms, degree, self.freedom, self.noise,
             self.assumed.shake * SHAKE_SIZES, self.shake_prior,
-            self.field_sizes, self.field_prior,
+            self.field_sizes, self.field_prior, neighbours,
         )  # fmt: skip
         return found
 
@@ -103,7 +105,7 @@ class Inliers:
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> Mode:
         """The Gaussian about the best motion of a typical speed."""
         state, cost = self.fitted(start, terms)
-        examined = self.examined(state, terms, 0)
+        examined = self.examined(state, terms, 0, neighbours=False)
         volume = volume_of(terms, examined)
         evidence = self.worth * (examined.sizes.evidence + volume)
         if self.assumed.turn is not None:
@@ -140,8 +142,8 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
     for probability, mode in zip(possible, modes, strict=True):
         covariance += probability * mode.covariance
-    # Shaking that was not seen may be there all the same.
-    joint = found.covariance.copy()
+    # Shaking that was not seen may be there all the same, unless the camera rests.
+    joint = (1.0 - possible @ at_rest) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
     joint[:PARAMETERS, PARAMETERS:] = 0.0
     joint[PARAMETERS:, :PARAMETERS] = 0.0
@@ -149,6 +151,7 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
         found,
         state=state,
         covariance=joint,
+        shake=np.zeros_like(found.shake),  # it was that beside another motion
         squared_errors=frame.observations.squared_errors(state),
         model_error=float(possible @ [mode.field for mode in modes]),
         mirror=_mirror(modes, evidence, steps, covariance) if planar else None,
