@@ -16,6 +16,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
+from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
@@ -25,6 +26,8 @@ from rs_localizer.estimation.refine import apply_step, step_between
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
+# Along the flat valleys of small planes a fit may end before its steps do.
+_FITS = 4
 # Odds by which motion must explain the points better than rest, to count in the estimate. Where a
 # map or a lens is seen to be wrong, what looks like motion mostly is more of that, and the odds
 # grow by the second factor. The covariance allows for motion at even odds.
@@ -77,8 +80,13 @@ class Inliers:
 
     def fitted(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
         """State (24,) and cost of the best motion near a state."""
-        found = fit(self.observations, start, self.inliers, terms, self.noise)
-        return found[0], found[2]
+        for _ in range(_FITS):
+            start, _, cost, converged = fit(
+                self.observations, start, self.inliers, terms, self.noise
+            )
+            if converged:
+                break
+        return start, cost
 
     def examined(
         self, state: Array, terms: PriorTerms, degree: int, neighbours: bool = True
@@ -112,7 +120,7 @@ class Inliers:
             evidence += self.assumed.turn.evidence(speed)
         return Mode(
             state,
-            self.inflation / self.worth * examined.covariance,
+            along_arcs(self.inflation / self.worth * examined.covariance, state[9:12]),
             evidence,
             self.worth * volume,
             cost / self.noise**2,
