@@ -26,16 +26,20 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
 python := $(VENV)/bin/python
 
-.PHONY: demo test lint clean
+.PHONY: demo test warm lint clean
 .DELETE_ON_ERROR:
 
 demo: $(ready)
 	@$(python) -m rs_localizer demo --out $(OUT)
 
-# Kernels that two processes compile at once may round differently, and tests compare bits.
-test: lint
+# Kernels that two processes compile at once may round differently, and tests compare bits. Of
+# three processes one often waits, for nodes that have to hear of each other.
+test: $(ready)
+	@$(MAKE) --no-print-directory --jobs 2 lint warm
+	@$(python) -m pytest -q -n 3 --dist loadfile
+
+warm: $(ready)
 	@$(python) -m rs_localizer warm >/dev/null
-	@$(python) -m pytest -q -n 2 --dist loadfile
 
 lint: $(ready)
 	@$(python) -m ruff check --quiet --output-format concise .

@@ -5,9 +5,10 @@ import importlib
 TYPE_CHECKING = False  # type checkers take it for typing's, which takes milliseconds to import
 if TYPE_CHECKING:
     from rs_localizer.config import Acceleration, LocalizerConfig, VelocityPrior
-    from rs_localizer.core.camera import Camera, DistortionModel, Roi, ScanDirection
+    from rs_localizer.core.camera import Camera, DistortionModel, Roi
     from rs_localizer.core.reasons import Reason
     from rs_localizer.core.rectification import rectify
+    from rs_localizer.core.scanning import ScanDirection
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.types import Estimate, Failure
     from rs_localizer.core.units import CameraState, camera_state
@@ -46,9 +47,10 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
     # does not wait for them, and the program can take Ctrl-C in hand before they come (PEP 562).
     _HOMES = {
         "config": ("Acceleration", "LocalizerConfig", "VelocityPrior"),
-        "core.camera": ("Camera", "DistortionModel", "Roi", "ScanDirection"),
+        "core.camera": ("Camera", "DistortionModel", "Roi"),
         "core.reasons": ("Reason",),
         "core.rectification": ("rectify",),
+        "core.scanning": ("ScanDirection",),
         "core.shutter": ("Motion",),
         "core.types": ("Estimate", "Failure"),
         "core.units": ("CameraState", "camera_state"),

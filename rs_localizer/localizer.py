@@ -12,6 +12,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.assumptions import (
@@ -26,7 +27,6 @@ from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.prior_terms import PriorTerms, with_motion
 from rs_localizer.estimation.ransac import Candidate
-from rs_localizer.estimation.refine import step_between
 from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import MotionSearch

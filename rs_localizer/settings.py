@@ -186,12 +186,17 @@ def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
     return value
 
 
-def write_parameters(path: Path, readout_time: float, scan_direction: str) -> None:
-    """The shutter of a recording as a params file, for ``replay --params``."""
+def write_parameters(
+    path: Path, readout_time: float, scan_direction: str, time_offset: float | None = None
+) -> None:
+    """The shutter of a recording, and ``imu.time_offset`` (s) where it is known, as a params file,
+    for ``replay --params``.
+    """
     config = NodeConfig(readout_time=readout_time, scan_direction=scan_direction)
     path.write_text(
         f"/**/{NODE_NAME}:\n  ros__parameters:\n"  # in whatever namespace
         f"    readout_time: {config.readout_time!r}\n"
-        f"    scan_direction: {config.scan_direction}\n",
+        f"    scan_direction: {config.scan_direction}\n"
+        + ("" if time_offset is None else f"    imu.time_offset: {time_offset!r}\n"),
         encoding="utf-8",
     )

@@ -21,6 +21,7 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import (
     PARAMETERS,
+    step_between,
 )
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.motion_model import (
@@ -31,7 +32,7 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.refine import inverted, step_between
+from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.config import Acceleration
+from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_model import acceleration_covariance, predict, unshaken
-from rs_localizer.estimation.refine import apply_step, step_between
+from rs_localizer.estimation.refine import apply_step
 
 READOUT = 0.03
 FADING = 0.1  # s

@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.estimation.refine import step_between
+from rs_localizer.core.state import step_between
 from rs_localizer.tracking import Tracker
 
 READOUT = 0.03

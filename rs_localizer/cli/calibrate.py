@@ -16,7 +16,7 @@ from rs_localizer.cli.calibrate_table import tell, tell_lens
 from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
 from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
-from rs_localizer.cli.shots import file_shots
+from rs_localizer.cli.shots import clock_of, of_bag, of_files, tell_times
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
@@ -28,15 +28,10 @@ from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
 from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.offline.image_sources import (
-    IMAGE_TYPES,
-    INFO_TYPE,
     Carried,
     Shot,
-    SourceError,
-    find_topic,
-    from_bag,
 )
-from rs_localizer.offline.imu_recording import read_imu_recording
+from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
 from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
@@ -158,29 +153,18 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
             raise UsageError("--imu is for bags: a video or files have no IMU")
         known = args.calibration is not None
         camera = read_calibration(args.calibration) if known else _unknown((2, 2))
-        with file_shots(path, args.rate, camera) as shots:
-            return _detected(args, shots)
+        source = of_files(path, camera, clock_of(path, args.rate))
+        found = _detected(args, source.shots)
+        tell_times(source.clock)
+        return found
     with open_bag(path) as bag:
         imu = None
         if args.imu is not None:
-            imu = read_imu_recording(bag, args.imu or None, _camera_frame(args, bag))
+            imu = read_imu_recording(bag, args.imu or None, optical_frame(bag, args.camera_info))
         if args.image is None and has_frames(bag):
             return replace(_correspondences(args, bag, config), imu=imu)
-        topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
         given = None if args.calibration is None else read_calibration(args.calibration)
-        info = None
-        if given is None:
-            info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
-        return replace(_detected(args, from_bag(bag, topic, info, given)), imu=imu)
-
-
-def _camera_frame(args: argparse.Namespace, bag: BagReader) -> str:
-    """Optical frame of the camera, by its first camera_info; without one, TF cannot be asked."""
-    try:
-        topic = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
-    except SourceError:
-        return ""
-    return next((str(m.header.frame_id) for _, _, m in bag.messages([topic])), "")
+        return replace(_detected(args, of_bag(bag, given, args).shots), imu=imu)
 
 
 def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:

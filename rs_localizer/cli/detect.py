@@ -13,17 +13,16 @@ from tqdm import tqdm
 from rs_localizer.cli import UsageError, detect_features, many
 from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
 from rs_localizer.cli.image_source import (
-    Source,
     add_source_arguments,
-    opened,
     tell_left_out,
     tell_next,
     time_faults,
     write_shutter,
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
+from rs_localizer.cli.shots import Source, opened
 from rs_localizer.config import DetectorConfig
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import STORAGES
 from rs_localizer.offline.detect import Options, Recorded, record
 from rs_localizer.pipeline.images import FrameDetector
@@ -86,7 +85,7 @@ def detect_one(args: argparse.Namespace) -> Recorded:
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
     detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
     detector.warm_up()
-    with opened(args) as source:
+    with opened(args, args.images, args.start) as source:
         recorded = _record(args, source, detector)
     write_shutter(args)
     _tell(args, recorded, notices)

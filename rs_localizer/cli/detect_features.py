@@ -8,15 +8,10 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.image_source import (
-    opened,
-    tell_left_out,
-    tell_next,
-    time_faults,
-    write_shutter,
-)
+from rs_localizer.cli.image_source import tell_left_out, tell_next, time_faults, write_shutter
+from rs_localizer.cli.shots import opened
 from rs_localizer.config import FeatureConfig, FeatureKind
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.offline.detect import Options
 from rs_localizer.offline.detect_features import Extraction, record_features
 from rs_localizer.pipeline.features import FrameExtractor
@@ -56,7 +51,7 @@ def run(args: argparse.Namespace) -> None:
         args.storage, args.with_images, args.scan_direction or ScanDirection.TOP_TO_BOTTOM
     )
     with (
-        opened(args) as source,
+        opened(args, args.images, args.start) as source,
         tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
     ):
         extraction = record_features(source.shots, extractor, args.out, options, progress.update)

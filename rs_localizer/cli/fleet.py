@@ -38,6 +38,9 @@ from rs_localizer.process.arguments import integer
 # Arguments that say what to do with which recordings, and nothing of a result.
 _OF_THE_FLEET = ("recordings", "out", "workers", "scheduler", "overwrite")
 
+# Held while results are written.
+_LOCK = ".lock"
+
 # Figures of a recording that are told while others are waited for.
 _TOLD = 5
 
@@ -123,6 +126,7 @@ def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
         **{name: _absolute(v) if isinstance(v, Path) else v for name, v in kept.items()}
     )
     settings = readable(arguments)
+    names = folder_names(recordings, (CSV, MARKDOWN, PICTURE, PARTIAL, _LOCK))
     return [
         Task(
             plan.kind,
@@ -133,7 +137,7 @@ def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
             identity(plan.kind.command, settings, [recording, *plan.inputs(recording)]),
             program(),
         )
-        for recording, name in zip(recordings, folder_names(recordings), strict=True)
+        for recording, name in zip(recordings, names, strict=True)
     ]
 
 
@@ -165,7 +169,7 @@ def _check(tasks: list[Task], plan: Plan) -> None:
 @contextlib.contextmanager
 def only_one(out: Path) -> Iterator[None]:
     """Within ``with``, no other process writes results into a directory."""
-    with (out / ".lock").open("w") as lock:
+    with (out / _LOCK).open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from rs_localizer.cli import UsageError
 from rs_localizer.config import NodeConfig
@@ -28,17 +30,38 @@ def add_settings(
     )
 
 
-def given_settings(args: argparse.Namespace) -> NodeConfig:
+def given_settings(
+    args: argparse.Namespace,
+    also: Sequence[str] = (),
+    check: Callable[[NodeConfig], object] | None = None,
+) -> NodeConfig:
     """The settings of a params file, and single ones over them.
 
+    Args:
+        args: of :func:`add_settings`.
+        also: further assignments, ``name:=value``.
+        check: raises ``ValueError`` for settings that cannot be used.
+
     Raises:
-        UsageError: for what is no setting, or a wrong value.
+        UsageError: for what is no setting, or a wrong value, with where it was given.
     """
+    where, values = "--params", dict[str, Any]()
     try:
-        values = {} if args.params is None else load_params_file(args.params)
-        return build(values | dict(map(parse_assignment, args.assignments)))
+        if args.params is not None:
+            values = load_params_file(args.params)
+            where = f"--params: {args.params}"
+            _built(values, check)
+        where = "-p"
+        return _built(values | dict(map(parse_assignment, [*args.assignments, *also])), check)
     except ValueError as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(f"{where}: {error}") from error
+
+
+def _built(values: dict[str, Any], check: Callable[[NodeConfig], object] | None) -> NodeConfig:
+    config = build(values)
+    if check is not None:
+        check(config)
+    return config
 
 
 def row_time(text: str) -> float:

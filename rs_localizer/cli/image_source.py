@@ -1,46 +1,21 @@
-"""Where the images of ``detect`` come from, by its arguments, and what is told of them."""
+"""Arguments of commands that take images, and what is told of them beside the result."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
-from rs_localizer.cli import UsageError
-from rs_localizer.core.camera import Camera, ScanDirection
-from rs_localizer.io.bags import is_bag, open_bag
-from rs_localizer.io.calibration.files import CALIBRATION_KINDS, read_calibration
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.bags import is_bag
+from rs_localizer.io.calibration.files import CALIBRATION_KINDS
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.io.video import has_times
 from rs_localizer.io.whole import told
-from rs_localizer.offline.image_sources import (
-    IMAGE_TYPES,
-    INFO_TYPE,
-    Carried,
-    Shot,
-    find_topic,
-    from_bag,
-    from_files,
-    from_video,
-    have_times,
-    image_files,
-)
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import settings, write_parameters
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """Images, as far as they are open."""
-
-    shots: Iterator[Shot] | Iterator[Shot | Carried]
-    total: int | None  # None: unknown
-    clock: ImageClock | None  # of images without times of their own
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,46 +58,6 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     bag = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
     bag.add_argument("--image", metavar="TOPIC")
     bag.add_argument("--camera-info", metavar="TOPIC")
-
-
-@contextlib.contextmanager
-def opened(args: argparse.Namespace) -> Iterator[Source]:
-    """The images of a video, a bag or a folder.
-
-    Raises:
-        UsageError: for options that do not go with it, or that are missing.
-    """
-    if not is_bag(args.images):
-        yield _files(args)
-        return
-    for name in ("rate", "start"):
-        if getattr(args, name) is not None:
-            raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
-    with open_bag(args.images) as bag:
-        camera = None if args.calibration is None else read_calibration(args.calibration)
-        topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
-        info = None
-        if camera is None:
-            info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
-        yield Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
-
-
-def _files(args: argparse.Namespace) -> Source:
-    clock = ImageClock(args.rate, None if args.start is None else round(args.start * 1e9))
-    for name in ("image", "camera_info"):
-        if getattr(args, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
-    if args.calibration is None:
-        raise UsageError("a video or folder has no camera_info: give --calibration")
-    files = image_files(args.images) if args.images.is_dir() else None
-    if args.rate is None and files is not None and not have_times(files):
-        raise UsageError("the names of the files are not times in ns: give --rate")
-    if args.rate is None and files is None and not has_times(args.images):
-        raise UsageError("this video has no presentation times: give --rate")
-    camera: Camera = read_calibration(args.calibration)
-    if files is None:
-        return Source(from_video(args.images, camera, clock), None, clock)
-    return Source(from_files(files, camera, clock), len(files), clock)
 
 
 def write_shutter(args: argparse.Namespace) -> None:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
+from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.replay_exports import add_export_arguments, write_exports
 from rs_localizer.cli.replay_result import (
     BRIDGED,
@@ -44,7 +45,6 @@ from rs_localizer.offline.replay import (
 )
 from rs_localizer.offline.smoothed import smooth_frames
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.settings import build, load_params_file, parse_assignment
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,17 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: RECORDING_replay)",
     )
     offline.add_argument("--overwrite", action="store_true", help="replace an earlier result")
-    offline.add_argument(
-        "--params", type=Path, metavar="FILE", help="settings: a ROS 2 params file"
-    )
-    offline.add_argument(
-        "-p",
-        dest="assignments",
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="one setting, as after --ros-args; may be repeated",
-    )
+    add_settings(offline)
     offline.add_argument(
         "--map",
         type=Path,
@@ -134,7 +124,7 @@ def run(args: argparse.Namespace) -> None:
 def settings_of(args: argparse.Namespace) -> NodeConfig:
     """The settings that the arguments give; refuses those that cannot be."""
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
-    return _config(args.params, args.assignments + given)
+    return given_settings(args, given, FrameLocalizer)  # refuses what it cannot do
 
 
 def _refuse_images(recording: Path) -> None:
@@ -219,23 +209,6 @@ def _check_usage(args: argparse.Namespace) -> None:
             "--out, --overwrite, --params, --map, --row, --nerfstudio, --smooth and -p are for "
             "offline replay; with --ros the running node has the settings and publishes the result"
         )
-
-
-def _config(params: Path | None, assignments: list[str]) -> NodeConfig:
-    try:
-        values = {} if params is None else load_params_file(params)
-    except ValueError as error:
-        raise UsageError(f"--params: {error}") from error
-    try:
-        FrameLocalizer(build(values))  # refuses what it cannot do
-    except ValueError as error:
-        raise UsageError(f"--params: {params}: {error}") from error
-    try:
-        config = build(values | dict(map(parse_assignment, assignments)))
-        FrameLocalizer(config)
-    except ValueError as error:
-        raise UsageError(f"-p: {error}") from error
-    return config
 
 
 def _hint(bag: Path, params: Path | None) -> None:

@@ -12,7 +12,7 @@ from rs_localizer.cli.replay_result import VIEW
 from rs_localizer.cli.replay_summary import Tally
 from rs_localizer.io.bags import BagReader
 from rs_localizer.offline.replay import Topics
-from rs_localizer.offline.viewing.stream import write_view
+from rs_localizer.offline.viewing.stream import check_screen, write_view
 from rs_localizer.pipeline.frames import FrameLocalizer
 
 _SUFFIX = ".rrd"
@@ -42,7 +42,7 @@ def check_view(args: argparse.Namespace) -> None:
 
     Raises:
         UsageError: for options that do not go together.
-        ValueError: without the Rerun SDK.
+        ValueError: without the Rerun SDK or, for the viewer, a screen.
     """
     if args.rerun is None and not args.view:
         return
@@ -57,6 +57,8 @@ def check_view(args: argparse.Namespace) -> None:
             "--rerun and --view need the Rerun SDK, which is not installed: "
             "pip install 'rs_localizer[view]'"
         )
+    if args.view:
+        check_screen()
 
 
 def write_file(

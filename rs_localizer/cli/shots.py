@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from rs_localizer.cli import UsageError
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import is_bag, open_bag
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration.files import read_calibration
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.video import has_times
@@ -27,43 +28,79 @@ from rs_localizer.offline.image_sources import (
 )
 
 
-@contextmanager
-def shots_of(args: argparse.Namespace) -> Iterator[Iterator[Shot | Carried]]:
-    """The images of ``args.recording`` with the lens of ``args.calibration`` or, of a bag, its
-    camera_info; topics as ``args.image`` and ``args.camera_info`` name them.
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Images, as far as they are open."""
+
+    shots: Iterator[Shot] | Iterator[Shot | Carried]
+    total: int | None  # None: unknown
+    clock: ImageClock | None  # of images without times of their own
+
+
+@contextlib.contextmanager
+def opened(args: argparse.Namespace, path: Path, start: float | None = None) -> Iterator[Source]:
+    """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
+
+    Args:
+        args: with ``rate``, and the topics ``image`` and ``camera_info`` of a bag.
+        path: of the images.
+        start: time of the first one, s; not of a bag.
+
+    Raises:
+        UsageError: for options that do not go with it, or that are missing.
     """
-    path: Path = args.recording
-    given = None if args.calibration is None else read_calibration(args.calibration)
-    if is_bag(path):
-        if args.rate is not None:
-            raise UsageError("--rate is for videos and folders; a bag has its own times")
-        with open_bag(path) as bag:
-            topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
-            info = None
-            if given is None:
-                info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
-            yield from_bag(bag, topic, info, given)
+    if not is_bag(path):
+        for name in ("image", "camera_info"):
+            if getattr(args, name) is not None:
+                raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
+        if args.calibration is None:
+            raise UsageError("a video or folder has no camera_info: give --calibration")
+        clock = clock_of(path, args.rate, start)
+        yield of_files(path, read_calibration(args.calibration), clock)
         return
-    if given is None:
-        raise UsageError("a video or folder has no camera_info: give --calibration")
-    with file_shots(path, args.rate, given) as shots:
-        yield shots
+    for name, value in (("rate", args.rate), ("start", start)):
+        if value is not None:
+            raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
+    with open_bag(path) as bag:
+        given = None if args.calibration is None else read_calibration(args.calibration)
+        yield of_bag(bag, given, args)
 
 
-@contextmanager
-def file_shots(path: Path, rate: float | None, camera: Camera) -> Iterator[Iterator[Shot]]:
-    """The images of a video or folder; afterwards it is told what their times are."""
-    clock = ImageClock(rate)
+def of_bag(bag: BagReader, camera: Camera | None, args: argparse.Namespace) -> Source:
+    """The images of a bag; without a camera, with that of its camera_info."""
+    topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
+    info = None
+    if camera is None:
+        info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
+    return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
+
+
+def clock_of(path: Path, rate: float | None, start: float | None = None) -> ImageClock:
+    """What gives the images of a video or folder their times.
+
+    Raises:
+        UsageError: when they have none, and there is no rate.
+    """
+    if rate is None and not path.is_dir() and not has_times(path):
+        raise UsageError("this video has no presentation times: give --rate; the readout time "
+                         "scales with it")  # fmt: skip
+    if rate is None and path.is_dir() and not have_times(image_files(path)):
+        raise UsageError("the names of the files are not times in ns: give --rate")
+    return ImageClock(rate, None if start is None else round(start * 1e9))
+
+
+def of_files(path: Path, camera: Camera, clock: ImageClock) -> Source:
+    """The images of a video or folder."""
     if not path.is_dir():
-        if rate is None and not has_times(path):
-            raise UsageError("this video has no presentation times: give --rate; the readout time "
-                             "scales with it")  # fmt: skip
-        yield from_video(path, camera, clock)
-    else:
-        files = image_files(path)
-        if rate is None and not have_times(files):
-            raise UsageError("the names of the files are not times in ns: give --rate")
-        yield from_files(files, camera, clock)
+        return Source(from_video(path, camera, clock), None, clock)
+    files = image_files(path)
+    return Source(from_files(files, camera, clock), len(files), clock)
+
+
+def tell_times(clock: ImageClock | None) -> None:
+    """Say where the times of images are from that have been read, and what speaks against them."""
+    if clock is None:
+        return
     print(clock.told())
     if fault := clock.fault():
         print(f"warning: {fault}")

@@ -10,7 +10,8 @@ import numpy as np
 
 from rs_localizer import data
 from rs_localizer.cli import UsageError
-from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
+from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps
 from rs_localizer.lab.simulation.true_motion import (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from rs_localizer.config.declared import check, setting
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 
 
 class ImageTransport(StrEnum):

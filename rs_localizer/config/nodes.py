@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from rs_localizer.config.declared import check, setting
 from rs_localizer.config.method import LocalizerConfig
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 
 
 class PoseTime(StrEnum):

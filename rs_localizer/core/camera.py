@@ -19,15 +19,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.checks import Matrix, Vector, choice, numbers, pixel_count
-
-
-class ScanDirection(StrEnum):
-    """The direction in which the shutter moves over the raw image."""
-
-    TOP_TO_BOTTOM = "top_to_bottom"
-    BOTTOM_TO_TOP = "bottom_to_top"
-    LEFT_TO_RIGHT = "left_to_right"
-    RIGHT_TO_LEFT = "right_to_left"
+from rs_localizer.core.scanning import ScanDirection
 
 
 class DistortionModel(StrEnum):

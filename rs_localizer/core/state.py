@@ -8,6 +8,11 @@ rotation; it is what :func:`rs_localizer.estimation.refine.apply_step` applies.
 
 from __future__ import annotations
 
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+
 STATE_SIZE = 24
 PARAMETERS = 18
 # Pose and velocities: what a search knows, and what ``Estimate.covariance`` is of.
@@ -18,3 +23,36 @@ TURN, MOVE, ANGULAR, LINEAR, ANGULAR_ACCELERATION, LINEAR_ACCELERATION = (
     slice(k, k + 3) for k in range(0, PARAMETERS, 3)
 )
 POSE, VELOCITIES, ACCELERATIONS = slice(0, 6), slice(6, 12), slice(12, 18)
+
+# Of a state, behind the rotation.
+(
+    STATE_TRANSLATION,
+    STATE_ANGULAR,
+    STATE_LINEAR,
+    STATE_ANGULAR_ACCELERATION,
+    STATE_LINEAR_ACCELERATION,
+) = (slice(k, k + 3) for k in range(9, STATE_SIZE, 3))
+_POSE_SIZE = STATE_TRANSLATION.stop
+
+
+def rotation_of(state: Array) -> Array:
+    """Rotation (3,3) camera_from_map at the middle row."""
+    return state[:9].reshape(3, 3)
+
+
+def at_rest(state: Array) -> Array:
+    """The same pose of a camera that does not move."""
+    return np.concatenate([state[:_POSE_SIZE], np.zeros(STATE_SIZE - _POSE_SIZE)])
+
+
+def depths(state: Array, points: Array) -> Array:
+    """How far before the camera at the middle row points (n,3) are, in m."""
+    found: Array = points @ state[6:9] + state[11]
+    return found
+
+
+def step_between(state: Array, other: Array) -> Array:
+    """The step (18,) that leads from one state to another."""
+    turn = rotation_of(state) @ rotation_of(other).T
+    moved = state[STATE_TRANSLATION] - turn @ other[STATE_TRANSLATION]
+    return np.concatenate([so3.log(turn), moved, other[_POSE_SIZE:] - state[_POSE_SIZE:]])

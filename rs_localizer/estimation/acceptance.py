@@ -8,6 +8,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, depths
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior
@@ -96,14 +97,14 @@ def refusal(
             Reason.IMPLAUSIBLE,
             f"the image would move with the rows, at {1.0 - pace:.0%} of their speed",
         )
-    turn = float(np.linalg.norm(state[12:15]))
+    turn = float(np.linalg.norm(state[STATE_ANGULAR]))
     if turn > _MOST_TURN:
         return Failure(
             Reason.IMPLAUSIBLE,
             f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
         )
-    depth = _median(observations.points @ state[6:9] + state[11], posterior.inliers)
-    travel = float(np.linalg.norm(state[15:18]))
+    depth = _median(depths(state, observations.points), posterior.inliers)
+    travel = float(np.linalg.norm(state[STATE_LINEAR]))
     if travel > depth:
         return Failure(
             Reason.IMPLAUSIBLE,

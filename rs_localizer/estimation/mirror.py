@@ -14,6 +14,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.state import STATE_TRANSLATION, rotation_of
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
@@ -29,7 +30,7 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
     plane, centre, axis_of_plane = _plane(points, inliers)
     if not plane:
         return None
-    rotation, translation = state[:9].reshape(3, 3), state[9:12]
+    rotation, translation = rotation_of(state), state[STATE_TRANSLATION]
     seen = rotation @ centre + translation
     sight = seen / np.linalg.norm(seen)
     normal = rotation @ axis_of_plane
@@ -39,7 +40,7 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
         return None
     flip = so3.exp(-2.0 * lean * axis / np.linalg.norm(axis))
     turned = flip @ (translation - seen) + seen
-    return np.concatenate([(flip @ rotation).ravel(), turned, state[12:]])
+    return np.concatenate([(flip @ rotation).ravel(), turned, state[STATE_TRANSLATION.stop :]])
 
 
 @kernel

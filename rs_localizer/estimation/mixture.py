@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import PARAMETERS
+from rs_localizer.core.state import PARAMETERS, at_rest, depths, step_between
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.mirror import mirrored
@@ -22,7 +22,7 @@ from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaki
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, Posterior, fit
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside, slower_terms
-from rs_localizer.estimation.refine import apply_step, step_between
+from rs_localizer.estimation.refine import apply_step
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
@@ -67,9 +67,9 @@ class Inliers:
     ) -> None:
         self.observations, self.terms, self.assumed = observations, terms, assumed
         self.inliers, self.noise, self.inflation = best.inliers, best.noise, best.inflation
-        depths = (observations.points @ best.state[6:9] + best.state[11])[best.inliers]
-        count = len(depths)
-        depth = float(np.partition(depths, count // 2)[count // 2]) if count else 1.0
+        before = depths(best.state, observations.points)[best.inliers]
+        count = len(before)
+        depth = float(np.partition(before, count // 2)[count // 2]) if count else 1.0
         self.field_sizes = assumed.field_sizes(max(depth, _NEAREST))
         self.freedom = max(2.0 * count - 6.0, 1.0)
         # What a point is worth beside one whose error is its own (an effective number of points).
@@ -171,7 +171,7 @@ def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
     terms, may_rest = frame.terms, frame.assumed.may_rest
     turn_known = frame.assumed.turn is not None
     modes: list[Mode] = []
-    near = np.concatenate([found.state[:12], np.zeros(12)]) if may_rest else found.state
+    near = at_rest(found.state) if may_rest else found.state
     other = mirrored(frame.observations.points, frame.inliers, near) if planar else None
     for speed in _SPEEDS if may_rest else (1.0,):
         if speed == 0.0:

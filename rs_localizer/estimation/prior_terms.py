@@ -16,7 +16,9 @@ from rs_localizer.core.state import (
     ANGULAR_ACCELERATION,
     LINEAR,
     PARAMETERS,
+    STATE_ANGULAR,
     STATE_SIZE,
+    rotation_of,
 )
 from rs_localizer.estimation.prior import Prior, state_in
 
@@ -94,7 +96,7 @@ def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
 def gravity_cost(terms: PriorTerms, state: Array) -> float:
     """What a state (24,) costs by the measured direction of gravity, in noise variances."""
     gravity = terms.gravity
-    error = state[:9].reshape(3, 3) @ gravity[:3] - gravity[3:6]
+    error = rotation_of(state) @ gravity[:3] - gravity[3:6]
     return float(gravity[6] * (error @ error))
 
 
@@ -109,7 +111,7 @@ def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
         information = np.zeros((PARAMETERS, PARAMETERS))
         information[ANGULAR, ANGULAR] = np.eye(3) / prior.angular_velocity_deviation**2
         reference = _STILL.copy()
-        reference[12:15] = prior.angular_velocity
+        reference[STATE_ANGULAR] = prior.angular_velocity
         informations = np.concatenate([informations, information[None]])
         references = np.concatenate([references, reference[None]])
     if prior.gravity is not None:

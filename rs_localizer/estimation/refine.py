@@ -10,7 +10,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.so3 import exp, log
+from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
@@ -46,12 +46,6 @@ def apply_step(state: Array, step: Array) -> Array:
     for i in range(12, STATE_SIZE):
         moved[i] = state[i] + (step[i - 6] if i - 6 < len(step) else 0.0)
     return moved
-
-
-def step_between(state: Array, other: Array) -> Array:
-    """The step (18,) that leads from one state to another."""
-    turn = state[:9].reshape(3, 3) @ other[:9].reshape(3, 3).T
-    return np.concatenate([log(turn), state[9:12] - turn @ other[9:12], other[12:] - state[12:]])
 
 
 @kernel

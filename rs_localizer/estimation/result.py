@@ -4,6 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from rs_localizer.core.state import (
+    STATE_ANGULAR,
+    STATE_ANGULAR_ACCELERATION,
+    STATE_LINEAR,
+    STATE_LINEAR_ACCELERATION,
+    STATE_TRANSLATION,
+    rotation_of,
+)
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.delay import delay_of
 from rs_localizer.estimation.observing import Observed
@@ -18,18 +26,18 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         samples: minimal samples drawn.
     """
     state, turn = posterior.state, observed.turn
-    rotation = state[:9].reshape(3, 3)
+    rotation = rotation_of(state)
     residuals = np.full(observed.count, np.nan)
     residuals[observed.usable] = np.sqrt(posterior.squared_errors)
     inliers = np.zeros(observed.count, dtype=np.bool_)
     inliers[observed.usable] = posterior.inliers
     found = Estimate(
         rotation=rotation,
-        translation=state[9:12] - rotation @ observed.centre,
-        angular_velocity=state[12:15],
-        linear_velocity=state[15:18],
-        angular_acceleration=state[18:21],
-        linear_acceleration=state[21:24],
+        translation=state[STATE_TRANSLATION] - rotation @ observed.centre,
+        angular_velocity=state[STATE_ANGULAR],
+        linear_velocity=state[STATE_LINEAR],
+        angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
+        linear_acceleration=state[STATE_LINEAR_ACCELERATION],
         inliers=inliers,
         residuals=residuals,
         joint_covariance=posterior.covariance,

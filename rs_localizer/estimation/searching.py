@@ -7,6 +7,7 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.state import at_rest, rotation_of
 from rs_localizer.estimation.observing import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
@@ -149,7 +150,7 @@ class MotionSearch:
         hypotheses = self._hypotheses(
             self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, observed.terms
         )
-        rotations = [start.state[:9].reshape(3, 3)]
+        rotations = [rotation_of(start.state)]
         pools = [Pool(near), *_pools(observed, np.arange(len(observed.observations)))]
         draws = Draws(rotations, pools, self._config.confidence, most, observed.random)
         return search(observed.observations, hypotheses, draws, before)
@@ -204,8 +205,9 @@ class MotionSearch:
     def global_shutter_inliers(self, observed: Observed, start: Candidate) -> int:
         """How many points a global-shutter pose explains at the inlier threshold."""
         threshold = self._config.inlier_threshold
-        still = np.concatenate([start.state[:12], np.zeros(12)])
-        pose = self.optimize(observed, still, 2.0 * _SCORE_SCALE * threshold, held_terms())
+        pose = self.optimize(
+            observed, at_rest(start.state), 2.0 * _SCORE_SCALE * threshold, held_terms()
+        )
         return int(
             np.count_nonzero(observed.observations.squared_errors(pose.state) < threshold**2)
         )

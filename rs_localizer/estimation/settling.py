@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES
+from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
 from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.mirror import mirrored
@@ -152,7 +152,7 @@ def _rather_rests(frame: Inliers, best: Posterior, examined: Examined) -> bool:
     """Whether a camera at rest, with a map or a lens that is a little off, explains as much."""
     if not frame.assumed.may_rest:
         return False
-    still = np.concatenate([best.state[:12], np.zeros(12)])
+    still = at_rest(best.state)
     turn = frame.assumed.turn
     rest = frame.mode(still, held_beside(frame.terms, turn is not None), 0.0)
     moving = examined.sizes.evidence + volume_of(frame.terms, examined)

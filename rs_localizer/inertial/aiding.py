@@ -10,10 +10,9 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.refine import step_between
 from rs_localizer.inertial import turning
 from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
 from rs_localizer.inertial.gravity import gravity_seen

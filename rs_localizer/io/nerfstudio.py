@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
+from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.scanning import ScanDirection
 
 # Axes of OpenGL's camera, which looks along -z with y up, in ours.
 _OPENGL = np.diag([1.0, -1.0, -1.0])

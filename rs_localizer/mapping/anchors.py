@@ -90,6 +90,7 @@ class Placement:
     levelled: bool  # z is up by what was measured, and not only by how the camera was held
     told: str
     doubt: str = ""  # why it may be wrong
+    up: str = "as the camera was held on average (a guess)"
 
 
 def place(anchors: Anchors, found: Triangulated, rotations: Array, positions: Array) -> Placement:
@@ -168,7 +169,7 @@ def _by_markers(marker_map: MarkerMap, found: Triangulated) -> Placement:
             f"the markers' corners are {1e3 * misfit:.1f} mm (rms) off their map, and so may be "
             "the landmarks: check sizes and places in the marker map, and the readout time"
         )
-    return Placement(similarity, True, True, told, doubt)
+    return Placement(similarity, True, True, told, doubt, "as in the marker map")
 
 
 def _down(rotations: Array) -> Array:

@@ -22,6 +22,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.mapping.anchors import Anchors, Placement, place
 from rs_localizer.mapping.errors import MappingError
 from rs_localizer.mapping.following import follow
+from rs_localizer.mapping.inertial_placing import GivenImu, InertialPlace, place_by_imu
 from rs_localizer.mapping.keyframes import Keyframes, choose_keyframes
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.mapping.sightings import Sightings
@@ -55,6 +56,7 @@ class Given:
     anchors: Anchors
     estimate_readout: bool = False
     frame: str = "map"
+    imu: GivenImu | None = None
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -103,7 +105,7 @@ class Built:
 
     landmarks: Map
     camera: Camera  # with its readout time and scan direction, as they were found
-    placement: Placement
+    place: InertialPlace
     keyframes: Keyframes
     structure: Structure  # as COLMAP had it, moved into this frame as a whole
     kept: IntArray  # (l,) rows of the structure's points that are landmarks
@@ -112,6 +114,10 @@ class Built:
     rotations: Array  # (g,3,3) map_from_camera at their middle rows
     positions: Array  # (g,3)
     deviation: float  # px, of the keypoints' noise
+
+    @property
+    def placement(self) -> Placement:
+        return self.place.placement
 
     def middle_rows(self, stamps_ns: Sequence[int]) -> tuple[IntArray, Array, Array]:
         """Times (g,) ns of the middle rows, positions (g,3), quaternions (g,4) of the poses.
@@ -158,21 +164,22 @@ def build_map(given: Given, work: Workshop) -> Built:
     motion = Motion(followed.views[used], refined.times, refined)
     shown = motion.seen(followed.views[seen.images], seen.landmarks, seen.pixels)
     found = triangulate(refined.camera, motion.sights(shown), len(structure.points))
-    placement = _placement(given, motion)
+    by_all = place_by_imu(_placement(given, motion), refined, given.imu)
+    similarity = by_all.placement.similarity
     kept = _kept(found, motion)
-    landmarks = _landmarks(found, kept, descriptors, placement.similarity, given.frame)
+    landmarks = _landmarks(found, kept, descriptors, similarity, given.frame)
     rotations, positions = motion.poses()
     return Built(
         landmarks=landmarks,
         camera=refined.camera_as_found,
-        placement=placement,
+        place=by_all,
         keyframes=keyframes,
-        structure=structure.moved(placement.similarity),
+        structure=structure.moved(similarity),
         kept=kept,
         refined=refined,
         posed=motion.rows,
-        rotations=placement.similarity.rotation @ rotations,
-        positions=placement.similarity(positions),
+        rotations=similarity.rotation @ rotations,
+        positions=similarity(positions),
         deviation=refined.deviation,
     )
 

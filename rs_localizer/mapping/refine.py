@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, sights_of
 from rs_localizer.mapping.asked_readout import AskedReadout, asked_readout
 from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.mapping.build import Built
+from rs_localizer.mapping.inertial_placing import InertialPlace
 
 PICTURES = ("map.png", "residuals.png")
 
@@ -36,7 +37,8 @@ def rows(built: Built, images: int, views: int) -> list[tuple[str, str]]:
         ("noise after it", f"{refined.after:.2f} px"),
         ("readout time", readout),
         ("scale", built.placement.told),
-        ("z is up", _up(built)),
+        ("z is up", built.placement.up),
+        *_of_imu(built.place),
     ]
 
 
@@ -47,7 +49,21 @@ def written(built: Built, images: int, views: int) -> str:
     return f"# Map\n\n| | |\n|---|---|\n{table}\n\n{shown}\n"
 
 
-def _up(built: Built) -> str:
-    if built.placement.levelled:
-        return "as in the marker map"
-    return "as the camera was held on average (a guess)"
+def _of_imu(place: InertialPlace) -> list[tuple[str, str]]:
+    """What an IMU says, beside scale and up where it gives them."""
+    metres = place.metres
+    if metres is None:
+        return []
+    mount, found = metres.mount, metres.metric
+    rows = []
+    if place.checked:
+        more = "larger" if place.larger > 0.0 else "smaller"
+        share = 100.0 * np.array([abs(place.larger), metres.share])
+        tilts = np.degrees([place.tilt, found.gravity_deviation])
+        rows = [
+            ("scale by the IMU", f"{share[0]:.2f} % {more}, +- {share[1]:.2f} %"),
+            ("gravity by the IMU", f"{tilts[0]:.2f} deg from -z, +- {tilts[1]:.2f} deg"),
+        ]
+    offset = f"{1e3 * mount.mount.delay:+.2f} +- {1e3 * mount.delay_deviation:.2f} ms"
+    bias = " ".join(f"{value:.2f}" for value in found.bias)
+    return [*rows, ("imu.time_offset", offset), ("bias of the accelerometer", f"{bias} m/s^2")]

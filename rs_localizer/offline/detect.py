@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.camera_info import Calibration, read_camera_info

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.pipeline.refusal import Notify

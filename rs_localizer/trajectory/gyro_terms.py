@@ -48,7 +48,7 @@ class GyroTerms:
         by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
         by_mount[:, :, 3:6] = np.eye(3)
         by_mount[:, :, 6] = states.angular_acceleration @ mount.matrix.T
-        by_mount[:, :, 7:] = _by_shape(turned)
+        by_mount[:, :, 7:] = by_shape(turned)
         errors = states.angular @ mount.matrix.T + mount.bias - self.samples.rates
         return Turns(first, errors, mount.matrix @ jacobians[:, 6:9], by_mount)
 
@@ -89,7 +89,7 @@ class GyroTerms:
         )  # fmt: skip
 
 
-def _by_shape(rates: Array) -> Array:
+def by_shape(rates: Array) -> Array:
     """Derivative (k,3,6) of ``shape rate`` by the six numbers of a symmetric matrix."""
     out = np.zeros((len(rates), 3, 6))
     for axis in range(3):

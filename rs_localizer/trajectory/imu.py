@@ -8,12 +8,14 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.fit import Fit, fit
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, first_mount
 from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
 from rs_localizer.trajectory.gyro_terms import GyroTerms
+from rs_localizer.trajectory.mean_accelerations import ForceSamples
 from rs_localizer.trajectory.model import Observations
 from rs_localizer.trajectory.online import REVERSED
 from rs_localizer.trajectory.start import refined
@@ -36,6 +38,9 @@ class ImuRecording:
     stamps_ns: IntArray  # (k,)
     angular_velocities: Array  # (k,3) rad/s, in its own axes
     camera_from_imu: Array | None = None  # (3,3) as others say: checked, not believed
+    # (k,3) m/s^2, specific force in its own axes, NaN where there is none; None: no accelerometer
+    specific_forces: Array | None = None
+    imu_in_camera: Array | None = None  # (3,) m, where it is by the camera's axes, as others say
 
     def samples(self, start_ns: int) -> GyroSamples:
         """Its finite samples in the order of time, one for each stamp, from a time 0 on."""
@@ -43,6 +48,14 @@ class ImuRecording:
         stamps, order = np.unique(self.stamps_ns[finite], return_index=True)
         times = (stamps - start_ns).astype(float) * 1e-9
         return GyroSamples(times, self.angular_velocities[finite][order])
+
+    def forces(self, start_ns: int, delay: float) -> ForceSamples:
+        """The accelerometer's finite samples likewise, their times later by ``delay`` (s)."""
+        assert self.specific_forces is not None
+        finite = np.isfinite(self.specific_forces).all(axis=1)
+        stamps, order = np.unique(self.stamps_ns[finite], return_index=True)
+        times = (stamps - start_ns).astype(float) * 1e-9 + delay
+        return ForceSamples(times, self.specific_forces[finite][order])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

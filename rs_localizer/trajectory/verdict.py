@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.trajectory.calibration import Calibration
 from rs_localizer.trajectory.online import REVERSED
 

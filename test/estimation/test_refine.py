@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
+from rs_localizer.core.state import step_between
 from rs_localizer.estimation.prior_terms import held_terms, motion_terms
 from rs_localizer.estimation.refine import (
     apply_step,
@@ -9,7 +10,6 @@ from rs_localizer.estimation.refine import (
     refine,
     smallest_eigenvalue,
     solve_positive,
-    step_between,
 )
 from rs_localizer.estimation.residuals import squared_errors
 

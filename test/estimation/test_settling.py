@@ -9,11 +9,11 @@ from scipy.stats import chi2
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.state import step_between
 from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import held_terms
-from rs_localizer.estimation.refine import step_between
 from rs_localizer.estimation.settling import settle
 from rs_localizer.solvers.table import find_solver
 

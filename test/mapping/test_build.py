@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from felt import Felt
+from scenes import imu_of, refined_of
 from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
@@ -19,6 +22,8 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments.room_mapping import Errors, Piece, Room, without_refinement
 from rs_localizer.lab.rendering.renderer import ImageSettings
 from rs_localizer.mapping.build import Built
+from rs_localizer.mapping.inertial_metres import inertial_metres
+from rs_localizer.mapping.inertial_placing import InertialPlace
 from rs_localizer.mapping.report import written
 from rs_localizer.mapping.similarity import through
 from rs_localizer.mapping.structure import DATABASE, SPARSE
@@ -138,6 +143,17 @@ def test_the_report_says_it(built: Built) -> None:
     assert "| scale | " in page
     assert "corners of markers" in page
     assert "![map.png](map.png)" in page
+
+
+def test_the_report_says_what_an_imu_says(built: Built) -> None:
+    felt = Felt.random(0)
+    metres = inertial_metres(refined_of(felt), imu_of(felt))
+    place = InertialPlace(built.placement, metres, checked=True)
+    page = written(replace(built, place=place), 60, 27)
+    assert "| gravity by the IMU | " in page
+    assert f"{100 * abs(felt.scale / built.placement.similarity.scale - 1):.0f}" in page
+    assert "| imu.time_offset | +5.0" in page
+    assert "| z is up | as in the marker map |" in page
 
 
 def test_the_model_of_colmap_can_be_read(built: Built, folder: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import READOUT, Walk, camera, walk
 
-from rs_localizer.core.camera import ScanDirection
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, MapStep
 from rs_localizer.mapping.gauge import similarity
 from rs_localizer.mapping.preparation import Preparation

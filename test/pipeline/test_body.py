@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 import rs_localizer.pipeline.method
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 import rs_localizer.pipeline.method
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior

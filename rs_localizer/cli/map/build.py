@@ -16,6 +16,7 @@ from tqdm import tqdm
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.image_source import add_source_arguments
 from rs_localizer.cli.map.build_images import Looked, Shutter, look_at_images, shutter_of
+from rs_localizer.cli.map.build_imu import add_imu_arguments, imu_of
 from rs_localizer.config import FeatureConfig
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
@@ -24,6 +25,7 @@ from rs_localizer.io.whole import whole
 from rs_localizer.lab.measures.map_pictures import save_pictures
 from rs_localizer.mapping.anchors import Anchors, Distance
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
+from rs_localizer.mapping.inertial_placing import GivenImu
 from rs_localizer.mapping.report import rows, written
 from rs_localizer.mapping.structure import Effort, require
 from rs_localizer.mapping.views import Looker
@@ -46,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "images", type=Path, metavar="VIDEO|BAG|FOLDER", help="images of one camera, as for detect"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="to create")
-    scale = parser.add_argument_group("scale and place (one of them)")
+    scale = parser.add_argument_group("scale and place (default: the IMU of the bag)")
     scale.add_argument(
         "--markers", type=Path, metavar="FILE", help="marker map; some of it is in the images"
     )
@@ -67,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("NAME", "NAME", "METRES"),
         help="between two of these points",
     )
+    add_imu_arguments(scale)
     add_source_arguments(parser)
     work = parser.add_argument_group("the work")
     work.add_argument(
@@ -98,12 +101,14 @@ def run(args: argparse.Namespace) -> None:
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else _marker_map(args.markers)
-    shutter = shutter_of(args)
+    shutter, imu = shutter_of(args), imu_of(args)
     with whole(args.out):
         args.out.mkdir(parents=True)
         looker = Looker(args.max_keypoints, markers)
         looked = look_at_images(args, looker, shutter.scan_direction)
-        built = _build(args, looked, shutter, markers)
+        built = _build(
+            args, looked, shutter, Anchors(markers, looked.points, tuple(args.distance)), imu
+        )
         _write(args.out, built, looked)
     _tell(args, built, looked)
 
@@ -129,14 +134,17 @@ def _marker_map(path: Path) -> MarkerMap:
 
 
 def _build(
-    args: argparse.Namespace, looked: Looked, shutter: Shutter, markers: MarkerMap | None
-) -> Built:
+    args: argparse.Namespace, looked: Looked, shutter: Shutter, anchors: Anchors,
+    imu: GivenImu | None,
+) -> Built:  # fmt: skip
+    markers = anchors.marker_map
     given = Given(
         looked.views,
         replace(looked.camera, readout_time=shutter.readout_time or 0.0),
-        Anchors(markers, looked.points, tuple(args.distance)),
+        anchors,
         estimate_readout=shutter.readout_time is None,
         frame=MAP_FRAME if markers is None else markers.map_frame,
+        imu=imu,
     )
     folder = args.out / COLMAP
     folder.mkdir()
@@ -151,7 +159,10 @@ def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
 
 def _write(out: Path, built: Built, looked: Looked) -> None:
     write_npz(out / MAP, built.landmarks)
-    write_parameters(out / PARAMETERS, built.camera.readout_time, str(built.camera.scan_direction))
+    write_parameters(
+        out / PARAMETERS, built.camera.readout_time, str(built.camera.scan_direction),
+        built.place.time_offset,
+    )  # fmt: skip
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     save_pictures(built, looked.views, out)
@@ -165,13 +176,14 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
     if not built.placement.scaled:
         print(
             "warning: nothing tells the scale: poses and velocities are in units of the map; give "
-            "--markers, or --point and --distance"
+            "--markers, --point and --distance, or --imu"
         )
     asked = built.refined.asked_readout
     if asked is not None and asked.differs:
         print(f"warning: {asked.told}")
-    if built.placement.doubt:
-        print(f"warning: {built.placement.doubt}")
+    for doubt in (built.placement.doubt, *built.place.doubts):
+        if doubt:
+            print(f"warning: {doubt}")
     out = shlex.quote(str(args.out))
     print(
         "next, for images of another walk: rs_localizer detect IMAGES --features sift --out seen "

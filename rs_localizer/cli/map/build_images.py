@@ -9,8 +9,10 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.image_source import opened, tell_left_out, time_faults
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.cli.image_source import tell_left_out, time_faults
+from rs_localizer.cli.shots import opened
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import is_bag
 from rs_localizer.io.images import Image
 from rs_localizer.io.recording import PARAMETERS
@@ -62,7 +64,7 @@ def look_at_images(args: argparse.Namespace, looker: Looker, scan_direction: str
     views: list[View] = []
     images, stamps = 0, list[int]()
     refused, named = dict[str, str](), dict[float, int]()
-    with opened(args) as source, tqdm(
+    with opened(args, args.images, args.start) as source, tqdm(
         total=source.total, unit="image", desc="look", disable=None
     ) as bar:  # fmt: skip
         for shot in source.shots:

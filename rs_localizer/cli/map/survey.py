@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.given import add_settings, given_settings
-from rs_localizer.cli.shots import shots_of
+from rs_localizer.cli.shots import opened, tell_times
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_info import Calibration, read_camera_info
@@ -141,8 +141,8 @@ def _spotted(
     """The camera, and the markers of each image."""
     spotted: dict[int, Spotted] = {}
     calibration: Calibration | None = None
-    with shots_of(args) as shots:
-        for shot in tqdm(shots, unit="image", desc="detect", disable=None):
+    with opened(args, args.recording) as source:
+        for shot in tqdm(source.shots, unit="image", desc="detect", disable=None):
             if isinstance(shot, Carried) or not isinstance(shot.image, Image):
                 continue
             read = read_camera_info(shot.camera_info)
@@ -158,6 +158,7 @@ def _spotted(
                 )
             stamp = shot.image.stamp_ns
             spotted[stamp] = spotter.spot(shot.image.pixels, stamp)
+    tell_times(source.clock)
     if calibration is None:
         raise ValueError(f"{args.recording} has no image that can be read")
     return camera, [spotted[stamp] for stamp in sorted(spotted)]

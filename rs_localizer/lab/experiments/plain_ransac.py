@@ -11,6 +11,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
+from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, STATE_TRANSLATION, rotation_of
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.ransac import MODEL_SIZE
 from rs_localizer.estimation.sampling import draw, generator
@@ -91,7 +92,9 @@ class PlainRansac:
         if not math.isfinite(costs[0]):
             return Best(None, rotation, 0)
         state = states[0]
-        motion = Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18])
+        motion = Motion(
+            rotation_of(state), state[STATE_TRANSLATION], state[STATE_ANGULAR], state[STATE_LINEAR]
+        )
         return Best(motion.at_rows, motion.rotation,
                     self._inliers(observations.squared_errors(state)))  # fmt: skip
 

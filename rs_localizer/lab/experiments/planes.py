@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from rs_localizer.config import VelocityPrior
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.state import rotation_of
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.prior_terms import motion_terms
@@ -102,7 +103,7 @@ def _unaided_error(view: View) -> float:
     state = start
     for _ in range(_REFINEMENTS):
         state = maximum_a_posteriori(observations, state, _NO_PRIOR, _WIDE).state
-    return float(angles(state[:9].reshape(3, 3), view.motion.rotation))
+    return float(angles(rotation_of(state), view.motion.rotation))
 
 
 _COLUMNS = ("case", "method", "orientation_deg_q25", "median", "q75", "no_pose")

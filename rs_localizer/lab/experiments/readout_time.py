@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.lab.experiments import charts
 from rs_localizer.lab.experiments.readout_faults import readout_faults

@@ -87,9 +87,11 @@ class Room:
 
         return in_order(render, self.stamps(piece))
 
-    def look(self, piece: Piece, done: Callable[[], object] = lambda: None) -> list[View]:
-        """The views of a piece."""
-        looker = Looker(self._most, self.marker_map)
+    def look(
+        self, piece: Piece, done: Callable[[], object] = lambda: None, markers: bool = True
+    ) -> list[View]:
+        """The views of a piece, with the markers or without looking for them."""
+        looker = Looker(self._most, self.marker_map if markers else None)
         views = []
         for image in self.images(piece):
             views.append(looker.look(image))

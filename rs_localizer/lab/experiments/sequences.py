@@ -10,7 +10,8 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info

@@ -10,10 +10,16 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import MOTION_PARAMETERS
+from rs_localizer.core.state import (
+    MOTION_PARAMETERS,
+    STATE_ANGULAR,
+    STATE_LINEAR,
+    STATE_TRANSLATION,
+    rotation_of,
+    step_between,
+)
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import state_in
-from rs_localizer.estimation.refine import step_between
 from rs_localizer.lab.experiments.kernels import informations
 from rs_localizer.lab.experiments.methods import states
 from rs_localizer.lab.experiments.trials import Setting, camera, draw_trials
@@ -120,7 +126,9 @@ def synthetic_views(
         inliers = np.ones(setting.points, dtype=np.bool_)
         inliers[rng.permutation(setting.points)[:wrong]] = False
         pixels[~inliers] = uniform_pixels(view, wrong, rng)
-        motion = Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18])
+        motion = Motion(
+            rotation_of(state), state[STATE_TRANSLATION], state[STATE_ANGULAR], state[STATE_LINEAR]
+        )
         yield View(view, np.ascontiguousarray(noisy.points[i]), pixels, true_pixels, inliers,
                    motion, setting.noise)  # fmt: skip
 

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, ScanDirection
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.trajectories import Trajectory

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 
-def folder_names(recordings: Sequence[Path]) -> list[str]:
+def folder_names(recordings: Sequence[Path], reserved: Collection[str] = ()) -> list[str]:
     """A name for each recording: its own, with as many parent folders as tell it from the others.
 
     Args:
         recordings: different absolute paths.
+        reserved: names of what else is there.
 
     Returns:
         as many different names: of ``a/flight`` and ``b/flight``, ``a_flight`` and ``b_flight``.
@@ -21,7 +22,7 @@ def folder_names(recordings: Sequence[Path]) -> list[str]:
     while left := [path for path in recordings if path not in names]:
         labels = {path: _label(path, depth) for path in left}
         counts = Counter(labels.values())
-        taken = set(names.values())
+        taken = {*reserved, *names.values()}
         deepest = depth > max(len(path.parts) for path in left)
         for path, label in labels.items():
             if counts[label] == 1 and label not in taken:

@@ -88,10 +88,16 @@ def write_view(
         stream.disconnect()
 
 
-def _start_viewer(stream: Any, arranged: Any) -> None:
+def check_screen() -> None:
+    """Raise ``ValueError`` where no viewer can open.
+
+    It would end at once, and what is sent to it would wait for ever.
+    """
     if sys.platform == "linux" and not any(map(os.environ.get, _SCREENS)):
-        # It would end at once, and what is sent to it would wait for ever.
         raise ValueError(f"the Rerun viewer needs a screen ({' or '.join(_SCREENS)}); {_INSTEAD}")
+
+
+def _start_viewer(stream: Any, arranged: Any) -> None:
     # Beside the interpreter, where pip puts it; that need not be on the path.
     beside = str(Path(sys.executable).parent)
     os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", os.defpath), beside])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +10,9 @@ from rs_localizer.features.picture import draw_features
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.features import Extracted, FrameExtractor, keypoints
-from rs_localizer.ros.detector.node import Finder, ImageNode
+from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Work
 from rs_localizer.ros.detector.outputs import Show
+from rs_localizer.ros.node.worker import Worker
 from rs_localizer.settings import FEATURES_NAME
 
 
@@ -51,8 +51,12 @@ class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
     def make_cloud(self, found: Extracted, make: Make) -> Any:
         return keypoints(found, make)
 
-    def drawing(self, show: Show) -> Callable[[Extracted, FeatureConfig], None]:
-        return lambda found, _: show(found.image, draw_features(found.image.pixels, found.features))
+    def make_drawing(
+        self, show: Show, worker: Worker[Work[FeatureConfig, Extracted], Extracted]
+    ) -> Drawing[Extracted, FeatureConfig]:
+        return Drawing(
+            lambda found, _: show(found.image, draw_features(found.image.pixels, found.features))
+        )
 
     def describe(self, finder: Finder[Extracted]) -> str:
         return f"{self.config.features}, at most {self.config.max_keypoints} keypoints an image"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,10 +10,8 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.debug import DebugPictures, picture_topics
-from rs_localizer.ros.detector.node import Finder, ImageNode, Work
+from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Work
 from rs_localizer.ros.detector.outputs import Show
-from rs_localizer.ros.node.inputs import Topic
 from rs_localizer.ros.node.worker import Worker
 from rs_localizer.settings import DETECTOR_NAME
 
@@ -79,14 +76,14 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     def make_cloud(self, found: Detected, make: Make) -> Any:
         return correspondences(found, make)
 
-    def drawing(self, show: Show) -> Callable[[Detected, DetectorConfig], None]:
-        self._pictures = DebugPictures(show, self.refusals.notice)
-        return self._pictures.add
+    def make_drawing(
+        self, show: Show, worker: Worker[Work[DetectorConfig, Detected], Detected]
+    ) -> Drawing[Detected, DetectorConfig]:
+        # Late: most nodes never draw, and need nothing of cubes, cameras and poses.
+        from rs_localizer.ros.detector.debug import DebugPictures, picture_topics
 
-    def picture_topics(
-        self, worker: Worker[Work[DetectorConfig, Detected], Detected]
-    ) -> Mapping[str, Topic]:
-        return picture_topics(worker, self._pictures, self.refusals)
+        pictures = DebugPictures(show, self.refusals.notice)
+        return Drawing(pictures.add, picture_topics(worker, pictures, self.refusals))
 
     def describe(self, finder: Finder[Detected]) -> str:
         assert isinstance(finder, FrameDetector)

@@ -6,7 +6,7 @@ It listens to images only while somebody listens to it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from rclpy.clock import Clock, ClockType
@@ -48,13 +48,21 @@ class Finder(Protocol[Found_co]):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Drawing(Generic[Found, Settings]):
+    """Makes debug pictures."""
+
+    draw: Callable[[Found, Settings], None]  # called in the worker's thread
+    topics: Mapping[str, Topic] = field(default_factory=dict)  # what it needs besides the images
+
+
 @dataclass(slots=True)
 class Work(Generic[Settings, Found]):
     """What the worker alone touches."""
 
     finder: Finder[Found]
     config: Settings
-    draw: Callable[[Found, Settings], None]  # makes the debug picture
+    draw: Callable[[Found, Settings], None] | None = None  # makes the debug picture
 
 
 class ImageNode(
@@ -63,7 +71,7 @@ class ImageNode(
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
     A node says what it looks for by overriding :meth:`make_finder`, :meth:`make_cloud`,
-    :meth:`drawing` and :meth:`describe`, and :meth:`picture_topics` where it needs any.
+    :meth:`make_drawing` and :meth:`describe`.
     """
 
     lack = Notice.NO_IMAGES
@@ -79,7 +87,7 @@ class ImageNode(
     ) -> None:
         self._outputs: ImageOutputs[Found] | None = None
         self._topics: dict[str, Topic] = {}  # all that may be listened to
-        self._for_pictures: tuple[str, ...] = ()
+        self._for_pictures: tuple[str, ...] | None = None  # none was wanted so far
         self._timer: Timer | None = None
         self._listening: tuple[str, ...] = ()
         super().__init__(name, kind, tell, **options)
@@ -94,13 +102,11 @@ class ImageNode(
         """The sensor_msgs/PointCloud2 of an image."""
         raise NotImplementedError
 
-    def drawing(self, show: Show) -> Callable[[Found, Settings], None]:
+    def make_drawing(
+        self, show: Show, worker: Worker[Work[Settings, Found], Found]
+    ) -> Drawing[Found, Settings]:
         """What makes debug pictures, which ``show`` takes, in the worker's thread."""
         raise NotImplementedError
-
-    def picture_topics(self, worker: Worker[Work[Settings, Found], Found]) -> Mapping[str, Topic]:
-        """What else is listened to while somebody looks at the debug pictures."""
-        return {}
 
     def describe(self, finder: Finder[Found]) -> str:
         """What the node is active with, for the log."""
@@ -120,17 +126,15 @@ class ImageNode(
     def open(self, config: Settings) -> None:
         finder = self.make_finder(config)
         self._outputs = outputs = ImageOutputs(self, self.output, self.make_cloud)
-        work = Work(finder, config, self.drawing(outputs.show))
+        work: Work[Settings, Found] = Work(finder, config)
 
         def publish(found: Found) -> None:
             outputs.publish(found)
-            if outputs.pictures_wanted():
+            if work.draw is not None and outputs.pictures_wanted():
                 work.draw(found, work.config)
 
-        worker = self.employ(work, publish)
-        further = self.picture_topics(worker)
-        self._for_pictures = tuple(further)
-        self._topics = {**_image_topics(worker), **further}
+        self._topics = _image_topics(self.employ(work, publish))
+        self._for_pictures = None
         self._description = self.describe(finder)
 
     def close(self) -> None:
@@ -180,12 +184,27 @@ class ImageNode(
         assert self._outputs is not None
         wanted: tuple[str, ...] = ()
         if self._outputs.pictures_wanted():
-            wanted = (*self._for_pictures, self._image_topic())
+            wanted = (*self._prepare_pictures(), self._image_topic())
         elif self._outputs.clouds_wanted():
             wanted = (self._image_topic(),)
         if wanted != self._listening:
             self.listen({name: self._topics[name] for name in wanted})
             self._listening = wanted
+
+    def _prepare_pictures(self) -> tuple[str, ...]:
+        """The topics that pictures need; what draws them is not there before one is wanted."""
+        if self._for_pictures is None:
+            assert self._outputs is not None
+            assert self.worker is not None
+            drawing = self.make_drawing(self._outputs.show, self.worker)
+
+            def take(work: Work[Settings, Found]) -> None:
+                work.draw = drawing.draw
+
+            self.worker.update("drawing", take)
+            self._topics.update(drawing.topics)
+            self._for_pictures = tuple(drawing.topics)
+        return self._for_pictures
 
     def _image_topic(self) -> str:
         """The topic of the images; where none has a publisher, the one so far."""

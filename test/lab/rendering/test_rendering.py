@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.core.camera import Camera, Roi, ScanDirection
+from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.lab.rendering.planes import TexturedPlane
 from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
 from rs_localizer.lab.simulation.true_motion import ConstantVelocity

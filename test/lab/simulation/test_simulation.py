@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, DistortionModel, ScanDirection
+from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.lab.simulation.frames import (
     FrameSettings,

@@ -24,6 +24,12 @@ def test_parents_tell_those_of_one_name_apart(paths: list[str], names: list[str]
     assert folder_names([Path(path) for path in paths]) == names
 
 
+def test_what_is_there_besides_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "summary.csv").mkdir()
+    name = f"{tmp_path.name}_summary.csv"
+    assert folder_names([tmp_path / "summary.csv"], {"summary.csv"}) == [name]
+
+
 def test_a_folder_keeps_its_point(tmp_path: Path) -> None:
     (tmp_path / "flight.2").mkdir()
     assert folder_names([tmp_path / "flight.2"]) == ["flight.2"]

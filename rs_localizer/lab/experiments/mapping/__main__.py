@@ -1,6 +1,6 @@
-"""The figures of ``docs/mapping.md``:
+"""The figures of ``docs/mapping.md`` and of an IMU in ``docs/map_build.md``:
 
-python -m rs_localizer.lab.experiments.mapping bend bound large surveys
+python -m rs_localizer.lab.experiments.mapping bend bound large surveys weighing
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterator
 
 from rs_localizer.lab.experiments.mapping.refining import bend, bound, large
 from rs_localizer.lab.experiments.mapping.surveying import surveys
+from rs_localizer.lab.experiments.mapping.weighing import weighing
 from rs_localizer.process.arguments import integer
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
     "bend": bend, "bound": bound, "large": large, "surveys": surveys,
+    "weighing": weighing,
 }  # fmt: skip
 
 

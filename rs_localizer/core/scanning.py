@@ -1,0 +1,14 @@
+"""How the shutter moves over the image; settings name it without loading a camera model."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class ScanDirection(StrEnum):
+    """The direction in which the shutter moves over the raw image."""
+
+    TOP_TO_BOTTOM = "top_to_bottom"
+    BOTTOM_TO_TOP = "bottom_to_top"
+    LEFT_TO_RIGHT = "left_to_right"
+    RIGHT_TO_LEFT = "right_to_left"

@@ -1,0 +1,217 @@
+"""Metres and gravity of a motion in units of its own, from an accelerometer that went along.
+
+Mean accelerations (:mod:`rs_localizer.trajectory.mean_accelerations`), divided by the scale s:
+
+    seen = m forces + w gravity - axes bias - arms lever
+
+is linear in m, gravity, bias and lever arm, each by s. The positions, which images know only so
+well, stand alone on the left: noise in what a fit regresses on would make the scale too small.
+``m`` is 1 / s but for what the accelerometer's own scale is off; the length of gravity says the
+same of 1 / s.
+
+The noise of neighbouring means hangs together: that of positions by their second differences, that
+of accelerations (an orientation that is off turns gravity) by the overlap of the B-splines. How
+much there is of both is told by the residuals, by restricted maximum likelihood (Patterson,
+Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 1971).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.inertial.gravity import STANDARD_GRAVITY
+from rs_localizer.trajectory.mean_accelerations import Means
+from rs_localizer.trajectory.metric_equations import (
+    BIAS,
+    FORCE,
+    GRAVITY,
+    INVERSE,
+    LEVER,
+    UNKNOWNS,
+    Whitened,
+    design,
+)
+
+# What is known beforehand (m/s^2): gravity by place, biases of consumer accelerometers; their
+# scale, by itself.
+_GRAVITY_DEVIATION, _BIAS_DEVIATION, _SCALE_DEVIATION = 0.02, 0.5, 0.01
+# Variance of accelerations by that of positions, s^-4: what may be, and where to begin.
+_RATIOS = np.geomspace(1e-3, 1e7, 41)
+_PLAIN = 1e3
+_ROUNDS, _TRIALS = 5, 4
+# Squared errors of three axes count up to so many times their median: 6 deviations.
+_OUTLIER = 15.0
+# Orientations by images have errors (rad) that last, which residuals do not show.
+_BEND = 5e-4
+# Rounding leaves at least this share of squares, and a camera at rest has none.
+_EXACT, _NOTHING = 1e-12, 1e-30
+# So much of the accelerations that images show must be the accelerometer's.
+_LEAST_EXPLAINED = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lever:
+    """Where the IMU is."""
+
+    position: Array  # (3,) m, in the camera's axes
+    deviation: float  # m, of each coordinate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Metric:
+    """What an accelerometer says of a motion."""
+
+    scale: float  # m per unit of the map
+    share: float  # standard deviation of the scale, as a part of it
+    gravity: Array  # (3,) m/s^2, downwards, in the map's axes
+    gravity_deviation: float  # rad, of its direction
+    bias: Array  # (3,) m/s^2, in the accelerometer's axes
+    lever: Array  # (3,) m, of the IMU in the camera's axes
+    force: float  # scale of the forces' own by that of gravity
+    explained: float  # share of the accelerations that camera and IMU have in common
+    parts: tuple[tuple[float, float], ...]  # scale and deviation (share) of parts on their own
+    means: int  # number of mean accelerations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """The most likely unknowns at a ratio of variances."""
+
+    found: Array  # (11,)
+    covariance: Array  # (11,11)
+    ratio: float  # of the variances, s^-4
+    variance: float  # of the noise of positions
+    likelihood: float  # its logarithm, restricted
+    explained: float
+
+
+class NoMetric(ValueError):
+    """Camera and accelerometer do not go together; the message says why."""
+
+
+def metric(means: Sequence[Means], lever: Lever) -> Metric:
+    """Scale and gravity.
+
+    Args:
+        means: of all parts of a motion.
+        lever: where the IMU is, as far as that is known.
+
+    Raises:
+        NoMetric: where camera and accelerometer are not accelerated alike.
+    """
+    kept = [np.ones(len(part.times), np.bool_) for part in means]
+    for _ in range(_TRIALS):
+        fit = _best(means, kept, lever)
+        before, kept = kept, _fitting(means, fit)
+        if all(map(np.array_equal, before, kept)):
+            break
+    inverse = float(fit.found[INVERSE])
+    if not (inverse > 0.0 and fit.explained > _LEAST_EXPLAINED):
+        raise NoMetric(_too_little(max(fit.explained, 0.0)))
+    gravity = fit.found[GRAVITY] / inverse
+    across = np.eye(3) - np.outer(gravity, gravity) / (gravity @ gravity)
+    tilt = across @ fit.covariance[GRAVITY, GRAVITY] @ across / (gravity @ gravity) / inverse**2
+    return Metric(
+        scale=1.0 / inverse,
+        share=float(np.sqrt(fit.covariance[INVERSE, INVERSE])) / inverse,
+        gravity=gravity,
+        gravity_deviation=float(np.hypot(np.sqrt(np.linalg.eigvalsh(tilt)[-1]), _BEND)),
+        bias=fit.found[BIAS] / inverse,
+        lever=fit.found[LEVER] / inverse,
+        force=float(fit.found[FORCE]) / inverse,
+        explained=fit.explained,
+        parts=tuple(
+            _part(part, chosen, fit)
+            for part, chosen in zip(means, kept, strict=True)
+            if np.any(chosen)
+        ),
+        means=int(sum(map(np.count_nonzero, kept))),
+    )
+
+
+def _best(means: Sequence[Means], kept: Sequence[BoolArray], lever: Lever) -> _Fitted:
+    """At the ratio of variances that is most likely."""
+    first = _start(Whitened(means, kept, _PLAIN))
+    fitted = [_fit(Whitened(means, kept, ratio), ratio, first, lever) for ratio in _RATIOS.tolist()]
+    return max(fitted, key=lambda each: each.likelihood)
+
+
+def _fitting(means: Sequence[Means], fit: _Fitted) -> list[BoolArray]:
+    """Which means (n,) of each part are no outliers: a knock, images that were matched wrongly."""
+    x = fit.found[:INVERSE]
+    squared = [np.sum(np.square(part.seen - design(part) @ x), axis=1) for part in means]
+    limit = _OUTLIER * float(np.median(np.concatenate(squared)))
+    return [np.asarray(errors < limit) for errors in squared]
+
+
+def _start(plain: Whitened) -> Array:
+    """Forces' scale and gravity (4,) of least squares."""
+    alone = slice(FORCE, GRAVITY.stop)
+    # At rest, forces and gravity are one column.
+    normal, right = plain.normal[alone, alone], plain.right[alone]
+    found = np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], np.float64)
+    explained = float(found @ right) / max(plain.squared, _NOTHING)
+    if not found[FORCE] > 0.0:
+        if explained < _LEAST_EXPLAINED:
+            raise NoMetric(_too_little(0.0))
+        raise NoMetric(
+            "the accelerometer shows the reverse of how the camera is accelerated: at rest it must "
+            "show +g upwards"
+        )
+    return found
+
+
+def _too_little(explained: float) -> str:
+    return (
+        f"camera and accelerometer agree in {100.0 * explained:.0f} % of their accelerations: "
+        "either the camera hardly moved (move it to and fro by some decimetres, briskly), or the "
+        "accelerometer's axes are not the gyroscope's"
+    )
+
+
+def _fit(whitened: Whitened, ratio: float, first: Array, lever: Lever) -> _Fitted:
+    inverse, down = float(first[FORCE]), first[GRAVITY] / np.linalg.norm(first[GRAVITY])
+    variance = max(whitened.squared, _NOTHING) / whitened.count
+    for _ in range(_ROUNDS):
+        rows, values = _known(inverse, down, lever)
+        normal = rows.T @ rows
+        normal[:INVERSE, :INVERSE] += whitened.normal / variance
+        right = rows.T @ values
+        right[:INVERSE] += whitened.right / variance
+        found = np.asarray(np.linalg.solve(normal, right), np.float64)
+        left = max(whitened.left(found), _EXACT * whitened.squared, _NOTHING)
+        variance = left / (whitened.count - INVERSE)
+        inverse, down = float(found[INVERSE]), found[GRAVITY] / np.linalg.norm(found[GRAVITY])
+    likelihood = -0.5 * (
+        whitened.count * (1.0 + np.log(variance))
+        + whitened.log_determinant
+        + np.linalg.slogdet(normal)[1]
+    )
+    explained = 1.0 - left / max(whitened.squared, _NOTHING)
+    covariance = np.asarray(np.linalg.inv(normal), np.float64)
+    return _Fitted(found, covariance, ratio, variance, float(likelihood), explained)
+
+
+def _known(inverse: float, down: Array, lever: Lever) -> tuple[Array, Array]:
+    """What is known beforehand: equations (8,11) of deviation 1, at a scale and a direction."""
+    rows = np.zeros((8, UNKNOWNS))
+    rows[:3, BIAS] = np.eye(3) / (_BIAS_DEVIATION * inverse)
+    rows[3:6, LEVER] = np.eye(3) / (lever.deviation * inverse)
+    rows[3:6, INVERSE] = -lever.position / (lever.deviation * inverse)
+    rows[6, FORCE], rows[6, INVERSE] = np.array([1.0, -1.0]) / (_SCALE_DEVIATION * inverse)
+    rows[7, GRAVITY] = down / (_GRAVITY_DEVIATION * inverse)
+    rows[7, INVERSE] = -STANDARD_GRAVITY / (_GRAVITY_DEVIATION * inverse)
+    return rows, np.zeros(8)
+
+
+def _part(part: Means, kept: BoolArray, fit: _Fitted) -> tuple[float, float]:
+    """The scale of a part with gravity, bias and lever of the whole, and its deviation (share)."""
+    alone = Whitened([part], [kept], fit.ratio)
+    metres = fit.found[:INVERSE] / fit.found[INVERSE]  # of accelerations in m/s^2
+    weight = float(metres @ alone.normal @ metres)
+    inverse = float(metres @ alone.right) / weight
+    return 1.0 / inverse, float(np.sqrt(fit.variance / weight) / abs(inverse))

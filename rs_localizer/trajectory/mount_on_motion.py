@@ -1,0 +1,160 @@
+"""How an IMU hangs on a camera whose motion is known: offset of its stamps, rotation, bias.
+
+The mount is that of the joint estimate (:mod:`rs_localizer.trajectory.imu`), with the motion held.
+A motion that images have found is good in its orientations, and noisy in its rates; so what is
+compared are turns over a while, of which the camera's are ``v`` and the gyroscope's
+
+    u = (1 + shape) camera_from_imu^T v + while bias
+
+within the small errors of a first guess. Deviations come from the scatter of parts of the
+recording, since what a motion lacks lasts for many samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.known_turn import rotations_at_knots
+from rs_localizer.core.known_turn import spline as cubics_of
+from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, NoMount, first_mount
+from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
+from rs_localizer.trajectory.gyro_terms import by_shape
+from rs_localizer.trajectory.spline import Layout, Spline
+
+# Turns are taken over so long (s): short beside the motion, long beside the images' noise.
+_WHILE = 0.15
+# Turns with a longer step between samples (s) in them, or nearer to the motion's ends, are none.
+_LONGEST_STEP, _MARGIN = 0.03, 0.02
+_ROUNDS = 10
+_STEP = 1e-3  # s, of the derivative by the delay
+# Squared errors of three axes count up to so many times their median.
+_LIMIT = 16.0
+# What a first guess of turn (rad), bias (rad/s) and delay (s) may be off: as good as nothing, but
+# what the motion does not tell stays where it is. Scales and angles of consumer gyroscopes are good
+# to some percent.
+_DEVIATIONS = np.repeat([1.0, 1.0, 0.5, 0.03], (3, 3, 1, MOUNT - DELAY - 1))
+# Turns further apart than so many have nothing to do with each other.
+_PART = 6
+_LEAST_PARTS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MountOnMotion:
+    """A mount beside a given motion."""
+
+    mount: GyroMount
+    covariance: Array  # (13,13) of turn (rad, IMU axes), bias, delay, shape
+
+    @property
+    def delay_deviation(self) -> float:
+        """s."""
+        return float(np.sqrt(self.covariance[DELAY, DELAY]))
+
+    @property
+    def turn_deviation(self) -> float:
+        """rad, about the axis that is known worst."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+
+def mount_on_motion(
+    samples: GyroSamples, spline: Spline, given: Array | None = None
+) -> MountOnMotion:
+    """The mount under which a gyroscope shows the turns of a motion.
+
+    Args:
+        samples: of the gyroscope; their deviation is not used.
+        spline: the motion of the camera.
+        given: (3,3) camera_from_imu, as far as the motion does not tell it.
+
+    Raises:
+        NoMount: when there are too few samples during the motion, or they show other turns.
+    """
+    start = mount = first_mount(samples, spline, given)
+    shown = _Shown(samples)
+    times = _times(spline.layout, samples.times + mount.delay)
+    if len(times) < _LEAST_PARTS * _PART:
+        raise NoMount(f"{_WHILE * len(times):.1f} s of the motion have samples without a gap")
+    before, after = (spline.states(times + shift).rotations for shift in (0.0, _WHILE))
+    seen = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
+    parts: IntArray = np.arange(len(times)) // _PART
+    for _ in range(_ROUNDS):
+        errors, by_mount = _errors(shown, times, seen, mount)
+        squared = np.sum(np.square(errors), axis=1)
+        weights = np.square(np.maximum(1.0 - squared / (_LIMIT * np.median(squared)), 0.0))
+        scores = weights[:, None] * np.einsum("nij,ni->nj", by_mount, errors)
+        variance = float(weights @ squared / (3.0 * np.sum(weights)))
+        held = np.diag(variance / _DEVIATIONS**2)
+        normal = np.einsum("n,nij,nik->jk", weights, by_mount, by_mount)
+        inverse = np.linalg.inv(normal + held)
+        mount = _moved(mount, -inverse @ (scores.sum(axis=0) + held @ _offset(start, mount)))
+    sums = np.zeros((parts[-1] + 1, MOUNT))
+    np.add.at(sums, parts, scores)
+    return MountOnMotion(mount, inverse @ (sums.T @ sums + variance * held) @ inverse)
+
+
+class _Shown:
+    """Orientations by a gyroscope."""
+
+    def __init__(self, samples: GyroSamples) -> None:
+        self._times, self._rates = samples.times, np.ascontiguousarray(samples.rates)
+        self._turned = rotations_at_knots(self._times, cubics_of(self._times, self._rates))
+
+    def turns(self, times: Array) -> Array:
+        """Rotation vectors (m,3) from times (m,) on, for a while."""
+        before, after = self._at(times), self._at(times + _WHILE)
+        return np.asarray(Rotation.from_matrix(before @ np.swapaxes(after, 1, 2)).as_rotvec())
+
+    def _at(self, times: Array) -> Array:
+        """IMU-then from IMU-at-first (m,3,3)."""
+        place = np.clip(np.searchsorted(self._times, times) - 1, 0, len(self._times) - 2)
+        since = (times - self._times[place])[:, None]
+        step = (self._times[place + 1] - self._times[place])[:, None]
+        rate, change = self._rates[place], self._rates[place + 1] - self._rates[place]
+        turned = so3.exp_many(-since * (rate + 0.5 * since / step * change))
+        return np.asarray(turned @ self._turned[place], np.float64)
+
+
+def _times(layout: Layout, sampled: Array) -> Array:
+    """When turns begin (m,), s: one after the other, each within a stretch and without a gap."""
+    parts = [
+        np.arange(start + _MARGIN, end - _MARGIN - _WHILE, _WHILE)
+        for start, end in zip(layout.starts, layout.ends, strict=True)
+    ]
+    times = np.concatenate(parts)
+    first = np.searchsorted(sampled, times - _MARGIN)
+    last = np.searchsorted(sampled, times + _WHILE + _MARGIN)
+    gaps = np.concatenate([[0], np.cumsum(np.diff(sampled) > _LONGEST_STEP)])
+    inside = (first > 0) & (last < len(sampled))
+    whole = gaps[first - 1] == gaps[np.minimum(last, len(gaps) - 1)]
+    return np.asarray(times[inside & whole], np.float64)
+
+
+def _errors(shown: _Shown, times: Array, seen: Array, mount: GyroMount) -> tuple[Array, Array]:
+    """What turns (m,3) of the gyroscope should be more, and its derivatives (m,3,13)."""
+    turned = seen @ mount.camera_from_imu
+    here = times - mount.delay
+    errors = seen @ mount.matrix.T + _WHILE * mount.bias - shown.turns(here)
+    by_mount = np.empty((len(times), 3, MOUNT))
+    by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
+    by_mount[:, :, 3:6] = _WHILE * np.eye(3)
+    by_mount[:, :, DELAY] = (shown.turns(here + _STEP) - shown.turns(here - _STEP)) / (2.0 * _STEP)
+    by_mount[:, :, DELAY + 1 :] = by_shape(turned)
+    return errors, by_mount
+
+
+def _moved(mount: GyroMount, step: Array) -> GyroMount:
+    return GyroMount(
+        mount.camera_from_imu @ so3.exp(step[:3]), mount.bias + step[3:6],
+        mount.delay + float(step[DELAY]), mount.shape + step[DELAY + 1 :],
+    )  # fmt: skip
+
+
+def _offset(start: GyroMount, mount: GyroMount) -> Array:
+    turn = so3.log(np.ascontiguousarray(start.camera_from_imu.T @ mount.camera_from_imu))
+    bias, delay = mount.bias - start.bias, mount.delay - start.delay
+    return np.concatenate([turn, bias, [delay], mount.shape])

@@ -1,0 +1,51 @@
+"""IMU readings in CSV files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rs_localizer.io.imu_files import ImuFileError, read_imu_csv
+
+HEAD = "#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z\n"
+LINE = "1403636579758555392,-0.1,0.14,0.07,8.12,-0.3,-3.7\n"
+
+
+def test_a_file_of_euroc(tmp_path: Path) -> None:
+    """To the nanosecond, which a float would lose."""
+    path = tmp_path / "data.csv"
+    path.write_text(HEAD + LINE + "\n" + LINE.replace("392,", "393, "))
+    stamps, rates, forces = read_imu_csv(path)
+    assert stamps.tolist() == [1403636579758555392, 1403636579758555393]
+    np.testing.assert_array_equal(rates, 2 * [[-0.1, 0.14, 0.07]])
+    np.testing.assert_array_equal(forces, 2 * [[8.12, -0.3, -3.7]])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (HEAD + LINE + "1,2,3\n", "line 3: must be time in ns.* got '1,2,3'"),
+        ("1.5" + LINE, "line 1: must be time in ns"),
+        (LINE.replace("0.07", "nan"), "line 1"),
+        (LINE.replace("1403", "99991403"), "line 1"),
+        ("stamp;w\n", "line 1"),
+        (HEAD, "has no readings"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text(text)
+    with pytest.raises(ImuFileError, match=said) as caught:
+        read_imu_csv(path)
+    assert str(path) in str(caught.value)
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(ImuFileError, match="cannot be read: No such file"):
+        read_imu_csv(tmp_path / "none.csv")
+    path = tmp_path / "picture.csv"
+    path.write_bytes(b"\x89PNG\r\n\xff\xfe")
+    with pytest.raises(ImuFileError, match="no text file"):
+        read_imu_csv(path)

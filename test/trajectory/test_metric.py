@@ -1,0 +1,186 @@
+"""Metres and gravity from an accelerometer: the equations, what is found, and how honest it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from felt import GRAVITY, Felt
+
+from rs_localizer.trajectory.gyro import GyroSamples, NoMount
+from rs_localizer.trajectory.mean_accelerations import ForceSamples, Means, mean_accelerations
+from rs_localizer.trajectory.metric import Lever, Metric, NoMetric, metric
+from rs_localizer.trajectory.metric_equations import covariance
+from rs_localizer.trajectory.mount_on_motion import mount_on_motion
+from rs_localizer.trajectory.spline import Layout, Spline
+
+SECONDS = 12.0
+UNKNOWN = Lever(np.zeros(3), 0.1)
+
+
+def means_of(felt: Felt, noise: float = 0.0, seed: int = 0, spacing: float = 0.15) -> list[Means]:
+    """By the true rotation and offset."""
+    stamps = felt.stamps(SECONDS)
+    forces = felt.forces(stamps)
+    forces += np.random.default_rng(seed).normal(0.0, noise, forces.shape)
+    samples = ForceSamples(stamps + felt.delay, forces)
+    return mean_accelerations(
+        felt.spline(SECONDS), samples, felt.camera_from_imu.as_matrix(), spacing
+    )
+
+
+def test_both_sides_are_the_same_number() -> None:
+    """``s p'' + (R l)'' = R C (f - b) + g`` of all means, by the test's own truth."""
+    felt = Felt.random(0)
+    for part in means_of(felt):
+        left = felt.scale * part.seen + part.arms @ felt.lever
+        right = part.forces - part.axes @ felt.bias + np.outer(part.weights, GRAVITY * felt.down)
+        np.testing.assert_allclose(left, right, atol=2e-3)
+        np.testing.assert_allclose(part.weights, 1.0, atol=1e-6)
+        assert np.std(felt.scale * part.seen) > 0.3
+
+
+def test_all_is_found() -> None:
+    felt = Felt.random(1)
+    found = metric(means_of(felt), UNKNOWN)
+    assert found.scale == pytest.approx(felt.scale, rel=2e-3)
+    assert np.linalg.norm(found.gravity) == pytest.approx(GRAVITY, rel=2e-3)
+    assert angle(found.gravity, felt.down) < 0.05
+    np.testing.assert_allclose(found.bias, felt.bias, atol=0.01)
+    np.testing.assert_allclose(found.lever, felt.lever, atol=0.005)
+    assert found.explained > 0.99
+
+
+def angle(one: np.ndarray, other: np.ndarray) -> float:
+    """deg."""
+    sine = np.linalg.norm(np.cross(one, other))
+    return float(np.degrees(np.arctan2(sine, one @ other)))
+
+
+def test_an_accelerometer_that_shows_too_much_makes_nothing_larger() -> None:
+    """2 %: gravity's known length says so."""
+    felt = Felt.random(2)
+    parts = [replace(part, forces=1.02 * part.forces) for part in means_of(felt)]
+    found = metric(parts, Lever(np.array(felt.lever), 0.005))
+    assert found.scale == pytest.approx(felt.scale, rel=0.008)
+    assert abs(found.scale / felt.scale - 1.0) < 3.0 * found.share
+
+
+def noisy(seed: int, noise: float = 3e-3) -> tuple[Felt, Metric]:
+    """Positions known to 3 mm, and orientations to 0.1 deg, for 70 ms each."""
+    felt, rng = Felt.random(seed), np.random.default_rng(1000 + seed)
+    exact = felt.spline(SECONDS)
+    layout = Layout.over(np.array([[0.0, SECONDS]]), 0.07)
+    off = Spline(
+        layout,
+        np.tile(np.eye(3), (layout.count, 1, 1)),
+        rng.normal(0.0, noise / felt.scale, (layout.count, 3)),
+    )
+    turns = rng.normal(0.0, np.radians(0.1), (layout.count, 3))
+    times = exact.layout.control_times()
+    shifted = Spline(layout, off.rotations, turns)
+    moved = exact.moved(
+        np.hstack([shifted.states(times).positions, off.states(times).positions]).ravel()
+    )
+    stamps = felt.stamps(SECONDS)
+    forces = felt.forces(stamps) + rng.normal(0.0, 0.03, (len(stamps), 3))
+    samples = ForceSamples(stamps + felt.delay, forces)
+    parts = mean_accelerations(moved, samples, felt.camera_from_imu.as_matrix(), 0.15)
+    found = metric(parts, UNKNOWN)
+    return felt, found
+
+
+def test_deviations_are_honest() -> None:
+    scales, tilts = [], []
+    for seed in range(12):
+        felt, found = noisy(seed)
+        scales.append((found.scale / felt.scale - 1.0) / found.share)
+        tilts.append(np.radians(angle(found.gravity, felt.down)) / found.gravity_deviation)
+        assert found.share < 0.02
+    assert 0.3 < np.sqrt(np.mean(np.square(scales))) < 1.7
+    assert np.max(np.abs(scales)) < 3.5
+    assert np.median(tilts) < 2.0
+
+
+def test_noise_of_positions_makes_nothing_smaller() -> None:
+    """As it would where accelerations of images are what is regressed on."""
+    ratios = [found.scale / felt.scale for felt, found in (noisy(seed, 0.01) for seed in range(6))]
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_covariance_is_that_of_white_noise() -> None:
+    """Of positions: means of a motion that is noise alone, by their own sums."""
+    rng, spacing = np.random.default_rng(0), 0.1
+    layout = Layout.over(np.array([[0.0, 80.0]]), 0.004)
+    still = np.tile(np.eye(3), (layout.count, 1, 1))
+    spline = Spline(layout, still, rng.normal(0.0, 1.0, (layout.count, 3)))
+    times = np.arange(0.0, 80.0, 0.01)
+    samples = ForceSamples(times, np.zeros((len(times), 3)))
+    parts = mean_accelerations(spline, samples, np.eye(3), spacing)
+    seen = np.concatenate([part.seen for part in parts if len(part.times) == 20])
+    expected = 0.004 * covariance(4, spacing, 0.0)[0]
+    for lag in range(4):
+        pairs = np.mean(seen[: len(seen) - lag] * seen[lag:])
+        assert pairs == pytest.approx(expected[lag], abs=0.12 * expected[0])
+
+
+def test_a_knock_does_not_count() -> None:
+    """30 m/s^2 for 20 ms that the images do not show."""
+    felt = Felt.random(9)
+    stamps = felt.stamps(SECONDS)
+    forces = felt.forces(stamps)
+    forces += np.random.default_rng(0).normal(0.0, 0.05, forces.shape)
+    forces[1200:1204] += [30.0, -10.0, 5.0]
+    samples = ForceSamples(stamps + felt.delay, forces)
+    parts = mean_accelerations(
+        felt.spline(SECONDS), samples, felt.camera_from_imu.as_matrix(), 0.15
+    )
+    assert metric(parts, UNKNOWN).scale == pytest.approx(felt.scale, rel=3e-3)
+
+
+def test_a_camera_at_rest_determines_nothing() -> None:
+    """Nor does it divide by nothing."""
+    felt = Felt.random(10, way=0.0, turn=0.0)
+    stamps = felt.stamps(SECONDS)
+    samples = ForceSamples(stamps + felt.delay, felt.forces(stamps))
+    parts = mean_accelerations(
+        felt.spline(SECONDS), samples, felt.camera_from_imu.as_matrix(), 0.15
+    )
+    with pytest.raises(NoMetric, match="the camera hardly moved"):
+        metric(parts, UNKNOWN)
+
+
+def test_the_mount_is_found() -> None:
+    felt = Felt.random(3)
+    stamps = felt.stamps(SECONDS)
+    rates = felt.rates(stamps)
+    rates[500] = 40.0  # a message that went wrong
+    found = mount_on_motion(GyroSamples(stamps, rates), felt.spline(SECONDS))
+    assert found.mount.delay == pytest.approx(felt.delay, abs=2e-4)
+    turned = felt.camera_from_imu.as_matrix().T @ found.mount.camera_from_imu
+    assert np.linalg.norm(turned - np.eye(3)) < 2e-3
+    np.testing.assert_allclose(found.mount.bias, felt.gyroscope_bias, atol=1e-3)
+    assert found.delay_deviation < 5e-4
+    assert found.turn_deviation < 5e-3
+
+
+def test_another_ones_turns_are_no_mount() -> None:
+    felt, other = Felt.random(4), Felt.random(5)
+    stamps = felt.stamps(SECONDS)
+    with pytest.raises(NoMount, match="are not the camera's"):
+        mount_on_motion(GyroSamples(stamps, other.rates(stamps)), felt.spline(SECONDS))
+
+
+def test_gaps_are_left_out() -> None:
+    felt = Felt.random(6)
+    stamps = felt.stamps(SECONDS)
+    kept = (stamps < 4.0) | (stamps > 4.3)
+    samples = ForceSamples(stamps[kept] + felt.delay, felt.forces(stamps[kept]))
+    parts = mean_accelerations(
+        felt.spline(SECONDS), samples, felt.camera_from_imu.as_matrix(), 0.15
+    )
+    times = np.concatenate([part.times for part in parts])
+    assert not np.any((times > 4.0 - 0.4) & (times < 4.3 + 0.4))
+    found = metric(parts, UNKNOWN)
+    assert found.scale == pytest.approx(felt.scale, rel=3e-3)
