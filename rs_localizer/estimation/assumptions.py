@@ -35,7 +35,7 @@ FIELD_SIZES = 10.0 ** np.arange(0.0, 2.1, 0.5)
 # Lenses and maps are never better than this, px: a hundredth. Careful ones, surveyed tags before a
 # calibrated lens, have errors of 0.1 to 0.2; whose errors are a pixel, are rare.
 _LEAST_FIELD = 0.01
-FIELD_PRIOR = np.array([0.3, 0.25, 0.3, 0.148, 0.002])
+FIELD_PRIOR = np.array([0.4, 0.25, 0.26, 0.088, 0.002])
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import FIRST_DEGREE
 from rs_localizer.core.state import PARAMETERS
+from rs_localizer.estimation.assumptions import FIELD_PRIOR
 from rs_localizer.estimation.columns import Columns, columns_of, with_prior
 from rs_localizer.estimation.evidence import (
     Sizes,
@@ -32,7 +33,7 @@ from rs_localizer.estimation.residuals import linearized
 
 # Probability of no field, the one assumed beforehand, above which none is looked for among
 # neighbours.
-_NO_FIELD = 0.3
+_NO_FIELD = float(FIELD_PRIOR[0])
 # Points nearer than this part of the image that the points fill are neighbours in it.
 _FAR_APART = 0.15
 # Correlations below so many standard deviations are chance.
