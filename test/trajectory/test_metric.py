@@ -93,7 +93,7 @@ def noisy(seed: int, noise: float = 3e-3) -> tuple[Felt, Metric]:
 
 def test_deviations_are_honest() -> None:
     scales, tilts = [], []
-    for seed in range(12):
+    for seed in range(8):
         felt, found = noisy(seed)
         scales.append((found.scale / felt.scale - 1.0) / found.share)
         tilts.append(np.radians(angle(found.gravity, felt.down)) / found.gravity_deviation)
@@ -105,7 +105,7 @@ def test_deviations_are_honest() -> None:
 
 def test_noise_of_positions_makes_nothing_smaller() -> None:
     """As it would where accelerations of images are what is regressed on."""
-    ratios = [found.scale / felt.scale for felt, found in (noisy(seed, 0.01) for seed in range(6))]
+    ratios = [found.scale / felt.scale for felt, found in (noisy(seed, 0.01) for seed in range(4))]
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.02)
 
 

@@ -16,9 +16,9 @@ from rs_localizer import data
 from rs_localizer.lab.experiments.results import Context, Result, Verdict
 from rs_localizer.lab.experiments.table import EXPERIMENTS
 
-TRIALS = 400
+TRIALS = 300
 # Of many conditions; what they measure is held by tests of their own.
-FEW = {"honesty": 5, "inertial": 20}
+FEW = {"honesty": 3, "inertial": 10, "augmented-reality": 200, "motion": 200, "readout-time": 200}
 
 HELD = {
     "motion.r6p_vcwt_equals_r6p",
@@ -145,6 +145,12 @@ OPEN = {
     *(f"inertial.few-{few}" for few in (7, 8, 12)),
     "inertial.planes-coverage",
     "inertial.cost",
+    *(
+        f"inertial.minimal-{motion}-{few}-{known}"
+        for motion in ("hand", "shaken")
+        for few in (6, 8, 12)
+        for known in ("turn", "vertical")
+    ),
 }
 
 
