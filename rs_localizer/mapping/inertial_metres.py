@@ -9,7 +9,6 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
 from rs_localizer.mapping.refine import RefinedMap
-from rs_localizer.trajectory.blocks import disagreement
 from rs_localizer.trajectory.gyro import NoMount
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.mean_accelerations import Means, mean_accelerations
@@ -99,10 +98,8 @@ def inertial_metres(refined: RefinedMap, imu: ImuRecording) -> InertialMetres:
         found = metric(means, _lever(imu))
     except NoMetric as error:
         raise NoMetres(str(error)) from error
-    parts = np.array(found.parts)
-    inflation = disagreement(parts[:, 0], parts[:, 0] * parts[:, 1])
     covered = found.means * spacing / _length(refined)
-    return InertialMetres(found, mount, inflation * found.share, turned, covered)
+    return InertialMetres(found, mount, found.inflation * found.share, turned, covered)
 
 
 def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[MountOnMotion, float | None]:
