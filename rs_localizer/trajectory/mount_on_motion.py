@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
@@ -30,7 +31,10 @@ from rs_localizer.trajectory.spline import Layout, Spline
 _WHILE = 0.15
 # Turns with a longer step between samples (s) in them, or nearer to the motion's ends, are none.
 _LONGEST_STEP, _MARGIN = 0.03, 0.02
+# Rates are averaged over so long (s) for a first guess: a third of a period of a hand's quickest.
+_CALMED = 0.06
 _ROUNDS = 10
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _STEP = 1e-3  # s, of the derivative by the delay
 # Squared errors of three axes count up to so many times their median.
 _LIMIT = 16.0
@@ -74,8 +78,9 @@ def mount_on_motion(
     Raises:
         NoMount: when there are too few samples during the motion, or they show other turns.
     """
-    start = mount = first_mount(samples, spline, given)
-    shown = _Shown(samples)
+    calmed = _calmed(samples)
+    start = mount = first_mount(calmed, spline, given)
+    shown = _Shown(samples, calmed)
     times = _times(spline.layout, samples.times + mount.delay)
     if len(times) < _LEAST_PARTS * _PART:
         raise NoMount(f"{_WHILE * len(times):.1f} s of the motion have samples without a gap")
@@ -97,8 +102,36 @@ def mount_on_motion(
     return MountOnMotion(mount, inverse @ (sums.T @ sums + variance * held) @ inverse)
 
 
+def _calmed(samples: GyroSamples) -> GyroSamples:
+    """Averaged over a moment: vibration, which no image shows, would be most of the rates."""
+    turned = cumulative_trapezoid(samples.rates, samples.times, axis=0, initial=0.0)
+    ends = np.clip(
+        samples.times + np.array([[-0.5], [0.5]]) * _CALMED, samples.times[0], samples.times[-1]
+    )
+    at = np.array([np.interp(ends, samples.times, axis) for axis in turned.T])
+    return GyroSamples(samples.times, ((at[:, 1] - at[:, 0]) / (ends[1] - ends[0])).T)
+
+
 class _Shown:
-    """Orientations by a gyroscope."""
+    """Turns by a gyroscope."""
+
+    def __init__(self, samples: GyroSamples, calmed: GyroSamples) -> None:
+        self._all, self._calm = _Turned(samples), _Turned(calmed)
+
+    def turns(self, times: Array) -> Array:
+        """Rotation vectors (m,3) from times (m,) on, for a while."""
+        return self._all.turns(times)
+
+    def changes(self, times: Array) -> Array:
+        """How they change with the times (m,), rad/s, without vibration: with it, an offset would
+        be found at which the tone of a motor happens to be zero at these times.
+        """
+        ahead, behind = self._calm.turns(times + _STEP), self._calm.turns(times - _STEP)
+        return np.asarray((ahead - behind) / (2.0 * _STEP))
+
+
+class _Turned:
+    """Orientations by samples."""
 
     def __init__(self, samples: GyroSamples) -> None:
         self._times, self._rates = samples.times, np.ascontiguousarray(samples.rates)
@@ -120,18 +153,26 @@ class _Shown:
 
 
 def _times(layout: Layout, sampled: Array) -> Array:
-    """When turns begin (m,), s: one after the other, each within a stretch and without a gap."""
+    """When turns begin (m,), s: one after the other, each within a stretch and without a gap.
+
+    Not evenly: a tone in step with them would be no noise.
+    """
     parts = [
         np.arange(start + _MARGIN, end - _MARGIN - _WHILE, _WHILE)
         for start, end in zip(layout.starts, layout.ends, strict=True)
     ]
-    times = np.concatenate(parts)
+    times = np.concatenate([even[:-1] + _unevenly(len(even) - 1) for even in parts])
     first = np.searchsorted(sampled, times - _MARGIN)
     last = np.searchsorted(sampled, times + _WHILE + _MARGIN)
     gaps = np.concatenate([[0], np.cumsum(np.diff(sampled) > _LONGEST_STEP)])
     inside = (first > 0) & (last < len(sampled))
     whole = gaps[first - 1] == gaps[np.minimum(last, len(gaps) - 1)]
     return np.asarray(times[inside & whole], np.float64)
+
+
+def _unevenly(count: int) -> Array:
+    """Up to a while (n,), s: multiples of the golden section, which come back to no tone."""
+    return np.asarray(_WHILE * np.modf(_GOLDEN * np.arange(count))[0])
 
 
 def _errors(shown: _Shown, times: Array, seen: Array, mount: GyroMount) -> tuple[Array, Array]:
@@ -142,7 +183,7 @@ def _errors(shown: _Shown, times: Array, seen: Array, mount: GyroMount) -> tuple
     by_mount = np.empty((len(times), 3, MOUNT))
     by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
     by_mount[:, :, 3:6] = _WHILE * np.eye(3)
-    by_mount[:, :, DELAY] = (shown.turns(here + _STEP) - shown.turns(here - _STEP)) / (2.0 * _STEP)
+    by_mount[:, :, DELAY] = shown.changes(here)
     by_mount[:, :, DELAY + 1 :] = by_shape(turned)
     return errors, by_mount
 

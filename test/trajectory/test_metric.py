@@ -187,6 +187,18 @@ def test_the_mount_is_found() -> None:
     assert found.turn_deviation < 5e-3
 
 
+def test_a_motor_s_tone_does_not_draw_the_offset() -> None:
+    """Of 0.5 deg, four times the hand's rates, in step with the turns that are compared."""
+    felt = Felt.random(3)
+    stamps = felt.stamps(SECONDS)
+    pulse = 2.0 * np.pi * 9.5 / 0.15
+    tone = np.radians(0.5) * pulse * np.cos(pulse * stamps)
+    samples = GyroSamples(stamps, felt.rates(stamps) + np.outer(tone, [0.5, 0.7, 0.5]))
+    found = mount_on_motion(samples, felt.spline(SECONDS))
+    assert found.mount.delay == pytest.approx(felt.delay, abs=3e-4)
+    assert abs(found.mount.delay - felt.delay) < 3.0 * found.delay_deviation
+
+
 def test_another_ones_turns_are_no_mount() -> None:
     felt, other = Felt.random(4), Felt.random(5)
     stamps = felt.stamps(SECONDS)
