@@ -12,17 +12,15 @@ iterated update). A gyroscope takes the place of the motion model's rotation whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import (
-    PARAMETERS,
-    step_between,
-)
+from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.motion_model import (
     FADING,
@@ -36,6 +34,7 @@ from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.sight import sight_of
 from rs_localizer.inertial.status import InertialStatus
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
@@ -53,6 +52,8 @@ _INDEPENDENT = 0.3
 # How fast surprises change the accelerations that are expected (exponent), and how much at most.
 _LEARNING = 0.2
 _MOST_JOLTS = 1e4
+# What a gyroscope knows.
+_TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 # The least angular acceleration there is, rad/s^2: turns are told by a gyroscope.
 _NO_TURN = 0.001
 
@@ -94,6 +95,7 @@ class Tracker:
         self._track: _Track | None = None
         readout_time = localizer.camera.readout_time
         self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
+        self._beside_turn = Acceleration(_NO_TURN, localizer.config.acceleration.linear)
         if self._aid is not None:
             self._aid.warm_up()
 
@@ -156,8 +158,11 @@ class Tracker:
         share = 0.0 if self._track is None else self._track.share
 
         def localized(foreseen: Foreseen | None) -> tuple[Estimate | Failure, Prior | None]:
-            prior = self.prediction(time_ns) if foreseen is None else foreseen.prior
             turn = None if foreseen is None else foreseen.turn
+            prior = None if foreseen is None else foreseen.prior
+            if prior is None:
+                prior = self.prediction(time_ns)
+                prior = prior if turn is None else _beside(prior, turn)
             return self.localizer.localize(points, pixels, scores, prior, share, turn), prior
 
         if self._aid is None:
@@ -173,6 +178,9 @@ class Tracker:
                     self._track = None
             return result
         self._track = _followed(self._track, prior, result, time_ns)
+        if self._aid is not None and imu is not None and self._aid.wants_sight():
+            camera = self.localizer.camera
+            self._aid.seek(sight_of(camera, points, pixels, result, time_ns))
         return result
 
     def _before(self, time_ns: int) -> Before | None:
@@ -183,8 +191,7 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
-        acceleration = Acceleration(_NO_TURN, self.localizer.config.acceleration.linear)
-        added += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
+        added += track.jolts * acceleration_covariance(self._beside_turn, dt, readout_time)
         return Before(
             track.time_ns,
             motion,
@@ -194,6 +201,20 @@ class Tracker:
             track.of_shake_sizes,
             track.of_field_sizes,
         )
+
+
+def _beside(prior: Prior | None, turn: KnownTurn) -> Prior | None:
+    """What the camera alone predicts, for a motion beside a known turn."""
+    if prior is None:
+        return None
+    assert prior.motion is not None
+    assert prior.covariance is not None
+    covariance = prior.covariance.copy()
+    covariance[_TURNING] = 0.0
+    covariance[:, _TURNING] = 0.0
+    covariance[np.ix_(_TURNING, _TURNING)] = turn.error
+    still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
+    return replace(prior, motion=still, covariance=covariance)
 
 
 def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_ns: int) -> _Track:

@@ -202,8 +202,8 @@ def test_covariance_covers_the_error():
             ]
         )
         distances.append(error @ np.linalg.solve(result.covariance, error))
-    # Median 11.34; with 60 draws it stays within these bounds unless a scale is off by a quarter.
-    assert 9.0 < np.median(distances) < 14.5
+    # Median 11.34, less by what a map may be wrong, which deviations allow for (a sixth at 0.5 px).
+    assert 7.5 < np.median(distances) < 14.5
     assert np.mean(np.array(distances) < 21.03) > 0.85
 
 

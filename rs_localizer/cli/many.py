@@ -23,7 +23,7 @@ def replay(args: Namespace, config: NodeConfig) -> None:
     if config.map_file:  # where it is from here, whatever directory a worker is in
         args = Namespace(**vars(args) | {"map": Path(config.map_file)})
     files = _given(args.params, args.map)
-    kind = Kind("replay", replay_of_many, kernels, None if args.smooth else replay_warm)
+    kind = Kind("replay", replay_of_many, kernels, replay_warm)
     run_fleet(args, Plan(kind, lambda _: files, args.overwrite))
 
 
@@ -31,8 +31,11 @@ def replay_warm(args: Namespace) -> None:
     """Compile what the settings need."""
     from rs_localizer.cli.replay import settings_of
     from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.trajectory.warm_up import warm_up
 
     FrameLocalizer(settings_of(args)).warm_up()
+    if args.smooth:
+        warm_up()
 
 
 def replay_of_many(args: Namespace, recording: Path, out: Path) -> Figures:
@@ -80,8 +83,19 @@ def calibrate(args: Namespace) -> None:
     options = ("intrinsics", "imu", "board", "map")
     given = [name for name in options if getattr(args, name) not in (None, False)]
     files = _given(args.map, args.calibration, args.params)
-    kind = Kind("calibrate", calibrate_of_many, " ".join(["calibrate", *given]))
+    kind = Kind("calibrate", calibrate_of_many, " ".join(["calibrate", *given]), calibrate_warm)
     run_fleet(Namespace(**vars(args) | {"plots": plots}), Plan(kind, lambda _: files))
+
+
+def calibrate_warm(_: Namespace) -> None:
+    """Compile what images of any kind, and many at once, need."""
+    from rs_localizer.markers.detection import warm_up as warm_up_markers
+    from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.trajectory.warm_up import warm_up
+
+    warm_up_markers()
+    FrameLocalizer(NodeConfig()).warm_up()
+    warm_up()
 
 
 def calibrate_of_many(args: Namespace, recording: Path, out: Path) -> Figures:

@@ -1,4 +1,6 @@
-"""``rs_localizer warm``: compiles all kernels of the nodes before somebody waits for them."""
+"""``rs_localizer warm``: compiles all kernels of the nodes, of calibration and of smoothing before
+somebody waits for them.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ from rs_localizer.core.lanes.jit import cache_directory
 from rs_localizer.markers import detection
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.solvers.table import SOLVERS
+from rs_localizer.trajectory import warm_up as trajectory
 
 # Any that is known: with it, frames are tracked, too.
 _READOUT_TIME = 0.03
@@ -23,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--solver",
         choices=SOLVERS,
         action="append",
-        help="only what this one needs; may be repeated (default: all solvers)",
+        help="only what frames need with this one; may be repeated (default: all solvers, and what "
+        "calibrate and replay --smooth need)",
     )
 
 
@@ -37,6 +41,8 @@ def run(arguments: argparse.Namespace) -> None:
     for name in arguments.solver or SOLVERS:
         config = NodeConfig(solver=name, readout_time=_READOUT_TIME)
         steps[f"solver {name}"] = FrameLocalizer(config).warm_up
+    if not arguments.solver:
+        steps["calibrate, smooth"] = trajectory.warm_up
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "cache of kernels .* at the next start", RuntimeWarning)
         for name, compiles in steps.items():

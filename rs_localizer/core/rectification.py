@@ -1,11 +1,12 @@
 """Pixels as a global shutter would have seen them: what the rows' motion did, undone.
 
-By the motion model (:mod:`rs_localizer.core.shutter`), what the camera has before it at the row
-time ``tau`` of its pixel, it has at another one ``tau'`` at
+With the poses ``R, t`` camera_from_map of two row times, what the camera has before it at ``tau``,
+the one of its pixel, it has at another one ``tau'`` at
 
-    camera_point(tau') = exp(-tau' [omega]x) (exp(tau [omega]x) camera_point(tau) + (tau - tau') v)
+    camera_point(tau') = Q camera_point(tau) + t(tau') - Q t(tau),   Q = R(tau') R(tau)^T
 
-Its depth is what a pixel alone does not say; far away, only the rotation counts.
+The poses are those of the whole motion: with accelerations, and with what shakes the camera as far
+as that is known. Its depth is what a pixel alone does not say; far away, only the rotation counts.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
@@ -52,12 +52,14 @@ def rectify(
         raise ValueError(f"tau must be finite, got {tau!r}")
     rows = camera.row_time(pixels)
     points = np.column_stack([camera.rays(pixels), np.ones(len(pixels))])
-    shift = np.zeros_like(points)
-    if depths is not None:
-        z = np.asarray(depths, np.float64)
-        if z.shape not in ((), (len(pixels),)) or not np.all(z > 0.0):
-            raise ValueError(f"depths must be one or (n,) numbers above 0, got {depths!r}")
-        # In units of the depth, which may be infinite.
-        shift = np.outer((rows - tau) / z, motion.linear_velocity)
-    turned = np.einsum("nij,nj->ni", so3.exp_many(rows[:, None] * motion.angular_velocity), points)
-    return camera.project((turned + shift) @ so3.exp(-tau * motion.angular_velocity).T)
+    rotations, translations = motion.at_rows(rows)
+    wanted, translation = motion.at(float(tau))
+    turned = np.einsum("ij,nkj,nk->ni", wanted, rotations, points)
+    if depths is None:
+        return camera.project(turned)
+    z = np.asarray(depths, np.float64)
+    if z.shape not in ((), (len(pixels),)) or not np.all(z > 0.0):
+        raise ValueError(f"depths must be one or (n,) numbers above 0, got {depths!r}")
+    # In units of the depth, which may be infinite.
+    shift = translation - np.einsum("ij,nkj,nk->ni", wanted, rotations, translations)
+    return camera.project(turned + shift / np.broadcast_to(z, len(pixels))[:, None])

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.known_turn import KnownTurn, find_turn
 from rs_localizer.core.lanes.jit import kernel
 
 # Image points that nearly keep pace with the rows.
@@ -37,21 +37,26 @@ def steadied(
         by_ray: (n,2,2) derivatives of the raw pixels by the rays.
         gradient: (2,) of the row time by the pixel.
     """
-    rotations, rates = turn.at_rows(np.nan_to_num(tau))
-    found: tuple[Array, Array] = _steadied(rays, by_ray, gradient, rotations, rates)
+    found: tuple[Array, Array] = _steadied(rays, tau, by_ray, gradient, *turn.spline)
     return found
 
 
 @kernel
 def _steadied(
-    rays: Array, by_ray: Array, gradient: Array, rotations: Array, rates: Array
-) -> tuple[Array, Array]:
+    rays: Array, tau: Array, by_ray: Array, gradient: Array,
+    times: Array, cubics: Array, rotations: Array, parabola: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     count = len(rays)
     turned, by_turned = np.empty((count, 2)), np.empty((count, 2, 2))
-    step, pixel = np.empty((2, 2)), np.empty((2, 2))
+    rotation, rate = np.empty((3, 3)), np.empty(3)
+    step, pixel, moved = np.empty((2, 2)), np.empty((2, 2)), np.empty(2)
     for i in range(count):
         x, y = rays[i, 0], rays[i, 1]
-        rotation, rate = rotations[i], rates[i]
+        if not np.isfinite(x + y + tau[i]):
+            turned[i] = np.nan
+            by_turned[i] = np.nan
+            continue
+        find_turn(tau[i], times, cubics, rotations, parabola, rotation, rate)
         # The bearing in the axes of the middle row.
         u = rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0]
         v = rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1]
@@ -69,7 +74,6 @@ def _steadied(
         depth_rate = rate[1] * x - rate[0] * y
         ray_rate_x = rate[2] * y - rate[1] - x * depth_rate
         ray_rate_y = rate[0] - rate[2] * x - y * depth_rate
-        moved = np.empty(2)
         for row in range(2):
             moved[row] = by_ray[i, row, 0] * ray_rate_x + by_ray[i, row, 1] * ray_rate_y
             for j in range(2):

@@ -18,8 +18,9 @@ _MOST_TURN = 1.5
 # Errors as large as the gate lets them be are those of points strewn over it.
 # A global shutter leaves errors of the motion beside the noise. In inlier thresholds.
 _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
-# Errors that neighbouring rows share although the motion follows vibration, in standard deviations.
-_MOST_AGREEMENT = 3.0
+# Errors that neighbouring rows share although the motion follows vibration, in standard deviations:
+# chance exceeds this in one good frame of 100,000.
+_MOST_AGREEMENT = 4.2
 # Less than this, in inlier thresholds, makes the covariance larger and refuses nothing.
 _LEAST_MODEL_ERROR = 0.05
 # Errors of map and lens, root mean square, in inlier thresholds.

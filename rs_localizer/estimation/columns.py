@@ -17,9 +17,9 @@ from rs_localizer.estimation.prior_terms import PriorTerms
 # Coefficients of the field: polynomials of the image up to the third degree, in two directions.
 _FIELD_DEGREE = 3
 _FIELD_TERMS = (_FIELD_DEGREE + 1) * (_FIELD_DEGREE + 2) // 2
-# Size of each degree: fields of lenses and maps are smooth, and no lens and no paper shears an
-# image.
-_FIELD_DEGREE_SIZES = (1.0, 0.2, 0.5, 0.25)
+# Size of each degree: fields of lenses and maps are smooth. Those of real maps shear and stretch an
+# image as much as they move it: printers stretch paper, markers are surveyed one by one.
+_FIELD_DEGREE_SIZES = (1.0, 1.0, 0.5, 0.25)
 _TERM_SIZES = np.array(
     [
         _FIELD_DEGREE_SIZES[degree] * math.sqrt((2 * i + 1) * (2 * (degree - i) + 1))

@@ -19,8 +19,9 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import KnownTurn, multiplied
+from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations

@@ -16,6 +16,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import PARAMETERS, at_rest, depths, step_between
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
+from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
@@ -25,6 +26,8 @@ from rs_localizer.estimation.refine import apply_step
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
+# Along the flat valleys of small planes a fit may end before its steps do.
+_FITS = 4
 # Odds by which motion must explain the points better than rest, to count in the estimate. Where a
 # map or a lens is seen to be wrong, what looks like motion mostly is more of that, and the odds
 # grow by the second factor. The covariance allows for motion at even odds.
@@ -77,17 +80,24 @@ class Inliers:
 
     def fitted(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
         """State (24,) and cost of the best motion near a state."""
-        found = fit(self.observations, start, self.inliers, terms, self.noise)
-        return found[0], found[2]
+        for _ in range(_FITS):
+            start, _, cost, converged = fit(
+                self.observations, start, self.inliers, terms, self.noise
+            )
+            if converged:
+                break
+        return start, cost
 
-    def examined(self, state: Array, terms: PriorTerms, degree: int) -> Examined:
+    def examined(
+        self, state: Array, terms: PriorTerms, degree: int, neighbours: bool = True
+    ) -> Examined:
         """Shaking, up to a degree (0: none), and field at the best motion."""
         observations = self.observations
         found: Examined = examine(
             observations.packed, state, observations.row_time_gradient, observations.rays,
             observations.tau, self.inliers, terms, degree, self.freedom, self.noise,
             self.assumed.shake * SHAKE_SIZES, self.shake_prior,
-            self.field_sizes, self.field_prior,
+            self.field_sizes, self.field_prior, neighbours,
         )  # fmt: skip
         return found
 
@@ -103,14 +113,14 @@ class Inliers:
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> Mode:
         """The Gaussian about the best motion of a typical speed."""
         state, cost = self.fitted(start, terms)
-        examined = self.examined(state, terms, 0)
+        examined = self.examined(state, terms, 0, neighbours=False)
         volume = volume_of(terms, examined)
         evidence = self.worth * (examined.sizes.evidence + volume)
         if self.assumed.turn is not None:
             evidence += self.assumed.turn.evidence(speed)
         return Mode(
             state,
-            self.inflation / self.worth * examined.covariance,
+            along_arcs(self.inflation / self.worth * examined.covariance, state[9:12]),
             evidence,
             self.worth * volume,
             cost / self.noise**2,
@@ -140,8 +150,8 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
     for probability, mode in zip(possible, modes, strict=True):
         covariance += probability * mode.covariance
-    # Shaking that was not seen may be there all the same.
-    joint = found.covariance.copy()
+    # Shaking that was not seen may be there all the same, unless the camera rests.
+    joint = (1.0 - possible @ at_rest) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
     joint[:PARAMETERS, PARAMETERS:] = 0.0
     joint[PARAMETERS:, :PARAMETERS] = 0.0
@@ -149,6 +159,7 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
         found,
         state=state,
         covariance=joint,
+        shake=np.zeros_like(found.shake),  # it was that beside another motion
         squared_errors=frame.observations.squared_errors(state),
         model_error=float(possible @ [mode.field for mode in modes]),
         mirror=_mirror(modes, evidence, steps, covariance) if planar else None,

@@ -19,6 +19,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import FIRST_DEGREE
 from rs_localizer.core.state import PARAMETERS
+from rs_localizer.estimation.assumptions import FIELD_PRIOR
 from rs_localizer.estimation.columns import Columns, columns_of, with_prior
 from rs_localizer.estimation.evidence import (
     Sizes,
@@ -30,8 +31,9 @@ from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
 
-# Probability of no field above which none is looked for among neighbours.
-_NO_FIELD = 0.5
+# Probability of no field, the one assumed beforehand, above which none is looked for among
+# neighbours.
+_NO_FIELD = float(FIELD_PRIOR[0])
 # Points nearer than this part of the image that the points fill are neighbours in it.
 _FAR_APART = 0.15
 # Correlations below so many standard deviations are chance.
@@ -170,6 +172,7 @@ def examine(
     inliers: BoolArray,
     prior: PriorTerms, degrees: int, freedom: float, noise: float,
     shake_sizes: Array, shake_prior: Array, field_sizes: Array, field_prior: Array,
+    neighbours: bool,
 ) -> Examined:  # fmt: skip
     """What a motion, the best without shaking, leaves of an image, and what that makes of it.
 
@@ -180,6 +183,7 @@ def examine(
         prior: of the motion.
         degrees: of the shaking; 0: the camera does not.
         freedom, noise, shake_sizes, ...: see :func:`sizes_of`.
+        neighbours: whether to ask how much they agree, else 0.
     """
     count = len(rays)
     still = np.zeros((count, 6))
@@ -190,9 +194,12 @@ def examine(
         columns, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
     )  # fmt: skip
     step, covariance = with_model_error(columns, sizes.noise, sizes.shake, sizes.field)
-    agreement = neighbours_agree(errors, measured_tau, rays, inliers)
-    # Where no field is seen, nor is what neighbours share; and most frames have none.
-    shared = shared_errors(errors, rays, inliers) if sizes.no_field < _NO_FIELD else 0.0
+    agreement, shared = 0.0, 0.0
+    if neighbours:
+        agreement = neighbours_agree(errors, measured_tau, rays, inliers)
+        # Where no field is seen, nor is what neighbours share; and most frames have none.
+        if sizes.no_field < _NO_FIELD:
+            shared = shared_errors(errors, rays, inliers)
     determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
     return Examined(step, covariance, sizes, agreement, shared, determined)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,
@@ -88,9 +89,16 @@ def held_beside(terms: PriorTerms, turn_known: bool = False) -> PriorTerms:
 
 def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
     """The terms of a motion beside a known turn; error (6,6): see ``KnownTurn.error``."""
-    informations = terms.informations.copy()
-    informations[0][_TURNING] = np.linalg.inv(error)
-    return terms._replace(informations=informations)
+    return terms._replace(informations=_with_turn(terms.informations, error))
+
+
+@kernel
+def _with_turn(informations: Array, error: Array) -> Array:
+    changed, precision = informations.copy(), np.linalg.inv(error)
+    for i in range(6):
+        for j in range(6):  # the rate, and its change six places behind it
+            changed[0, 6 + i + i // 3 * 3, 6 + j + j // 3 * 3] = precision[i, j]
+    return changed
 
 
 def gravity_cost(terms: PriorTerms, state: Array) -> float:

@@ -39,7 +39,7 @@ _LITTLE_OF_THE_PRIOR = 0.05
 _SHAKE_DEGREE = 6
 _SHAKING = 0.05
 # Logarithm of the odds that shaking of any degree must gain where only neighbouring rows agree; and
-# agreement of which a frame would be refused (:mod:`.acceptance`) if nothing mended it.
+# agreement, by chance in one frame of 700, that neither rest nor a wrong map explains.
 _GAIN, _CERTAIN = 0.1, 3.0
 # Where points are fewer, two for each of the coefficients, such a gain hides in their noise.
 _ENOUGH_POINTS = 2 * 3 * (DEGREES[-1] - 1)
@@ -100,7 +100,8 @@ def _settled(
     sizes = examined.sizes
     may_shake = assumed.rolling and not mirrored_fits
     seems_to_shake = may_shake and _seems_to_shake(frame, best, examined)
-    if seems_to_shake and not _rather_rests(frame, best, examined):
+    certain = examined.agreement > _CERTAIN
+    if seems_to_shake and (certain or not _rather_rests(frame, best, examined)):
         shaken = _followed(frame, best, sizes, threshold)
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
             return shaken

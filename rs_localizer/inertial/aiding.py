@@ -15,9 +15,12 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.inertial import turning
 from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
+from rs_localizer.inertial.gaps import span_of
 from rs_localizer.inertial.gravity import gravity_seen
+from rs_localizer.inertial.offset_search import OffsetSearch, warm_up
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.sight import Sight
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
@@ -29,6 +32,9 @@ _SEEN_BLOCK = np.ix_(SEEN, SEEN)
 # it contradicts what the camera sees.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
 
+
+# Deviations of an offset that was found at once, as the filter takes them.
+_WIDER = 3.0
 
 Found = tuple[Estimate | Failure, Prior | None]
 
@@ -74,6 +80,9 @@ class GyroscopeAid:
         self._watch = GyroscopeWatch(settings, self.filter)
         self._last_ns: int | None = None
         self._state = Alone.NO_SAMPLES
+        self._status: InertialStatus | None = None  # until it is asked for
+        self._search = OffsetSearch() if settings.estimate_time_offset else None
+        self._shaken = False  # in this frame, by the gyroscope
 
     def warm_up(self) -> None:
         """Compile every kernel that frames may need, or load it from the cache."""
@@ -84,6 +93,11 @@ class GyroscopeAid:
         between = turning.turn_between(samples, -30_000_000, 0, filter_.errors)
         assert within is not None
         assert between is not None
+        span_of(times, 0, 1)
+        warm_up()
+        within.known.at(0.0)
+        within.known.late(0.0)
+        contradicts(np.zeros(3), within.known.error[:3, :3])
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         identity = np.eye(PARAMETERS)
         predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
@@ -93,13 +107,38 @@ class GyroscopeAid:
     @property
     def status(self) -> InertialStatus:
         """What became of the gyroscope in the last frame."""
-        return self._watch.status(self._state)
+        if self._status is None:
+            self._status = self._watch.status(self._state)
+        return self._status
 
     def reset(self) -> None:
         """Forget all frames."""
+        self._status = None
         self.filter.reset()
         self._watch.reset()
         self._last_ns = None
+        self._search = OffsetSearch() if self._settings.estimate_time_offset else None
+
+    @property
+    def searches(self) -> bool:
+        """Whether the time offset is still looked for among all that are possible."""
+        return self._search is not None
+
+    def wants_sight(self) -> bool:
+        """Whether this frame is to help in that: only where the camera vibrates one may err."""
+        return self._shaken and self._search is not None and self._search.wants()
+
+    def seek(self, sight: Sight | None) -> None:
+        """Look for the time offset with one more frame."""
+        if self._search is None or sight is None:
+            return
+        self._search.add(sight)
+        found = self._search.look(*self._watch.heard)
+        if found is not None:
+            self._search, self._status = None, None
+            if self.filter.contradicts(found.time_offset, found.deviation):
+                self.filter.reset(found.time_offset, _WIDER * found.deviation)
+                self._watch.take_up()
 
     def localize(
         self,
@@ -116,6 +155,7 @@ class GyroscopeAid:
             localized: localizes the frame with what is foreseen, or with the camera alone; and the
                 prior that it did so with.
         """
+        self._status, self._shaken = None, False
         if self._last_ns is not None and middle_ns > self._last_ns:
             self.filter.walk(1e-9 * (middle_ns - self._last_ns))
         self._last_ns = middle_ns
@@ -150,6 +190,7 @@ class GyroscopeAid:
         if turn is None:
             self._state = Alone.NOT_COVERED
             return None
+        self._shaken = turn.known.roughness > turning.MOST_ROUGH
         last = before()
         if last is not None:
             errors = self.filter.errors

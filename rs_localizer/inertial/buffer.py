@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.inertial.gaps import span_of
 
 Vector = tuple[float, float, float]
 
@@ -24,9 +25,6 @@ MOST = 16_384
 _SET_BACK_NS = 500_000_000
 # At a longer period than this, a shaking of 30 Hz turns by half a cycle between two readings.
 _LONGEST_PERIOD_NS = 16_000_000
-# Readings farther apart than so many periods are a gap: one that is missing can be told from its
-# neighbours, as far as a vibration goes that they can show, two cannot.
-_MOST_PERIODS = 2.5
 # Between readings that are closer than this the noise would make the spline swing: one counts.
 _CLOSEST_NS = 250_000
 # A gyroscope that shows its greatest value so many times in a row, and at least this (rad/s; the
@@ -180,36 +178,34 @@ class ReadingBuffer:
             end = int(known.searchsorted(until_ns)) + 1
             stamps = known[begin:end].copy()
             values = self._values[self._first + begin : self._first + end].copy()
-        if len(stamps) > 1 and np.diff(stamps).min() < _CLOSEST_NS:
+        span = span_of(stamps, start_ns, end_ns)
+        if span.closest < _CLOSEST_NS:
             kept = _apart(stamps)
             stamps, values = stamps[kept], values[kept]
-        first = int(stamps.searchsorted(start_ns, "right")) - 1
-        last = int(stamps.searchsorted(end_ns)) + 1
-        steps = stamps[1:] - stamps[:-1]
-        period = float(np.median(steps)) if len(steps) else 0.0
-        if period > _LONGEST_PERIOD_NS:
+            span = span_of(stamps, start_ns, end_ns)
+        if span.period > _LONGEST_PERIOD_NS:
             return Lacking(
                 Lack.TOO_SLOW,
-                f"a reading comes every {_span(period)}; at most {_span(_LONGEST_PERIOD_NS)} tell "
-                "how a camera shakes",
+                f"a reading comes every {_span(span.period)}; at most {_span(_LONGEST_PERIOD_NS)} "
+                "tell how a camera shakes",
             )
-        stops = np.flatnonzero(steps > _MOST_PERIODS * period) + 1
-        if ((stops > first) & (stops < last)).any():
-            step = _span(float(steps[first : last - 1].max()))
+        if span.gap:
+            step = _span(span.gap)
             return Lacking(Lack.GAP, f"for {step} within the exposure there is no reading")
+        begin, end = span.begin, span.end
         greatest = values[-1, 6:]
         if greatest.max() >= _SATURATED_RATE:
             ends = _at_the_end_of_the_range(values[:, :3], greatest)
-            if np.any(ends[first:last]):
-                most = float(np.abs(values[first:last, :3]).max())
+            if np.any(ends[span.first : span.last]):
+                most = float(np.abs(values[span.first : span.last, :3]).max())
                 return Lacking(
                     Lack.SATURATED,
                     f"the gyroscope shows {most:.2f} rad/s and no more: the end of its range",
                 )
             # Cut on both sides of what it could not tell.
-            stops = np.concatenate([stops, np.flatnonzero(ends), np.flatnonzero(ends) + 1])
-        begin = max(stops[stops <= first].tolist(), default=0)
-        end = min(stops[stops >= last].tolist(), default=len(stamps))
+            stops = np.concatenate([np.flatnonzero(ends), np.flatnonzero(ends) + 1])
+            begin = max([begin, *stops[stops <= span.first].tolist()])
+            end = min([end, *stops[stops >= span.last].tolist()])
         forces = values[begin:end, 3:6]
         return Readings(
             stamps[begin:end],

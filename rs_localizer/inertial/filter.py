@@ -11,7 +11,7 @@ update of the whole filter: given the motion, the image says nothing more of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from rs_localizer.core.state import (
     ANGULAR_ACCELERATION,
     PARAMETERS,
 )
+from rs_localizer.estimation.refine import half_inverse
 from rs_localizer.inertial import turning
 from rs_localizer.inertial.settings import (
     BIAS_DEVIATION,
@@ -39,10 +40,13 @@ _GIVEN_OFFSET_DEVIATION = 1e-4
 _MOST_BIAS = 5.0
 # Of the information that a frame adds at most, so that rounding leaves some variance.
 _MOST_GAIN = 0.9999
+_ROUNDING = 1e-9  # of eigenvalues of what is scaled to 1
 
 RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 """Of a step: what the gyroscope leaves to the points."""
 _TURNS = np.arange(3)
+# Deviations between two values of one offset.
+_FAR = 4.0
 # What the rows say of the time offset is not believed beyond chance (squared, in variances),
 # but then its variance grows.
 _MOST_DELAY, _WIDER = 16.0, 2.0
@@ -78,6 +82,12 @@ class GyroscopeFilter:
         """Whether no gyroscope has such a bias."""
         return float(np.abs(self.errors.bias).max()) > _MOST_BIAS * BIAS_DEVIATION
 
+    def contradicts(self, time_offset: float, deviation: float) -> bool:
+        """Whether another time offset, known to a deviation (s), is not the one of the frames."""
+        own = math.sqrt(self.errors.covariance[OFFSET, OFFSET])
+        off = abs(time_offset - self.errors.time_offset)
+        return off > _FAR * math.hypot(deviation, JITTER) or own > _FAR * deviation
+
     def forget_motion(self) -> None:
         """The next frame does not follow the last one."""
         self._with_motion = np.zeros((PARAMETERS, turning.PARAMETERS))
@@ -89,11 +99,10 @@ class GyroscopeFilter:
 
     def walk(self, seconds: float) -> None:
         """Let time pass."""
-        covariance = self.errors.covariance.copy()
-        covariance[BIAS, BIAS] += self._settings.gyroscope_bias_walk**2 * seconds * np.eye(3)
-        if self._settings.estimate_time_offset:
-            covariance[OFFSET, OFFSET] += OFFSET_WALK**2 * seconds
-        self._set(np.append(self.errors.bias, self.errors.time_offset), covariance)
+        offset_walk = OFFSET_WALK if self._settings.estimate_time_offset else 0.0
+        added = np.array([*3 * [self._settings.gyroscope_bias_walk], offset_walk]) ** 2
+        covariance = self.errors.covariance + np.diag(seconds * added)
+        self.errors = replace(self.errors, covariance=covariance)
 
     def predict(
         self,
@@ -187,10 +196,11 @@ class GyroscopeFilter:
         """``known``: places of a step that the prediction ``before`` was of."""
         whole = len(known) == PARAMETERS
         after = np.ascontiguousarray(posterior if whole else posterior[np.ix_(known, known)])
-        gain, gained, left = _gain(before, after, np.ascontiguousarray(with_parameters))
+        gain, gained, tied = _gain(
+            np.ascontiguousarray(before), after, np.ascontiguousarray(with_parameters)
+        )
         covariance = self.errors.covariance - gained
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain @ step
-        tied = left @ gain.T
         if not whole:
             tied = posterior[:, known] @ np.linalg.solve(after, tied)
         self._with_motion = np.ascontiguousarray(tied)
@@ -243,31 +253,23 @@ def _carried(
 
 @kernel
 def _gain(before: Array, after: Array, with_parameters: Array) -> tuple[Array, Array, Array]:
-    """Gain (4,k), what it takes from the covariance (4,4), and the covariance (k,k) after.
+    """Gain (4,k), what it takes from the covariance (4,4), and what is left of the one (k,4).
 
     What shaking and model error make of an estimate's covariance may exceed the prediction's. Such
     a frame says nothing of the parameters, but does not make them worse.
     """
     size = len(before)
-    deviations = np.sqrt(np.diag(before))
-    scaled = np.empty((size, size))
+    inverse, scale, found = half_inverse(before)
+    if not found:
+        nothing = np.zeros((with_parameters.shape[1], size))
+        return nothing, nothing @ with_parameters, with_parameters.copy()
     for i in range(size):
-        for j in range(size):
-            scaled[i, j] = before[i, j] / (deviations[i] * deviations[j])
-    factor = np.linalg.cholesky(scaled)
-    inverse = np.linalg.inv(factor)  # of the factor of what is not scaled
-    for i in range(size):
-        for j in range(size):
-            inverse[i, j] /= deviations[j]
+        for j in range(i + 1):
+            inverse[i, j] *= scale[j]
     half = inverse @ with_parameters
-    values, vectors = np.linalg.eigh(inverse @ after @ inverse.T)
-    outer, along = factor @ vectors, vectors.T @ half
-    lost, kept = along.copy(), outer.copy()
-    for k in range(size):
-        value = min(max(values[k], 1.0 - _MOST_GAIN), 1.0)
-        for i in range(size):
-            outer[i, k] *= deviations[i]
-            kept[i, k] = outer[i, k] * value
-        for i in range(4):
-            lost[k, i] *= 1.0 - value
-    return half.T @ inverse, along.T @ lost, kept @ outer.T
+    left = inverse @ after @ inverse.T
+    if not half_inverse((1.0 + _ROUNDING) * np.eye(size) - left)[2]:
+        values, vectors = np.linalg.eigh(left)
+        left = (vectors * np.minimum(values, 1.0)) @ vectors.T
+    kept = _MOST_GAIN * left @ half + (1.0 - _MOST_GAIN) * half
+    return half.T @ inverse, half.T @ (half - kept), before @ (inverse.T @ kept)

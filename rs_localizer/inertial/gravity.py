@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import rotations_at_knots, spline
+from rs_localizer.core.rate_spline import rotations_at_knots, spline
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.turning import GyroscopeErrors
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.known_turn import rotations_at_knots, spline, turns_at
+from rs_localizer.core.rate_spline import rotations_at_knots, spline, turns_at
 from rs_localizer.core.so3 import log
 
 # Offsets to try, s; finer than a tenth of the cycle of what can shake a camera at 100 Hz.

@@ -27,13 +27,13 @@ class ImuSamples:
 
     def __post_init__(self) -> None:
         count = len(self.times_ns)
-        if np.shape(self.times_ns) != (count,) or np.any(np.diff(self.times_ns) <= 0):
+        if np.shape(self.times_ns) != (count,) or (self.times_ns[1:] <= self.times_ns[:-1]).any():
             raise ValueError("times_ns must be (n,) and increase")
         for name in ("angular_velocity", "specific_force"):
             values = getattr(self, name)
             if values is None:
                 continue
-            if np.shape(values) != (count, 3) or not np.all(np.isfinite(values)):
+            if np.shape(values) != (count, 3) or not np.isfinite(values).all():
                 raise ValueError(
                     f"{name} must be ({count},3) and finite, got shape {np.shape(values)}"
                 )
@@ -43,8 +43,8 @@ class ImuSamples:
 
     def around(self, first_ns: int, last_ns: int) -> slice | None:
         """Which samples cover an interval, and a few on both sides; None if they do not."""
-        first = int(np.searchsorted(self.times_ns, first_ns, "right"))
-        last = int(np.searchsorted(self.times_ns, last_ns, "left"))
+        first = int(self.times_ns.searchsorted(first_ns, "right"))
+        last = int(self.times_ns.searchsorted(last_ns))
         if first == 0 or last == len(self):
             return None
         return slice(max(first - MARGIN, 0), last + MARGIN)

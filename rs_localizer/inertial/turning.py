@@ -14,15 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.known_turn import (
-    KnownTurn,
-    multiplied,
-    rotations_at_knots,
-    spline,
-    turn_of,
-    turns_at,
-)
+from rs_localizer.core.known_turn import KnownTurn, turn_of
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
 from rs_localizer.core.so3 import coefficients, log
 from rs_localizer.inertial.band import densified
 from rs_localizer.inertial.samples import ImuSamples
@@ -40,7 +34,7 @@ _LEAST_SHIFT = 1e-4
 # A vibration of more than this (rad per readout) of whose phase nothing is known, because the
 # offset is not known this well (s), says nothing of bias and offset: one that is in step with the
 # frames is the same in all of them, as a bias is.
-_MOST_ROUGH, _NEAR = 2e-3, 5e-4
+MOST_ROUGH, _NEAR = 2e-3, 5e-4
 _WAVE_SLOPE = 60.0  # squared slope of a line through a wave, to its mean square; at most
 
 
@@ -95,7 +89,9 @@ def turn_within(
     period = (times[-1] - times[0]) / (len(times) - 1)
     rate_noise = errors.noise * readout_time / math.sqrt(period)
     delay = math.sqrt(errors.covariance[OFFSET, OFFSET] + JITTER**2) / readout_time
-    return TurnWithin(KnownTurn(*turn, error, rate_noise, delay), by_parameters, variances)
+    rate_error = readout_time**2 * errors.covariance[BIAS, BIAS]
+    known = KnownTurn(*turn, error, rate_noise, delay, rate_error)
+    return TurnWithin(known, by_parameters, variances)
 
 
 def turn_between(
@@ -139,7 +135,7 @@ def _within(
             variances[k] += _WALK_SLOPE * walk + scale * turned
         else:
             variances[k] += _WALK_CURVATURE * walk + scale * changed
-    if rough * min(deviation / _NEAR, 1.0) > _MOST_ROUGH:
+    if rough * min(deviation / _NEAR, 1.0) > MOST_ROUGH:
         for k in range(6):
             variances[k] += rough * rough * (2.0 if k < 3 else 2.0 * _WAVE_SLOPE)
             uncertain = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -9,13 +10,14 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.filter import GyroscopeFilter
 from rs_localizer.inertial.mounting import fit_mounting
 from rs_localizer.inertial.offset import CameraTurn, fit_offset
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
-from rs_localizer.inertial.turning import BIAS, OFFSET, turn_between
+from rs_localizer.inertial.turning import turn_between
 
 # Squared Mahalanobis length of what a frame changes in the predicted rotation and turn rate; a
 # chi-squared variable of six degrees of freedom exceeds this once in a million.
@@ -67,6 +69,14 @@ class GyroscopeWatch:
         while self._samples and self._samples[0][0][-1] < samples.times_ns[-1] - _MEMORY_NS:
             self._samples.popleft()
 
+    @property
+    def heard(self) -> tuple[IntArray, Array]:
+        """Times (n,) in ns and rates (n,3) of the last seconds' samples."""
+        if not self._samples:
+            return np.zeros(0, np.int64), np.zeros((0, 3))
+        times, rates = zip(*self._samples, strict=True)
+        return np.concatenate(times), np.concatenate(rates)
+
     def judge(self, contradicts: bool, frame: Believed | None) -> None:
         """Take in a frame.
 
@@ -99,16 +109,15 @@ class GyroscopeWatch:
         """Find a time offset that makes the two agree, or say that the mounting does not."""
         if not self._samples:
             return
-        times = np.concatenate([part[0] for part in self._samples])
-        rates = np.concatenate([part[1] for part in self._samples])
+        times, rates = self.heard
         fit = fit_offset(times, rates, self._turns)
         if fit is not None and fit.explains and self._settings.estimate_time_offset:
             self._filter.reset(fit.time_offset, 2.0 * fit.deviation)
-            self._take_up()
+            self.take_up()
             return
         shown, seen = self._compared(ImuSamples(times, rates))
         if len(seen) and np.sum((seen - shown) ** 2) < _ALLOWED * np.sum(seen**2):
-            self._take_up()
+            self.take_up()
             return
         mounting = fit_mounting(shown, seen) if len(seen) else None
         if mounting is not None and mounting.explains:
@@ -116,7 +125,8 @@ class GyroscopeWatch:
         else:
             self.dropped, self.angle = Alone.DISAGREES, 0.0
 
-    def _take_up(self) -> None:
+    def take_up(self) -> None:
+        """Believe it again."""
         self.dropped, self.angle = Alone.NONE, 0.0
         self._contradictions.clear()
 
@@ -134,17 +144,18 @@ class GyroscopeWatch:
     def status(self, alone: Alone) -> InertialStatus:
         """What to tell."""
         errors = self._filter.errors
-        deviations = np.sqrt(np.diag(errors.covariance))
+        *biases, offset = errors.covariance.diagonal().tolist()
         return InertialStatus(
             alone,
             errors.bias,
-            float(np.sqrt(np.mean(deviations[BIAS] ** 2))),
+            math.sqrt(sum(biases) / len(biases)),
             errors.time_offset,
-            float(deviations[OFFSET]),
+            math.sqrt(offset),
             self.angle,
         )
 
 
 def contradicts(step: Array, covariance: Array) -> bool:
     """Whether a frame moved rotation and turn rate (k,) by more than their prediction allows."""
-    return bool(step @ np.linalg.solve(covariance, step) > _MOST_SURPRISE)
+    information = inverted(np.ascontiguousarray(covariance))
+    return not step @ information @ step <= _MOST_SURPRISE

@@ -152,14 +152,18 @@ def _touch(rows: Rows, landmark: int, scratch: Scratch, shared: int) -> tuple[in
 
 
 @kernel
-def eliminate(rows: Rows, part: int, parts: int, system: Array) -> None:
+def eliminate(rows: Rows, sequence: IntArray, part: int, parts: int, system: Array) -> None:
     """Take the landmarks out of the lower triangle of a system (N,N): every ``parts``-th control's
     rows of it, so that threads do not meet.
+
+    Args:
+        sequence: (p,) the landmarks, those that the same images see behind each other: what they
+            touch of a large system is then still at hand.
     """
     scratch = make_scratch(rows)
     inverse, coupled = scratch.inverse, scratch.coupled
     starts, ends, columns = scratch.runs
-    for landmark in range(len(rows.starts) - 1):
+    for landmark in sequence:
         runs = gather(rows, landmark, scratch)
         for mine in range(runs):
             for a in range(starts[mine], ends[mine]):
@@ -263,13 +267,13 @@ def _within(scratch: Scratch, runs: int, inverse: Array, out: Array) -> None:
 
 
 @kernel
-def covariances(rows: Rows, inverse: Array, part: int, parts: int, out: Array) -> None:
-    """Covariances (p,3,3) of every ``parts``-th landmark, ``V^-1 + V^-1 W^T S^-1 W V^-1``, from
-    the lower triangle of ``S^-1`` (N,N).
+def covariances(rows: Rows, sequence: IntArray, inverse: Array, out: Array) -> None:
+    """Fill the covariances (p,3,3) of some landmarks, ``V^-1 + V^-1 W^T S^-1 W V^-1``, from the
+    lower triangle of ``S^-1`` (N,N); ``sequence`` as for :func:`eliminate`.
     """
     scratch = make_scratch(rows)
     middle, own = np.empty((3, 3)), scratch.inverse
-    for landmark in range(part, len(rows.starts) - 1, parts):
+    for landmark in sequence:
         runs = gather(rows, landmark, scratch)
         _within(scratch, runs, inverse, middle)
         for i in range(3):

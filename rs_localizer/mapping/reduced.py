@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.mapping.elimination import Rows, covariances, eliminate, lift, lower, slopes
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.normal_kernels import Normal
@@ -48,10 +48,11 @@ class Reduced:
         self._controls = len(normal.motion.slope)
         self._slope = np.concatenate([normal.motion.slope, normal.motion.border_slope])
         self._slope += normal.held @ normal.held_error
-        system = _dense(normal.motion, damping)
+        system, sequence = _dense(normal.motion, damping), _sequence(self._rows)
         with ThreadPoolExecutor(_WORKERS) as workers:
             for _ in workers.map(
-                lambda part: eliminate(self._rows, part, _WORKERS, system), range(_WORKERS)
+                lambda part: eliminate(self._rows, sequence, part, _WORKERS, system),
+                range(_WORKERS),
             ):
                 pass
         system += normal.held @ normal.held.T
@@ -85,15 +86,21 @@ class Reduced:
         inverse, failed = dpotri(self._factor, lower=0, overwrite_c=1)
         if failed:
             raise Undetermined("the images do not determine map and motion")
-        inverse = inverse.T
+        inverse, parts = inverse.T, np.array_split(_sequence(self._rows), _WORKERS)
         out = np.empty((len(self._rows.precisions), 3, 3))
         with ThreadPoolExecutor(_WORKERS) as workers:
-            for _ in workers.map(
-                lambda part: covariances(self._rows, inverse, part, _WORKERS, out), range(_WORKERS)
-            ):
+            for _ in workers.map(lambda part: covariances(self._rows, part, inverse, out), parts):
                 pass
         shared = np.tril(inverse[self._controls :, self._controls :])
         return out, shared + np.tril(shared, -1).T
+
+
+def _sequence(rows: Rows) -> IntArray:
+    """The landmarks (p,) by the first images that see them."""
+    last = len(rows.order)
+    seen = np.minimum(rows.starts[:-1], max(last - 1, 0))
+    firsts = rows.first[rows.order[seen]] if last else rows.starts[:-1]
+    return np.asarray(np.argsort(firsts, kind="stable"), np.int64)
 
 
 def _dense(motion: Normal, damping: float) -> Array:

@@ -16,6 +16,7 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, sights_of
+from rs_localizer.mapping.alike import Pull, pull_at_landmarks
 from rs_localizer.mapping.asked_readout import AskedReadout, asked_readout
 from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
 from rs_localizer.mapping.placing import place
@@ -23,7 +24,7 @@ from rs_localizer.mapping.preparation import Preparation
 from rs_localizer.mapping.sightings import MapFreedom, Sightings, Start, check
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.descent import settle
-from rs_localizer.trajectory.fit import inflation_of, left_over
+from rs_localizer.trajectory.fit import inflation_of, left_over, steepness
 from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, start_state
 from rs_localizer.trajectory.online import REVERSED
@@ -35,6 +36,9 @@ __all__ = ["MapFreedom", "RefinedMap", "Sightings", "Start", "refine"]
 
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
+# Nor one that is known worse than to so many times what landmarks usually moved by: seen from one
+# side only, it would be farther off than where it was.
+_WORTH = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +47,7 @@ class RefinedMap:
 
     points: Array  # (p,3) m
     covariances: Array  # (p,3,3) m^2; NaN where not refined
-    refined: BoolArray  # (p,)
+    refined: BoolArray  # (p,) others are where they were given
     sights: IntArray  # (p,) keypoints that fit
     camera: Camera  # with the readout time and the lens that were found
     readout_time: float  # s; negative: against the scan direction
@@ -152,10 +156,14 @@ class _Refinement:
         sights, images = sights_of(seen, inliers)
         used = _freedoms(state.spline, seen.frames) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.motion.border)
+        inflation = self._with_alike_errors(problem, deviation, inflation)
         placed = place(problem, state, deviation, images > 1)
         covariances = inflation * placed.covariances
         spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         refined = (images > 1) & (spread < _KNOWN * prepared.size)
+        if prepared.freedom.deviations is None and refined.any():
+            moved = np.linalg.norm(placed.points - prepared.start.points, axis=1)
+            refined &= spread < _WORTH * np.median(moved[refined])
         all_squared = np.full(len(prepared.used), np.inf)
         all_squared[prepared.used] = squared
         readout_time, free = float(state.readout_time), self.freedom.readout_time
@@ -167,7 +175,7 @@ class _Refinement:
             camera=with_lens(replace(self.camera, readout_time=abs(readout_time)), state.lens),
             readout_time=readout_time,
             readout_time_deviation=math.sqrt(inflation * placed.shared[0, 0]) if free else math.nan,
-            asked_readout=self._asked(deviation),
+            asked_readout=self._asked(deviation, inflation),
             deviation=deviation * math.sqrt(left_over(len(inliers), used)),
             squared_errors=all_squared,
             inliers=all_squared < (LIMIT * deviation) ** 2,
@@ -178,16 +186,29 @@ class _Refinement:
             times=prepared.times,
         )
 
-    def _asked(self, deviation: float) -> AskedReadout | None:
+    def _with_alike_errors(
+        self, problem: MapProblem, deviation: float, independent: float
+    ) -> float:
+        """The covariances' inflation, with what errors of a second pull together."""
+        rows, seen = problem.normal(self.state, deviation)[1].rows, self.observations
+        squared = problem.errors(self.state)
+        inside = squared[squared < (LIMIT * deviation) ** 2]
+        pull = pull_at_landmarks(rows.values[..., -4:], seen.points, seen.times, rows.precisions)
+        own = steepness(inside, deviation) ** 2
+        own *= left_over(len(inside), _freedoms(self.state.spline, seen.frames))
+        return Pull(own * pull.found, pull.expected).inflation(independent)
+
+    def _asked(self, deviation: float, inflation: float) -> AskedReadout | None:
         """Whether a readout time that was given is the one of the images."""
         given = self.camera.readout_time > 0.0 and not self.freedom.readout_time
         if not given or not self.prepared.tells_readout:
             return None
         free = self._problem(replace(self.freedom, readout_time=True))
         try:
-            return asked_readout(free, self.state, deviation)
+            asked = asked_readout(free, self.state, deviation)
         except Undetermined:
             return None
+        return replace(asked, deviation=math.sqrt(inflation) * asked.deviation)
 
 
 def _freedoms(spline: Spline, frames: IntArray) -> int:

@@ -5,13 +5,15 @@ shows several of them closes loops.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.mapping.alike import with_alike_errors
 from rs_localizer.mapping.asked_readout import AskedReadout
 from rs_localizer.mapping.chaining import Chained, chain
 from rs_localizer.mapping.first_motion import (
@@ -20,11 +22,13 @@ from rs_localizer.mapping.first_motion import (
     calm,
     first_motion,
 )
+from rs_localizer.mapping.free_network import of_the_shape
+from rs_localizer.mapping.mirrored import mirrored
 from rs_localizer.mapping.spotting import Spotted
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.trajectory.banded import Undetermined
-from rs_localizer.trajectory.bodies import BODY
+from rs_localizer.trajectory.bodies import BODY, PLACE
 from rs_localizer.trajectory.fit import Fit, fit
 from rs_localizer.trajectory.model import Freedom, Observations, start_state
 from rs_localizer.trajectory.problem import Problem
@@ -34,10 +38,14 @@ _LEAST_IMAGES = 5
 _LEAST_SIGHTS = 3
 # The noise about the first guess is taken for at least and at most this (px).
 _FIRST_NOISE = 5.0, 50.0
-# px; an image of one marker has two numbers more than its pose.
+# px, at first; an image of one marker has two numbers more than its pose.
 _LEAST_NOISE = 0.05
 # Share of the corners that fit where nothing is wrong: nearly all do.
 _LEAST_FIT = 0.8
+# A place that is known worse than to this part of a marker's size is worth little.
+_POOR = 0.1
+# Markers that were turned over may hide others.
+_MOST_TURNS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,18 +53,33 @@ class Survey:
     """Markers and what is known of their errors."""
 
     markers: tuple[Marker, ...]  # in the frame of the first of them, the origin
-    covariances: Array  # (m,6,6) place (m) and turn (rad) along the map's axes; 0 of the origin
+    # (6 m, 6 m) of place (m) and turn (rad) along the map's axes: in the frame of the origin,
+    # whose own is 0, and of the shape, wherever the whole of it lies.
+    covariance: Array
+    covariance_of_shape: Array
     sights: tuple[int, ...]  # images of each
     apart: tuple[tuple[Marker, ...], ...]  # not connected with these, part by part
-    rare: tuple[Marker, ...]  # connected, but too few images show them
+    # Connected, but too few images show them, or do not tell which of two ways they are turned.
+    rare: tuple[Marker, ...]
     images: int  # with a pose
     fit: Fit
     asked_readout: AskedReadout | None = None  # where it was given
 
     @property
     def deviations(self) -> Array:
-        """Standard deviations (m,6)."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2)))
+        """Standard deviations (m,6) in the frame of the origin."""
+        return np.sqrt(np.diagonal(self.covariance)).reshape(-1, BODY)
+
+    @property
+    def poor(self) -> BoolArray:
+        """Which markers (m,) are known worse, beside the others, than a tenth of their size."""
+        off = np.linalg.norm(self.deviations_of_shape[:, :PLACE], axis=1)
+        return np.asarray(off > _POOR * np.array([marker.size for marker in self.markers]))
+
+    @property
+    def deviations_of_shape(self) -> Array:
+        """Standard deviations (m,6) of what is left when all are laid over the truth."""
+        return np.sqrt(np.diagonal(self.covariance_of_shape)).reshape(-1, BODY)
 
 
 def survey(
@@ -121,22 +144,22 @@ def _adjusted(
     calmer = calm(found.state, freedom)
     if calmer is not None:
         found = fit(camera, seen, found.state, calmer, found.deviation)
+    found, doubtful = _right_side_up(camera, seen, found)
+    found = _less_noise(camera, seen, found)
     _check_fit(found)
+    found = _believable(camera, seen, found)
     corners = found.state.landmarks.reshape(-1, 4, 3)
     placed = [
         Marker(markers[m].family, markers[m].id, of) for m, of in zip(own, corners, strict=True)
     ]
-    shared = len(found.border_covariance) - BODY * (len(own) - 1)
-    covariances = np.zeros((len(own), BODY, BODY))
-    for k in range(len(own) - 1):
-        at = slice(shared + BODY * k, shared + BODY * (k + 1))
-        covariances[k + 1] = found.border_covariance[at, at]
     counts = np.bincount(seen.points[found.inliers] // 4, minlength=len(own)) // 4
-    known = [k for k in range(1, len(own)) if counts[k] >= _LEAST_SIGHTS]
+    known = [k for k in range(1, len(own)) if counts[k] >= _LEAST_SIGHTS and not doubtful[k]]
     order = [0, *sorted(known, key=lambda k: own[k])]
-    return Survey(
+    covariance = _covariance(found, order)
+    done = Survey(
         tuple(placed[k] for k in order),
-        covariances[order],
+        covariance,
+        of_the_shape(covariance, corners[order]),
         tuple(int(counts[k]) for k in order),
         tuple(tuple(markers[m] for m in part) for part in chained.apart),
         tuple(markers[m] for m in chained.markers if m not in {own[k] for k in order}),
@@ -144,6 +167,46 @@ def _adjusted(
         found,
         None if found.freedom.readout_time else _asked(camera, seen, found),
     )
+    _check_places(done)
+    return done
+
+
+def _right_side_up(camera: Camera, seen: Observations, found: Fit) -> tuple[Fit, BoolArray]:
+    """With all markers turned as they fit best, and for which (m,) that cannot be told."""
+    for _ in range(_MOST_TURNS):
+        other = mirrored(camera, seen, found)
+        if not other.better.any():
+            break
+        turned = fit(camera, seen, other.state, found.freedom, found.deviation)
+        problem = Problem(camera, seen, found.state, found.freedom)
+        if problem.normal(turned.state, found.deviation)[0] > found.cost:
+            break
+        found = turned
+    return found, other.doubtful
+
+
+def _less_noise(camera: Camera, seen: Observations, found: Fit) -> Fit:
+    """With corners that are better than was taken for granted: weighed too little, they lose to
+    what is known of accelerations beforehand, and the readout time with them.
+    """
+    noise = found.deviation * math.sqrt(found.inflation)
+    if found.deviation > _LEAST_NOISE or noise > _LEAST_NOISE:
+        return found
+    return fit(camera, seen, found.state, replace(found.freedom, least_noise=noise), noise)
+
+
+def _believable(camera: Camera, seen: Observations, found: Fit) -> Fit:
+    """With covariances as large as the corners' errors show."""
+    return with_alike_errors(Problem(camera, seen, found.state, found.freedom), found)
+
+
+def _covariance(found: Fit, order: list[int]) -> Array:
+    """Of the markers (6 m, 6 m) in an order whose first is the origin, number 0."""
+    shared = len(found.border_covariance) - BODY * (len(found.state.landmarks) // 4 - 1)
+    columns = shared + (BODY * (np.array(order[1:]) - 1)[:, None] + np.arange(BODY)).ravel()
+    covariance = np.zeros((BODY * len(order),) * 2)
+    covariance[BODY:, BODY:] = found.border_covariance[np.ix_(columns, columns)]
+    return covariance
 
 
 def _check_fit(found: Fit) -> None:
@@ -155,11 +218,22 @@ def _check_fit(found: Fit) -> None:
         )
 
 
+def _check_places(found: Survey) -> None:
+    if np.mean(found.poor) > 0.5:
+        off = np.median(np.linalg.norm(found.deviations_of_shape[:, :PLACE], axis=1))
+        size = np.median([marker.size for marker in found.markers])
+        raise ValueError(
+            f"most markers would be known to {1e3 * off:.0f} mm only, of {1e3 * size:.0f} mm: go "
+            "nearer, for longer, with a sharper picture, and show more of them at once"
+        )
+
+
 def _asked(camera: Camera, seen: Observations, found: Fit) -> AskedReadout:
     """The readout time that the corners ask for where one was given."""
     free = fit(
         camera, seen, found.state, replace(found.freedom, readout_time=True), found.deviation
     )
+    free = _believable(camera, seen, free)
     given = float(found.state.readout_time)
     return AskedReadout(given, float(free.state.readout_time), free.readout_time_deviation)
 

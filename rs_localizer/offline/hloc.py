@@ -13,7 +13,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.hloc import H5File, HlocError
-from rs_localizer.io.maps.colmap_images import read_image_ids
+from rs_localizer.io.maps.colmap_images import read_images
 from rs_localizer.io.maps.colmap_model import read_model
 from rs_localizer.localizer import Localizer
 
@@ -37,7 +37,7 @@ class Reference:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.images = read_image_ids(folder)
+        self.images = read_images(folder)
         model = read_model(folder)
         self.points = model.points
         owners = np.repeat(np.arange(len(model.points)), np.diff(model.starts))
@@ -51,8 +51,18 @@ class Reference:
         self._features, self._owners = model.tracks["feature"].astype(np.int64), owners
 
     def points_of(self, image: str, keypoints: IntArray) -> IntArray:
-        """The points (m,) that these keypoints (m,) of an image show; -1: none."""
-        rows = self._rows.get(self.images[image])
+        """The points (m,) that these keypoints (m,) of an image show; -1: none.
+
+        Raises:
+            HlocError: when the image has fewer keypoints.
+        """
+        known = self.images[image]
+        if known.features and keypoints.max(initial=-1) >= known.features:
+            raise HlocError(
+                f"the matches are of keypoint {keypoints.max()} of {image}, which has "
+                f"{known.features} in the model: are model and matches of one run?"
+            )
+        rows = self._rows.get(known.number)
         if rows is None or not len(keypoints):
             return np.full(len(keypoints), -1)
         features = self._features[rows]
@@ -112,7 +122,12 @@ def _matched(
     found = [np.zeros((0, 2), np.int64)]
     for image in images:
         pairs = matches.matches(query, image)
-        if len(pairs) and (pairs.min() < 0 or pairs[:, 0].max() >= count):
+        if pairs.min(initial=0) < 0:
+            raise HlocError(
+                f"the matches of {query} and {image} are of keypoint {pairs.min()}: is the file "
+                "damaged?"
+            )
+        if pairs[:, 0].max(initial=-1) >= count:
             raise HlocError(
                 f"the matches of {query} and {image} are of keypoint {pairs[:, 0].max()}, but "
                 f"{query} has {count}: are features and matches of one run?"

@@ -137,11 +137,11 @@ class FrameLocalizer:
         """Whether readings of the frame with this stamp are missing that may come within so many
         seconds.
         """
-        tracker = self._method.tracker
-        if tracker is None:
+        follower = self._method.follower
+        if follower is None:
             return False
         time_ns = self._method.middle_row_ns(stamp_ns)
-        return self.imu.awaits(tracker, self.config, time_ns, patience)
+        return self.imu.awaits(follower, self.config, time_ns, patience)
 
     def load_map(self) -> None:
         """Use the map of the setting ``map_file``, if there is one.
@@ -208,13 +208,13 @@ class FrameLocalizer:
         for name, text in oddities(cloud, method.camera, frame).items():
             self._notice(name, text)
         given = (cloud.points, cloud.pixels, cloud.scores)
-        if method.tracker is None:
+        if method.follower is None:
             self.imu.without_tracker(method.config)
             result = method.localizer.localize(*given)
         else:
             time_ns = method.middle_row_ns(cloud.stamp_ns)
             result = self.imu.track(
-                method.tracker, method.config, time_ns, frame, self.transforms, given
+                method.follower, method.config, time_ns, frame, self.transforms, given
             )
         if not result:
             return Refusal(result.reason, result.detail)

@@ -26,6 +26,7 @@ from rs_localizer.io.transforms.rigid import TransformError, Transforms
 from rs_localizer.pipeline.imu_axes import in_camera_axes
 from rs_localizer.pipeline.reasons import IMU_REASONS
 from rs_localizer.pipeline.refusal import Notify
+from rs_localizer.pipeline.single_frames import SingleFrames
 from rs_localizer.tracking import Tracker
 
 # Beside the exposure: the spline through the readings wants neighbours, and the tracker those since
@@ -53,6 +54,9 @@ _OF_ALONE = {
     Alone.DISAGREES: ImuReason.DISAGREES,
     Alone.TURNED: ImuReason.TURNED,
 }
+
+
+Follower = Tracker | SingleFrames
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +134,7 @@ class ImuInput:
             self._status,
         )
 
-    def awaits(self, tracker: Tracker, config: NodeConfig, time_ns: int, patience: float) -> bool:
+    def awaits(self, tracker: Follower, config: NodeConfig, time_ns: int, patience: float) -> bool:
         """Whether readings of this exposure are missing that may come within so many seconds."""
         if not self._wanted(config):
             return False
@@ -140,7 +144,7 @@ class ImuInput:
 
     def track(
         self,
-        tracker: Tracker,
+        tracker: Follower,
         config: NodeConfig,
         time_ns: int,
         camera_frame: str,
@@ -169,7 +173,7 @@ class ImuInput:
         return result
 
     def without_tracker(self, config: NodeConfig) -> None:
-        """Count a frame that is localized by itself."""
+        """Count a frame that no gyroscope could help."""
         if self._wanted(config):
             unknown = config.readout_time == 0.0
             reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
@@ -180,7 +184,7 @@ class ImuInput:
 
     def _samples(
         self,
-        tracker: Tracker,
+        tracker: Follower,
         config: NodeConfig,
         time_ns: int,
         camera_frame: str,
@@ -199,7 +203,7 @@ class ImuInput:
             text = f"from the IMU {self.frame!r} to the camera {camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
 
-    def _count(self, config: NodeConfig, tracker: Tracker | None, unused: Unused | None) -> None:
+    def _count(self, config: NodeConfig, tracker: Follower | None, unused: Unused | None) -> None:
         self._frames += 1
         self._used += unused is None
         self._recently.append(unused is None)
@@ -229,7 +233,7 @@ def inertial_settings(config: NodeConfig) -> InertialSettings | None:
     )
 
 
-def _exposure(config: NodeConfig, time_ns: int, tracker: Tracker) -> tuple[int, int]:
+def _exposure(config: NodeConfig, time_ns: int, tracker: Follower) -> tuple[int, int]:
     """First and last row by the clock of the IMU, as far as that is known."""
     status = tracker.inertial
     left = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset

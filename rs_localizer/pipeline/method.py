@@ -17,6 +17,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.clock import middle_row_ns
 from rs_localizer.pipeline.imu import inertial_settings
 from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.single_frames import SingleFrames
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
 
@@ -48,6 +49,7 @@ class Method:
     camera: Camera
     localizer: Localizer
     tracker: Tracker | None  # None: every frame stands alone
+    single: SingleFrames | None = None  # without a tracker, but with an IMU
 
     @classmethod
     def of(cls, calibration: Calibration, config: NodeConfig) -> Self:
@@ -60,8 +62,16 @@ class Method:
         localizer = Localizer(camera, config)
         rolling = config.readout_time > 0.0 and find_solver(config.solver).rolling_shutter
         tracks = config.tracking and rolling
-        tracker = Tracker(localizer, inertial_settings(config)) if tracks else None
-        return cls(calibration, config, camera, localizer, tracker)
+        inertial = inertial_settings(config)
+        if tracks:
+            return cls(calibration, config, camera, localizer, Tracker(localizer, inertial))
+        single = SingleFrames(localizer, inertial) if rolling and inertial is not None else None
+        return cls(calibration, config, camera, localizer, None, single)
+
+    @property
+    def follower(self) -> Tracker | SingleFrames | None:
+        """What takes the IMU's samples; None: nothing does."""
+        return self.tracker or self.single
 
     def middle_row_ns(self, stamp_ns: int) -> int:
         """When the middle row of the image with this stamp was exposed."""

@@ -21,7 +21,9 @@ acceleration are left out.
 Shaking turns the camera by ``delta(tau)`` in its own axes beside all that; its coefficients stand
 behind the motion in the estimate's covariance, and its turn and rate are linear in them. What a
 gyroscope knows of the turn comes last: what is said above is of the motion beside it, and then
-turned by it; its own noise at one moment is added to the angular velocity's.
+turned by it; its own noise at one moment is added to the angular velocity's. Where the gyroscope
+alone knows the angular velocity of that moment better than motion and turn together, because its
+time offset leaves the motion beside the turn to the points, its own is published.
 """
 
 from __future__ import annotations
@@ -108,6 +110,14 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     own = own + changed * np.eye(3)
     covariance[_ANGULAR, _ANGULAR] += own / readout_time**2
     covariance[_LINEAR, _LINEAR] += turned / readout_time**2 * so3.hat(linear) @ so3.hat(linear).T
+    measured = None if estimate.turn is None else estimate.turn.rate_at(tau)
+    if measured is not None:
+        error = measured[1] / readout_time**2
+        if np.trace(error) < np.trace(covariance[_ANGULAR, _ANGULAR]):
+            angular = measured[0]
+            covariance[_ANGULAR] = 0.0
+            covariance[:, _ANGULAR] = 0.0
+            covariance[_ANGULAR, _ANGULAR] = error
     return Twist(
         linear=linear / readout_time, angular=angular / readout_time, covariance=covariance
     )

@@ -131,8 +131,8 @@ IMU_REASONS: dict[str, Meaning] = {
         "set readout_time; rs_localizer calibrate finds it",
     ),
     ImuReason.NOT_TRACKING: Meaning(
-        "tracking is off, or solver knows no rolling shutter",
-        "tracking: the gyroscope's bias is found from frame to frame",
+        "solver knows no rolling shutter",
+        "another solver",
     ),
     ImuReason.DOUBTED: Meaning(
         "the points of this image fit better without the gyroscope",

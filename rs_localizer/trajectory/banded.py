@@ -42,8 +42,8 @@ class Factored:
         self._normal = normal
         try:
             self._band = cholesky_banded(band, lower=True, check_finite=False)
-            self._lifted = self._solve(normal.cross)  # H^-1 C
-            schur = corner - normal.cross.T @ self._lifted
+            self.lifted = self._solve(normal.cross)  # H^-1 C: how the controls follow the border
+            schur = corner - normal.cross.T @ self.lifted
             self._scale = 1.0 / np.sqrt(np.maximum(np.diag(corner), 1e-300))
             scaled = schur * self._scale[:, None] * self._scale
             self._schur = cho_factor(scaled, lower=True) if len(schur) else None
@@ -67,7 +67,7 @@ class Factored:
         """The step (6 n,) of the controls and (b,) of the border."""
         inner = self._solve(self._normal.slope)
         border = -self._solve_schur(self._normal.border_slope - self._normal.cross.T @ inner)
-        return -inner - self._lifted @ border, border
+        return -inner - self.lifted @ border, border
 
     def border_covariance(self) -> Array:
         """Covariance (b,b) of the border, the controls marginalised."""
@@ -92,7 +92,7 @@ class Factored:
             pair[:size, size:] = beside[block]
             pair[size:, :size] = beside[block].T
             begin = CONTROL * int(first)
-            lifted = self._lifted[begin : min(begin + LOCAL, count)]
+            lifted = self.lifted[begin : min(begin + LOCAL, count)]
             own = pair[inside : inside + LOCAL, inside : inside + LOCAL]
             out[m] = own + lifted @ border @ lifted.T
         return out

@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.blocks import Block, blocks_of, disagreement
-from rs_localizer.trajectory.fit import Fit, cost_at, fit, image_speeds
+from rs_localizer.trajectory.fit import Fit, cheaper, cost_at, fit, image_speeds
 from rs_localizer.trajectory.gyro import NoMount
 from rs_localizer.trajectory.imu import ImuRecording, MountFound, mount_of, with_gyro
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
@@ -41,8 +41,6 @@ _LEAST_JITTER = 0.03
 _LEAST_STAMPS = 1e-5  # s
 # The prior of the accelerations is so many times their median, and at least this.
 _ACCELERATIONS, _LEAST_ACCELERATION = 1.5, 0.3
-# Finer knots, or images' own times, must lower the cost by this much per new parameter (Akaike).
-_COST_PER_PARAMETER = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +79,13 @@ class Calibration:
     def global_shutter(self) -> bool:
         """Whether 0 lies within the error."""
         return self.determined and abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
+
+    @property
+    def held(self) -> int:
+        """Landmarks that are seen often enough to have a shape estimated, but are too many."""
+        seen = self.posed.observations
+        often = len(seen.points) >= _LEAST_SIGHTS * len(seen.landmarks)
+        return len(seen.landmarks) if often and self.fit.freedom.landmarks == 0.0 else 0
 
     @property
     def scatter(self) -> float:
@@ -167,13 +172,13 @@ def _best(camera: Camera, posed: Posed, interval: float, freedom: Freedom) -> Fi
     with suppress(Undetermined):  # a richer model that cannot be determined is no candidate
         other = _unsteady(camera, seen, found, interval, freedom)
         unsteady = other.freedom.stamps > _LEAST_JITTER * interval
-        if unsteady and _cheaper(other, found, len(other.state.delays)):
+        if unsteady and cheaper(other, found, len(other.state.delays)):
             found = other
     with suppress(Undetermined):
         state = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
         finer = fit(camera, seen, state, found.freedom, found.deviation)
         added = 6 * (len(finer.state.spline.positions) - len(found.state.spline.positions))
-        if _cheaper(finer, found, added):
+        if cheaper(finer, found, added):
             found = finer
     return found
 
@@ -216,13 +221,6 @@ def _calm(state: State, freedom: Freedom) -> Freedom:
         angular_acceleration=max(_ACCELERATIONS * angular, _LEAST_ACCELERATION),
         linear_acceleration=max(_ACCELERATIONS * linear, _LEAST_ACCELERATION),
     )
-
-
-def _cheaper(richer: Fit, plainer: Fit, parameters: int) -> bool:
-    """Whether more parameters are worth it, by the noise that the richer model leaves."""
-    limit = 36.0 * richer.deviation**2
-    left = [float(np.sum(found.squared_errors.clip(max=limit))) for found in (plainer, richer)]
-    return (left[0] - left[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
 
 
 def within(observations: Observations, spline: Spline) -> Observations:

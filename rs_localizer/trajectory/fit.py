@@ -20,6 +20,8 @@ from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline_kernels import CONTROL
 
 _FEW_STEPS = 6
+# Richer models must lower the cost by this much per new parameter (Akaike).
+_COST_PER_PARAMETER = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +94,13 @@ def cost_at(camera: Camera, observations: Observations, found: Fit, readout_time
     return problem.normal(least, found.deviation)[0]
 
 
+def cheaper(richer: Fit, plainer: Fit, parameters: float) -> bool:
+    """Whether so many more parameters are worth it, by the noise that the richer model leaves."""
+    limit = (LIMIT * richer.deviation) ** 2
+    left = [float(np.sum(found.squared_errors.clip(max=limit))) for found in (plainer, richer)]
+    return (left[0] - left[1]) / richer.deviation**2 > _COST_PER_PARAMETER * parameters
+
+
 def image_speeds(camera: Camera, observations: Observations, state: State) -> Array:
     """How fast the keypoints (n,) move in their images, px/s."""
     speeds = []
@@ -132,11 +141,17 @@ def inflation_of(squared: Array, deviation: float, used: int) -> float:
     Huber's formula, ``E psi^2 / (E psi')^2``, where the matrix has the mean weight instead; and
     the freedoms that the motion used up.
     """
+    weight = (1.0 - squared / (LIMIT * deviation) ** 2) ** 2
+    psi_squared = np.mean(weight**2 * squared) / (2.0 * deviation**2)
+    steep = steepness(squared, deviation)
+    return float(psi_squared / np.mean(weight)) * steep**2 * left_over(len(squared), used)
+
+
+def steepness(squared: Array, deviation: float) -> float:
+    """Mean weight by ``E psi'``: how much the normal matrix is too steep for Tukey's estimator."""
     share = squared / (LIMIT * deviation) ** 2
     weight = (1.0 - share) ** 2
-    psi_squared = np.mean(weight**2 * squared) / (2.0 * deviation**2)
-    slope = np.mean(weight - 2.0 * share * (1.0 - share))
-    return float(psi_squared * np.mean(weight) / slope**2 * left_over(len(squared), used))
+    return float(np.mean(weight) / np.mean(weight - 2.0 * share * (1.0 - share)))
 
 
 def left_over(keypoints: int, used: int) -> float:

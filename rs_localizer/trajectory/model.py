@@ -11,6 +11,7 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples
 from rs_localizer.trajectory.lens import lens_values
+from rs_localizer.trajectory.prior_kernels import Accelerations
 from rs_localizer.trajectory.spline import Spline
 
 
@@ -47,6 +48,8 @@ class Freedom:
     stamps: float = 0.0  # s, standard deviation of each image's stamp; 0: they are right
     angular_acceleration: float = 100.0  # rad/s^2, zero-mean prior at each control
     linear_acceleration: float = 50.0  # m/s^2
+    # Time (s) in which accelerations fade; 0: those at neighbouring controls are independent.
+    fading: float = 0.0
     # Likewise of the velocity of images that stand alone, in stretches of one interval; infinite:
     # nothing is known of it.
     angular_velocity: float = math.inf  # rad/s
@@ -54,6 +57,13 @@ class Freedom:
     # The noise is at least this (px). Where images have hardly more keypoints than numbers of their
     # own, a robust estimate rejects all but those it can run through, and ends at no noise at all.
     least_noise: float = 1e-4  # recordings without noise are simulated
+
+    def accelerations(self, spacing: float) -> Accelerations:
+        """What is expected of them at controls that are so far apart (s)."""
+        memory = math.exp(-spacing / self.fading) if self.fading > 0.0 else 0.0
+        return Accelerations(
+            float(self.angular_acceleration), float(self.linear_acceleration), memory
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.known_turn import rotations_at_knots
-from rs_localizer.core.known_turn import spline as cubics_of
+from rs_localizer.core.rate_spline import rotations_at_knots
+from rs_localizer.core.rate_spline import spline as cubics_of
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, NoMount, first_mount
 from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
 from rs_localizer.trajectory.gyro_terms import by_shape

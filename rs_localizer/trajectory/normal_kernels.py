@@ -39,7 +39,7 @@ class Normal(NamedTuple):
 
 
 @kernel
-def _border_of(sights: Sights, terms: Terms, n: int, row: Row, columns: IntArray,
+def border_of(sights: Sights, terms: Terms, n: int, row: Row, columns: IntArray,
                border: Array) -> int:  # fmt: skip
     """Fill the columns of the border that keypoint n touches, rising, and its derivatives
     (2,...) by them; returns their number.
@@ -80,7 +80,7 @@ def accumulate(curve: Curve, sights: Sights, terms: Terms, normal: Normal) -> fl
         cost += spent
         if weight == 0.0:
             continue
-        count, image = _border_of(sights, terms, n, row, columns, border), sights.frames[n]
+        count, image = border_of(sights, terms, n, row, columns, border), sights.frames[n]
         base = CONTROL * sights.first[n]
         for a in range(LOCAL):
             x, y = weight * rows[0, a], weight * rows[1, a]

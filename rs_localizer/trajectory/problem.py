@@ -21,7 +21,7 @@ from rs_localizer.trajectory.gyro_terms import GyroTerms
 from rs_localizer.trajectory.lens import lens_values, project
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.normal_kernels import Normal, accumulate
-from rs_localizer.trajectory.prior_kernels import add_rest, add_smoothness, eliminate_stamps
+from rs_localizer.trajectory.prior_kernels import add_accelerations, add_rest, eliminate_stamps
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, look, squared_errors
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
@@ -142,11 +142,10 @@ class Problem:
         for other in normals[1:]:
             for field in _SUMS:
                 getattr(normal, field)[:] += getattr(other, field)
-        cost += add_smoothness(
-            curve, state.spline.layout.firsts, float(self.freedom.angular_acceleration),
-            float(self.freedom.linear_acceleration), normal,
-        )  # fmt: skip
-        alone = state.spline.layout.alone()
+        layout = state.spline.layout
+        expected = self.freedom.accelerations(layout.spacing)
+        cost += add_accelerations(curve, layout.firsts, expected, normal)
+        alone = layout.alone()
         if len(alone) and self.freedom.angular_velocity < math.inf:
             cost += add_rest(
                 curve, alone, float(self.freedom.angular_velocity),

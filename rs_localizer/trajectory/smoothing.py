@@ -11,8 +11,10 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
-from rs_localizer.trajectory.fit import Fit, fit
-from rs_localizer.trajectory.model import Freedom, State, start_state
+from rs_localizer.estimation.motion_model import FADING
+from rs_localizer.trajectory.accelerations import told
+from rs_localizer.trajectory.fit import Fit, cheaper, fit
+from rs_localizer.trajectory.model import Freedom, Observations, start_state
 from rs_localizer.trajectory.observe import Observed, collect
 from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
 
@@ -20,10 +22,11 @@ from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
 _MOST_UNCERTAIN = 5.0
 # A sample is bridged where the images with a pose lie farther apart than this many intervals.
 _BRIDGED = 1.5
-# Finer knots must lower the squared errors by this much per new parameter (Akaike).
-_COST_PER_PARAMETER = 2.0
-_LEAST_ACCELERATION = 0.1  # rad/s^2, m/s^2
-_ROUNDS = 2
+# Where images show how accelerations fade, that bridges the knots (s) between them: these need not
+# be as wide as a hand's motion would allow, and narrow ones follow all of it.
+_NARROW_SPACING = 0.025
+# The expected accelerations are settled when they change by less than this part.
+_ALIKE, _ROUNDS = 0.05, 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +130,8 @@ def smooth(
     readout_time = camera.readout_time
     if not readout_time > 0.0:
         raise ValueError("smoothing needs the readout time of the camera, which is 0 (unknown)")
+    if not images:
+        raise ValueError("no image has a pose: there is nothing to smooth")
     known = [
         replace(one, inliers=np.ones(len(image.points), dtype=np.bool_))
         for one, image in zip(estimates, images, strict=True)
@@ -135,27 +140,30 @@ def smooth(
     posed = collect(camera, images, list(known), delay)
     seen = posed.observations
     interval = float(np.median(np.diff(posed.times))) if len(posed.times) > 1 else 1.0
-    spacing = min(LONGEST_SPACING, interval)
+    fading = FADING if interval < 0.5 * FADING else 0.0
+    spacing = min(_NARROW_SPACING if fading else LONGEST_SPACING, interval)
     spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, readout_time)
     seen = seen.subset(spline.layout.inside(seen.times))
     state = start_state(camera, seen, spline, readout_time)
-    found = fit(camera, seen, state, Freedom(readout_time=False))
-    for _ in range(_ROUNDS):
-        found = fit(camera, seen, found.state, _steady(found.state), found.deviation)
-    finer = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
-    other = fit(camera, seen, finer, _steady(found.state), found.deviation)
-    added = 6 * (len(finer.spline.positions) - len(found.state.spline.positions))
-    gain = float(np.sum(found.squared_errors) - np.sum(other.squared_errors)) / other.deviation**2
-    if gain > _COST_PER_PARAMETER * added:
-        found = fit(camera, seen, other.state, _steady(other.state), other.deviation)
-    return Smoothed(found, readout_time, posed.start_ns, posed.times)
-
-
-def _steady(state: State) -> Freedom:
-    """With a prior of the accelerations as large as the motion's own."""
-    states = state.spline.states(state.spline.layout.control_times())
-    angular, linear = (
-        max(float(np.sqrt(np.mean(np.square(of)))), _LEAST_ACCELERATION)
-        for of in (states.angular_acceleration, states.linear_acceleration)
+    found = _lively(
+        camera, seen, fit(camera, seen, state, Freedom(readout_time=False, fading=fading))
     )
-    return Freedom(readout_time=False, angular_acceleration=angular, linear_acceleration=linear)
+    halved = replace(found.state, spline=refined(found.state.spline, 0.5 * spacing))
+    finer = _lively(camera, seen, fit(camera, seen, halved, found.freedom, found.deviation))
+    more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
+    best = finer if cheaper(finer, found, float(more)) else found
+    return Smoothed(best, readout_time, posed.start_ns, posed.times)
+
+
+def _lively(camera: Camera, seen: Observations, found: Fit) -> Fit:
+    """With a prior of the accelerations that the motion itself shows."""
+    for _ in range(_ROUNDS):
+        before, freedom = found.freedom, told(found).most_likely(found.freedom)
+        found = fit(camera, seen, found.state, freedom, found.deviation)
+        changed = (
+            freedom.angular_acceleration / before.angular_acceleration,
+            freedom.linear_acceleration / before.linear_acceleration,
+        )
+        if np.all(np.abs(np.log(changed)) < _ALIKE):
+            break
+    return found

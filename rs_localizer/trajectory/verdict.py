@@ -73,6 +73,11 @@ def remarks(found: Calibration) -> list[str]:
             f"parts of the recording differ ({_blocks(found)} ms) by more than their noise: the "
             f"deviation is {found.inflation:.1f} times that of the noise alone"
         )
+    if found.held:
+        said.append(
+            f"the map's {found.held} points are taken as they are given: more than are estimated "
+            "along; where they may be off by a thousandth of its size, show a smaller board"
+        )
     if abs(found.readout_time) > _LONGEST * found.stamps.interval:
         said.append(
             f"longer than the interval between images, {1e3 * found.stamps.interval:.1f} ms: are "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 import sys
 from pathlib import Path
@@ -263,6 +264,13 @@ def test_bad_files_are_told_of_in_one_line(
     with h5py.File(tmp_path / "few.h5", "w") as file:
         file[f"{name}/keypoints"] = np.zeros((5, 2))
     refused("but query/cam0/0.jpg has 5: are features and matches", features=tmp_path / "few.h5")
+    for index, told in (
+        (9999, "keypoint 9999 of db/0.jpg, which has"), (-7, "db/0.jpg are of keypoint -7"),
+    ):  # fmt: skip
+        shutil.copy(tmp_path / "m.h5", tmp_path / "far.h5")
+        with h5py.File(tmp_path / "far.h5", "a") as file:
+            file["query-cam0-0.jpg/db-0.jpg/matches0"][3] = index
+        refused(told, matches=tmp_path / "far.h5")
     bad.write_text(f"{name}\n")
     refused("bad, line 1: expected QUERY IMAGE", retrieval=bad)
     bad.write_text(f"{name} db/7.jpg\n")

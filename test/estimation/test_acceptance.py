@@ -74,8 +74,9 @@ def test_errors_as_large_as_the_gate(good, rolling, noise, expected):
 
 def test_errors_that_neighbouring_rows_share(good):
     observations, posterior = good
-    shaking = replace(posterior, agreement=3.1)
+    shaking = replace(posterior, agreement=4.3)
     assert reason(observations, shaking) is Reason.MODEL_ERROR
+    assert reason(observations, replace(posterior, agreement=4.1)) is None
     assert reason(observations, shaking, rolling=False) is None
     # Below a twentieth of the threshold no pose suffers.
     assert reason(observations, replace(shaking, noise=0.09)) is None

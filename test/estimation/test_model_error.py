@@ -21,7 +21,7 @@ SHAKE = 3 * (DEGREES - 1)
 DEVIATION = 0.3  # px
 # Polynomials of the image, from the constant to the cubic ones, and the sizes of each degree.
 PLACES = [(i, degree - i) for degree in range(4) for i in range(degree + 1)]
-DEGREE_SIZES = np.array([1.0, 0.2, 0.5, 0.25])
+DEGREE_SIZES = np.array([1.0, 1.0, 0.5, 0.25])
 
 
 @pytest.mark.parametrize("tau", [-0.5, -0.2, 0.0, 0.37, 0.5])

@@ -10,6 +10,7 @@ from rs_localizer.estimation.model_error import gain_of_shaking
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.shake_sizes import _share, sizes_and_step
 from rs_localizer.estimation.shaking import Scales, follow
+from rs_localizer.lab.experiments.honesty.vibration import Condition, measure
 from rs_localizer.localizer import assumptions
 from rs_localizer.solvers.table import find_solver
 
@@ -177,3 +178,11 @@ def test_sizes_step_and_noise_are_those_of_plain_matrices():
     np.testing.assert_allclose(covariance, expected[1], rtol=1e-6, atol=1e-12)
     assert noise == pytest.approx(expected[2], rel=1e-8)
     np.testing.assert_allclose(sizes, expected[3], rtol=1e-7)
+
+
+def test_fast_shaking_that_the_rows_show_is_followed_and_not_refused():
+    """A camera at rest before a wrong map explains much of it, but not that rows agree."""
+    found = measure(Condition(degrees=0.3, hertz=100.0, noise=0.1, tracking=False), 15, seed=1)
+    assert np.mean(found.middle.localized) > 0.9
+    assert np.mean(found.middle.inside("pose")) > 0.7
+    assert found.middle.median("orientation") < 0.03  # deg, of 0.3 that it shakes

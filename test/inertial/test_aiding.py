@@ -44,7 +44,8 @@ def test_a_time_offset_is_found(motion):
     followed = follow(recorded, 1.0, True, 60)
     assert abs(followed.time_offsets[0] - 0.005) < 5e-4
     assert followed.scores.localized.all()
-    assert followed.scores.median("angular") < 5.0  # 50 without the gyroscope
+    # 50 without the gyroscope; a tenth of a millisecond is worth 5 under the vibrations.
+    assert followed.scores.median("angular") < 7.0
 
 
 def test_the_bias_is_found(held):

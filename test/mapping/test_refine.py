@@ -233,3 +233,16 @@ def test_what_is_no_map_is_refused(video: Walk) -> None:
         refine(camera(), video.seen, video.start, MapFreedom(deviations=one))
     with pytest.raises(ValueError, match="stamps must rise"):
         replace(video.seen, stamps_ns=video.seen.stamps_ns[::-1])
+
+
+def test_landmarks_that_are_known_worse_than_before_stay(video: Walk) -> None:
+    """Seen from one side only, they would be anywhere along it."""
+    found = refine(camera(), video.seen, video.start)
+    seen = np.unique(video.seen.landmarks)
+    moved = np.linalg.norm(found.points - video.start.points, axis=1)
+    assert not np.all(found.refined[seen])
+    assert np.all(moved[~found.refined] == 0.0)
+    assert np.all(np.isnan(found.covariances[~found.refined]))
+    # None is worse off than the worst of those that were given.
+    before = np.linalg.norm(video.start.points - video.points, axis=1)
+    assert errors(found, video).max() < 1.5 * before.max()

@@ -9,6 +9,8 @@ import pytest
 from scenes import READOUT, camera, ring, spot
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.mapping.chaining import Chained, chain
 from rs_localizer.mapping.spotting import Spotted, every_marker
 from rs_localizer.mapping.survey import Survey, survey
 from rs_localizer.markers.consistency import problems
@@ -122,3 +124,32 @@ def test_a_wrong_readout_time_is_named(spotted: list[Spotted]) -> None:
 def test_a_survey_that_few_corners_fit_is_refused(spotted: list[Spotted]) -> None:
     with pytest.raises(ValueError, match=r"% of the corners fit .* check the readout time"):
         survey(camera(0.3 * READOUT), spotted, MARKERS)
+
+
+def turned_over(chained: Chained, marker: int) -> Chained:
+    """The first guess with a marker turned over as its images see it."""
+    own = chained.markers[marker]
+    toward = np.mean([pose.translation for pose in chained.poses], axis=0) - own.translation
+    toward /= np.linalg.norm(toward)
+    mirror = np.eye(3) - 2.0 * np.outer(toward, toward)
+    turned = Transform(mirror @ own.rotation @ np.diag([1.0, 1.0, -1.0]), own.translation)
+    markers = {**chained.markers, marker: turned}
+    back = markers[next(iter(markers))].inverse()  # the first is the origin
+    return replace(
+        chained,
+        markers={of: back @ pose for of, pose in markers.items()},
+        poses=[back @ pose for pose in chained.poses],
+    )
+
+
+@pytest.mark.parametrize("origin", [0, 2])
+def test_a_marker_that_was_turned_over_is_turned_back(
+    spotted: list[Spotted], poses: Poses, origin: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "rs_localizer.mapping.survey.chain", lambda *given: turned_over(chain(*given), 2)
+    )
+    # All of it would turn it back on the way.
+    found = survey(camera(), spotted[:40], MARKERS, origin=origin)
+    assert found.rare == ()
+    check(found, poses, 0.03)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
+from rs_localizer.markers.families import FAMILIES
 from rs_localizer.markers.formats.common import Unsaid
 from rs_localizer.markers.formats.files import FORMATS, OWN, read_any, write_any
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
@@ -102,6 +103,26 @@ def test_there_and_back(tmp_path: Path, name: str) -> None:
     found, kind = read_any(path, Unsaid(size=SIZE))
     assert kind == name
     np.testing.assert_allclose(found.points, some_map().points, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("family", ["apriltag_25h9", "4x4_50"])
+def test_the_family_goes_along(tmp_path: Path, name: str, family: str) -> None:
+    path = tmp_path / ("map.json" if name == "wpilib" else "map.yaml")
+    write_any(path, MarkerMap((Marker.at(family, 3, SIZE, Pose()),)), name)
+    (marker,) = read_any(path, Unsaid(size=SIZE))[0].markers
+    assert marker.family.name == family
+    if name != OWN:  # what the user says goes first
+        (marker,) = read_any(path, Unsaid(FAMILIES["5x5_100"], SIZE))[0].markers
+        assert marker.family.name == "5x5_100"
+        path.write_text(path.read_text().replace("tag25h9", "tag9h9").replace("4x4_50", "4x4_5"))
+        with pytest.raises(MarkerMapError, match=r"unknown family '(tag9h9|4x4_5)'"):
+            read_any(path, Unsaid(size=SIZE))
+
+
+def test_apriltag_ros_has_its_own_name_of_the_family(tmp_path: Path) -> None:
+    write_any(tmp_path / "map.yaml", some_map(), "apriltag_ros")
+    assert "tag_family: tag36h11\n" in (tmp_path / "map.yaml").read_text()
 
 
 def test_deviations_of_a_survey_are_kept(tmp_path: Path) -> None:

@@ -271,15 +271,30 @@ def test_two_hundred_interruptions(flight: Flight) -> None:
     rng = np.random.default_rng(0)
     starts = np.sort(rng.uniform(0.0, 3.0, 200))
     ends = starts + rng.choice([0.003, 0.01, 0.03, 0.1], 200, p=[0.55, 0.3, 0.1, 0.05])
+    kept = []
 
     def change(message: Any, time: float) -> Iterable[Any]:
-        return () if np.any((starts < time) & (time < ends)) else (message,)
+        if np.any((starts < time) & (time < ends)):
+            return ()
+        kept.append(stamp_ns(message))
+        return (message,)
 
     flown = fly(flight, change)
     flown.assert_none_is_lost_or_wrong(count(flight))
     assert flown.state is not None
-    assert 0 < flown.state.used < flown.state.frames
     assert flown.state.reasons[ImuReason.GAP] > 5
+    # What is free of gaps uses it at once, and no frame has to be searched anew.
+    longest = 2.5 * MS * 1000 / 400
+    used = 0
+    for topic, _, message in flight.items:
+        if topic == "/correspondences":
+            first, last = stamp_ns(message), stamp_ns(message) + round(1e9 * READOUT_TIME)
+            around = kept[
+                np.searchsorted(kept, first, "right") - 1 : np.searchsorted(kept, last) + 1
+            ]
+            used += bool(np.diff(around).max() <= longest)
+    assert flown.state.used == used > 0
+    assert sum(frame.estimate.tracked for frame in flown.frames) >= count(flight) - 2
 
 
 def test_repetition_changes_nothing(flight: Flight) -> None:
@@ -289,12 +304,22 @@ def test_repetition_changes_nothing(flight: Flight) -> None:
         assert np.array_equal(a.pose.covariance, b.pose.covariance)
 
 
-def test_without_a_readout_time_or_tracking_it_is_not_used_and_that_is_told(
+def test_frames_that_stand_alone_use_it_too(flight: Flight) -> None:
+    config = NodeConfig(readout_time=READOUT_TIME, tracking=False)
+    both, alone = fly(flight, config=config), fly(flight, lambda message, time: (), config)
+    both.assert_none_is_lost_or_wrong(count(flight))
+    assert both.state is not None
+    assert both.state.share > 0.9
+    assert not any(frame.estimate.tracked for frame in both.frames)
+    assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
+
+
+def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_is_told(
     flight: Flight,
 ) -> None:
     for config, reason in (
         (NodeConfig(), ImuReason.NO_READOUT_TIME),
-        (NodeConfig(readout_time=READOUT_TIME, tracking=False), ImuReason.NOT_TRACKING),
+        (NodeConfig(readout_time=READOUT_TIME, solver="p3p"), ImuReason.NOT_TRACKING),
     ):
         flown = fly(flight, config=config)
         assert flown.state is not None

@@ -52,6 +52,21 @@ def test_the_reversed_direction_is_found() -> None:
     found = calibrate(CAMERA, list(recording(-0.02)))
     agrees(found, -0.02, 1e-4)
     assert verdict.scan_direction(found) == "bottom_to_top"
+    says_what_it_holds(found)
+
+
+def says_what_it_holds(found: Calibration) -> None:
+    """A board whose shape is free is worth no word, one with too many corners is."""
+    assert found.held == 0
+    seen = found.posed.observations
+    large = replace(seen, landmarks=np.zeros((500, 3)), points=np.zeros(15_000, dtype=np.int64))
+    held = replace(
+        found,
+        posed=replace(found.posed, observations=large),
+        fit=replace(found.fit, freedom=replace(found.fit.freedom, landmarks=0.0)),
+    )
+    assert held.held == 500
+    assert any("map's 500 points" in remark for remark in verdict.remarks(held))
 
 
 def test_a_global_shutter_is_one() -> None:

@@ -13,7 +13,7 @@ from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.whole import whole_files
 from rs_localizer.markers.families import family
-from rs_localizer.markers.formats.common import Unsaid
+from rs_localizer.markers.formats.common import USUAL_FAMILY, Unsaid
 from rs_localizer.markers.formats.files import (
     FORMATS,
     OWN,
@@ -43,7 +43,7 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         "name, in the folder or one of the two above)",
     )
     foreign = parser.add_argument_group("markers: what files of other programs do not say")
-    foreign.add_argument("--family", help=f"(default: {Unsaid().family.name})")
+    foreign.add_argument("--family", help=f"(default: that of the file, or {USUAL_FAMILY.name})")
     foreign.add_argument("--size", type=number(0.0, above=True), metavar="M", help="of all markers")
     foreign.add_argument("--map-frame", metavar="NAME", help="(default: map)")
     foreign.add_argument("--part", metavar="NAME", help="of several bundles or bodies")
@@ -70,7 +70,7 @@ def read(args: argparse.Namespace) -> tuple[Map | MarkerMap, str]:
 def _unsaid(args: argparse.Namespace) -> Unsaid:
     known = Unsaid()
     try:
-        kind = known.family if args.family is None else family(args.family)
+        kind = None if args.family is None else family(args.family)
     except ValueError as error:
         raise UsageError(f"--family: {error}") from error
     return Unsaid(kind, args.size, args.map_frame or known.map_frame, args.part or "")

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.map import contradiction
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -65,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="how well these are known (default: %(default)s)",
     )
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="instead of camera_info")
+    contradiction.add_argument(parser)
     add_settings(
         parser,
         "readout_time, scan_direction, stamp_offset, matching.*; map_deviation: how well all "
@@ -99,6 +101,7 @@ def run(args: argparse.Namespace) -> None:
         camera, known.seen, known.start, freedom, stamp_offset=config.stamp_offset, done=_told
     )
     _tell(known, found)
+    contradiction.check(args, found.asked_readout, "see --shutter estimated")
     _write(args, known.landmarks, found)
 
 
@@ -150,8 +153,6 @@ def _tell(known: RecordedMap, found: RefinedMap) -> None:
         print(f"{name:26} {text}")
     if found.readout_time < 0.0:
         print("the readout time is negative: the scan direction is the reverse of what was set")
-    if found.asked_readout is not None and found.asked_readout.differs:
-        print(f"warning: {found.asked_readout.told}; see --shutter estimated")
 
 
 def _millimetres(lengths: Array) -> str:
@@ -169,4 +170,7 @@ def _write(args: argparse.Namespace, landmarks: Map, found: RefinedMap) -> None:
     print(f"written: {', '.join(map(str, files))}")
     left = np.count_nonzero(~found.refined)
     if left:
-        print(f"{left} landmarks stayed as they were: fewer than two images determine them")
+        print(
+            f"{left} landmarks stayed as they were: seen by fewer than two images, or from "
+            "too few sides to be known better"
+        )

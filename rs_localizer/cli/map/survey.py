@@ -11,8 +11,10 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.map import contradiction
 from rs_localizer.cli.shots import opened, tell_times
 from rs_localizer.config import NodeConfig
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.images import Image
@@ -28,6 +30,7 @@ from rs_localizer.offline.image_sources import Carried
 from rs_localizer.process.arguments import number
 
 _LISTED = 12
+_SHAPE, _ORIGIN = "shape", "origin"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,6 +60,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="marker whose frame is that of the map (default: the lowest id of the most that hang "
         "together)",
     )  # fmt: skip
+    parser.add_argument(
+        "--deviations", choices=(_SHAPE, _ORIGIN), default=_SHAPE,
+        help="what is written of the errors: of the markers beside each other, wherever all of "
+        "them lie, or in the frame of the origin, whose own are 0 (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, metavar="WALL.yaml")
     parser.add_argument("--overwrite", action="store_true", help="replace WALL.yaml")
     parser.add_argument("--map-frame", default="map", help="(default: %(default)s)")
@@ -69,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate", type=number(0.0, above=True), metavar="HZ",
         help="images per second of a video or of files",
     )  # fmt: skip
+    contradiction.add_argument(parser)
     add_settings(parser, "readout_time (0: it is found), scan_direction, stamp_offset")
     topics = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
     topics.add_argument("--image", metavar="TOPIC")
@@ -86,10 +95,12 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.recording} does not exist")
     camera, spotted = _spotted(args, config, Spotter(markers, args.min_side))
     found = survey(camera, spotted, markers, origin=origin, stamp_offset=config.stamp_offset)
-    _tell(found, len(spotted))
+    every = found.deviations_of_shape if args.deviations == _SHAPE else found.deviations
+    _tell(found, every, len(spotted))
+    contradiction.check(args, found.asked_readout, "without one it is found")
     surveyed = tuple(
-        replace(marker, deviations=None if k == 0 else deviations)
-        for k, (marker, deviations) in enumerate(zip(found.markers, found.deviations, strict=True))
+        replace(marker, deviations=deviations)
+        for marker, deviations in zip(found.markers, every, strict=True)
     )
     marker_map = MarkerMap(surveyed, map_frame=args.map_frame)
     with whole_files(args.out):
@@ -164,8 +175,8 @@ def _spotted(
     return camera, [spotted[stamp] for stamp in sorted(spotted)]
 
 
-def _tell(found: Survey, images: int) -> None:
-    """The table of the markers."""
+def _tell(found: Survey, every: Array, images: int) -> None:
+    """The table of the markers, with their deviations (m,6)."""
     fit = found.fit
     print(f"images with a marker     {found.images} of {images}")
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
@@ -175,22 +186,40 @@ def _tell(found: Survey, images: int) -> None:
     print(
         f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
     )
-    for marker, sights, deviations in zip(
-        found.markers, found.sights, found.deviations, strict=True
+    for marker, sights, deviations, poor in zip(
+        found.markers, found.sights, every, found.poor, strict=True
     ):
         x, y, z = marker.pose.position
         place = 1e3 * np.linalg.norm(deviations[:3])
         turn = np.degrees(np.linalg.norm(deviations[3:]))
         name = marker.name.removeprefix("marker ")
-        print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}")
-    if found.asked_readout is not None and found.asked_readout.differs:
-        print(f"warning: {found.asked_readout.told}; without one it is found")
+        mark = " poor" if poor else ""
+        print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}{mark}")
+    _tell_frame(found)
+    if found.poor.any():
+        poor = tuple(found.markers[k] for k in np.flatnonzero(found.poor))
+        print(f"warning: known to worse than a tenth of their size: {_listed(poor)}")
     for part in found.apart:
         print(
             f"not connected: {_listed(part)}: no image shows one of them together with those above"
         )
     if found.rare:
-        print(f"left out: {_listed(found.rare)}: too few images show them, or none as the others")
+        print(
+            f"left out: {_listed(found.rare)}: too few images show them, or not enough to tell "
+            "which way they are turned"
+        )
+
+
+def _tell_frame(found: Survey) -> None:
+    """What the errors of the origin's own pose make of all others in its frame."""
+    origin, places = found.markers[0], [marker.pose.position for marker in found.markers]
+    turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
+    far = int(np.argmax(np.linalg.norm(places, axis=1)))
+    there = 1e3 * np.linalg.norm(found.deviations[far, :3])
+    print(
+        f"frame: that of {origin.name}, whose own orientation is known to {turn:.3f} deg: in it, "
+        f"{found.markers[far].name} is known to {there:.1f} mm"
+    )
 
 
 def _listed(markers: tuple[Marker, ...]) -> str:

@@ -1,8 +1,10 @@
-"""The images of a sparse model of COLMAP: ``images.bin`` or ``images.txt``, names and numbers."""
+"""The images of a sparse model of COLMAP, from ``images.bin`` or ``images.txt``."""
 
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 from rs_localizer.io.maps.landmarks import MapError
@@ -11,10 +13,19 @@ from rs_localizer.io.maps.landmarks import MapError
 _IMAGE = struct.Struct("<I7dI")
 _COUNT = struct.Struct("<Q")
 _FEATURE_BYTES = 24  # x, y and the number of the point
+_FEATURE_WORDS = 3
 
 
-def read_image_ids(folder: Path) -> dict[str, int]:
-    """The numbers of a model's images by their names.
+@dataclass(frozen=True, slots=True)
+class ModelImage:
+    """An image of a model."""
+
+    number: int
+    features: int  # 0: the model does not list them
+
+
+def read_images(folder: Path) -> dict[str, ModelImage]:
+    """A model's images by their names.
 
     Raises:
         MapError: for anything that is not a model, OSError as any file.
@@ -31,8 +42,8 @@ def read_image_ids(folder: Path) -> dict[str, int]:
     return found
 
 
-def _read_binary(data: bytes) -> dict[str, int]:
-    found: dict[str, int] = {}
+def _read_binary(data: bytes) -> dict[str, ModelImage]:
+    found: dict[str, ModelImage] = {}
     try:
         (count,) = _COUNT.unpack_from(data)
         position = _COUNT.size
@@ -40,8 +51,8 @@ def _read_binary(data: bytes) -> dict[str, int]:
             number = _IMAGE.unpack_from(data, position)[0]
             start = position + _IMAGE.size
             end = data.index(0, start)
-            found[data[start:end].decode("utf-8")] = number
             (features,) = _COUNT.unpack_from(data, end + 1)
+            found[data[start:end].decode("utf-8")] = ModelImage(number, features)
             position = end + 1 + _COUNT.size + features * _FEATURE_BYTES
     except (struct.error, ValueError):  # the latter also where a name is not text
         position = len(data) + 1
@@ -50,18 +61,19 @@ def _read_binary(data: bytes) -> dict[str, int]:
     return found
 
 
-def _read_text(path: Path) -> dict[str, int]:
-    found: dict[str, int] = {}
+def _read_text(path: Path) -> dict[str, ModelImage]:
+    found: dict[str, ModelImage] = {}
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line[:1] != "#"]
     # Every second line lists the features of an image, and may be empty.
-    for line in lines[::2]:
+    for line, features in zip_longest(lines[::2], lines[1::2], fillvalue=""):
         words = line.split(maxsplit=9)
         if not words:
             continue
         try:
             if len(words) != 10:
                 raise ValueError
-            found[words[9]] = int(words[0])
+            count = len(features.split()) // _FEATURE_WORDS
+            found[words[9]] = ModelImage(int(words[0]), count)
         except ValueError:
             raise MapError(
                 f"images.txt: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, found {line[:80]!r}"

@@ -1,13 +1,14 @@
 """Bundles of apriltag_ros (ROS 1): YAML.
 
+    tag_family: tag36h11
     tag_bundles:
       - name: wall
         layout:
           - {id: 0, size: 0.16, x: 0, y: 0, z: 0, qw: 1, qx: 0, qy: 0, qz: 0}
 
 Metres; x of a tag is to the right, y up, z toward the viewer (AprilRobotics/apriltag_ros #156).
-What is missing of a pose is that of the origin. The family is not in the file; standalone tags
-have no place.
+What is missing of a pose is that of the origin. The family may be in another file of parameters;
+standalone tags have no place.
 """
 
 from __future__ import annotations
@@ -17,8 +18,12 @@ from typing import Any
 import yaml
 
 from rs_localizer.markers.entries import Entry
+from rs_localizer.markers.families import Family
 from rs_localizer.markers.formats.common import (
+    TAG_FAMILY,
     Unsaid,
+    family_name,
+    family_of,
     identifier,
     quaternion,
     rounded,
@@ -32,7 +37,8 @@ from rs_localizer.markers.prints import Marker
 
 def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
     """The map of a parsed file; raises ValueError for anything else."""
-    found = Entry(tree, "the file").entries("tag_bundles", "bundle")
+    file = Entry(tree, "the file")
+    family, found = family_of(file, unsaid), file.entries("tag_bundles", "bundle")
     bundles = {
         str(bundle.take("name", (str, int), f"{index}")): bundle
         for index, bundle in enumerate(found)
@@ -47,29 +53,30 @@ def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
     if unsaid.part and unsaid.part not in bundles:
         raise MarkerMapError(f"it has no bundle {unsaid.part}; it has {', '.join(bundles)}")
     chosen = bundles[unsaid.part] if unsaid.part else next(iter(bundles.values()))
-    markers = tuple(_marker(tag, unsaid) for tag in chosen.entries("layout", "tag"))
+    markers = tuple(_marker(tag, family) for tag in chosen.entries("layout", "tag"))
     return MarkerMap(markers, map_frame=unsaid.map_frame)
 
 
-def _marker(tag: Entry, unsaid: Unsaid) -> Marker:
+def _marker(tag: Entry, family: Family) -> Marker:
     number, size = identifier(tag, "id"), tag.number("size")
     place = vector(tag, "xyz")
     turn = [float(tag.take(f"q{name}", (int, float), float(name == "w"))) for name in "xyzw"]
     with tag.named():
         pose = Pose(place, rotation_of_quaternion(turn))
-        return Marker.at(unsaid.family.name, number, size, pose)
+        return Marker.at(family.name, number, size, pose)
 
 
 def write(marker_map: MarkerMap) -> str:
     """The text of a file with one bundle."""
-    layout = []
-    for marker in single_markers(marker_map, "apriltag_ros"):
+    layout, markers = [], single_markers(marker_map, "apriltag_ros")
+    for marker in markers:
         pose = marker.pose
         tag: dict[str, Any] = {"id": marker.id, "size": rounded([marker.size])[0]}
         tag |= dict(zip("xyz", rounded(pose.position), strict=True))
         tag |= dict(zip(("qx", "qy", "qz", "qw"), quaternion(pose.rotation), strict=True))
         layout.append(tag)
     tree = {
+        TAG_FAMILY: family_name(markers),
         "standalone_tags": [],
         "tag_bundles": [{"name": marker_map.map_frame, "layout": layout}],
     }

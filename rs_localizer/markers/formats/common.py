@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,19 +11,39 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.entries import Entry
-from rs_localizer.markers.families import FAMILIES, Family
+from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.prints import Marker
+
+TAG_FAMILY = "tag_family"
+"""Key of the family's name: a parameter of apriltag_ros, which reads it beside the bundles. The
+other formats have no place for it, and their readers pass over keys that they do not know.
+"""
+USUAL_FAMILY = FAMILIES["apriltag_36h11"]
+"""Of files that do not say it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unsaid:
     """What a file does not say of its markers."""
 
-    family: Family = FAMILIES["apriltag_36h11"]
+    family: Family | None = None  # None: as the file says, or the usual one
     size: float | None = None  # m
     map_frame: str = "map"
     part: str = ""  # name of the bundle or body to take
+
+
+def family_of(file: Entry, unsaid: Unsaid) -> Family:
+    """The family of a file's markers; raises ValueError for a name that is none."""
+    if unsaid.family is not None:
+        return unsaid.family
+    return family(file.take(TAG_FAMILY, str, USUAL_FAMILY.name))
+
+
+def family_name(markers: tuple[Marker, ...]) -> str:
+    """What is written under :data:`TAG_FAMILY`: AprilTag's own names, where there is one."""
+    largest = max((marker.family for marker in markers), key=lambda of: of.count)
+    return re.sub(r"^apriltag_", "tag", largest.name)
 
 
 def identifier(entry: Entry, name: str) -> int:

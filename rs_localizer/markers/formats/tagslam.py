@@ -11,7 +11,8 @@
               pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}
 
 Metres; ``rotation`` is a rotation vector (rad). x of a tag is to the right, y up, z toward the
-viewer. The family is not in the file. Tags without a pose, which TagSLAM is to find, are left out.
+viewer. The family is not of the format: it is written, and read, as ``tag_family``. Tags without a
+pose, which TagSLAM is to find, are left out.
 """
 
 from __future__ import annotations
@@ -25,8 +26,12 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.entries import Entry
+from rs_localizer.markers.families import Family
 from rs_localizer.markers.formats.common import (
+    TAG_FAMILY,
     Unsaid,
+    family_name,
+    family_of,
     identifier,
     rounded,
     single_markers,
@@ -44,13 +49,13 @@ _AT_REST = 1e-6
 
 def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
     """The map of a parsed file; raises ValueError for anything else."""
-    markers: list[Marker] = []
-    names = []
-    for item in Entry(tree, "the file").entries("bodies", "body"):
+    file, markers, names = Entry(tree, "the file"), list[Marker](), []
+    family = family_of(file, unsaid)
+    for item in file.entries("bodies", "body"):
         for name, body in _named(item):
             names.append(name)
             if (unsaid.part or name) == name and body.take("is_static", bool, True):
-                markers += _markers(body, unsaid)
+                markers += _markers(body, family)
     if unsaid.part and unsaid.part not in names:
         raise MarkerMapError(f"it has no body {unsaid.part}; it has {', '.join(names) or 'none'}")
     if not markers:
@@ -63,7 +68,7 @@ def _named(item: Entry) -> list[tuple[str, Entry]]:
     return [(name, Entry(item.take(name, dict), f"body {name}")) for name in item.names()]
 
 
-def _markers(body: Entry, unsaid: Unsaid) -> list[Marker]:
+def _markers(body: Entry, family: Family) -> list[Marker]:
     size = body.take("default_tag_size", (int, float), None)
     place, turn = _pose(body) if "pose" in body else (np.zeros(3), np.eye(3))
     markers = []
@@ -76,7 +81,7 @@ def _markers(body: Entry, unsaid: Unsaid) -> list[Marker]:
         own_place, own_turn = _pose(tag)
         with tag.named():
             pose = Pose(turn @ own_place + place, turn @ own_turn)
-            markers.append(Marker.at(unsaid.family.name, number, side, pose))
+            markers.append(Marker.at(family.name, number, side, pose))
     return markers
 
 
@@ -89,8 +94,8 @@ def _pose(entry: Entry) -> tuple[Array, Array]:
 
 def write(marker_map: MarkerMap) -> str:
     """The text of a file with one static body."""
-    tags = []
-    for marker in single_markers(marker_map, "TagSLAM"):
+    tags, markers = [], single_markers(marker_map, "TagSLAM")
+    for marker in markers:
         known = marker.deviations
         if known is None:
             known = np.repeat([_POSITION_NOISE, _ROTATION_NOISE], 3)
@@ -106,7 +111,11 @@ def write(marker_map: MarkerMap) -> str:
     at_rest = {"position": _xyz(np.zeros(3)), "rotation": _xyz(np.zeros(3))}
     at_rest |= {f"{name}_noise": _xyz(np.full(3, _AT_REST)) for name in ("position", "rotation")}
     body = {"is_static": True, "type": "simple", "pose": at_rest, "tags": tags}
-    tree = {"default_body": marker_map.map_frame, "bodies": [{marker_map.map_frame: body}]}
+    tree = {
+        TAG_FAMILY: family_name(markers),
+        "default_body": marker_map.map_frame,
+        "bodies": [{marker_map.map_frame: body}],
+    }
     return str(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=160))
 
 

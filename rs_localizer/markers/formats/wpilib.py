@@ -5,7 +5,7 @@
      "field": {"length": 16.54, "width": 8.02}}
 
 Metres; z is up, x of a tag comes out of it toward the viewer, y is to the viewer's right. Sizes
-and family are not in the file.
+are not in the file; nor is the family, which is written, and read, as ``tag_family``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ import numpy as np
 
 from rs_localizer.markers.entries import Entry
 from rs_localizer.markers.formats.common import (
+    TAG_FAMILY,
     Unsaid,
+    family_name,
+    family_of,
     identifier,
     quaternion,
     rounded,
@@ -41,8 +44,8 @@ def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
         raise MarkerMapError(
             "a field of WPILib does not say how large its tags are: give --size (m; 0.1651 of FRC)"
         )
-    field = Entry(tree, "the field")
-    markers = []
+    field, markers = Entry(tree, "the field"), []
+    family = family_of(field, unsaid)
     for tag in field.entries("tags", "tag"):
         number = identifier(tag, "ID")
         pose = Entry(tag.take("pose", dict), f"{tag.where}: pose")
@@ -51,9 +54,7 @@ def read(tree: Any, unsaid: Unsaid) -> MarkerMap:
         x, y, z, w = vector(Entry(turn.take("quaternion", dict), pose.where), "XYZW")
         with tag.named():
             rotation = rotation_of_quaternion([x, y, z, w]) @ _TAG_FROM_PRINT
-            markers.append(
-                Marker.at(unsaid.family.name, number, unsaid.size, Pose(place, rotation))
-            )
+            markers.append(Marker.at(family.name, number, unsaid.size, Pose(place, rotation)))
     return MarkerMap(tuple(markers), map_frame=unsaid.map_frame)
 
 
@@ -74,4 +75,5 @@ def write(marker_map: MarkerMap) -> str:
         tags.append({"ID": marker.id, "pose": {"translation": place, "rotation": turn}})
     length, width = np.maximum(marker_map.points.max(axis=0), 0.0)[:2]
     field = {"length": round(float(length), 6), "width": round(float(width), 6)}
-    return json.dumps({"tags": tags, "field": field}, indent=1) + "\n"
+    tree = {TAG_FAMILY: family_name(markers), "tags": tags, "field": field}
+    return json.dumps(tree, indent=1) + "\n"

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -83,48 +84,83 @@ def record(
 class Followed:
     """What a tracker made of recordings."""
 
-    scores: Scores
+    scores: Scores  # at the middle row
+    first: Scores  # at the first one
     seconds: list[float]  # of each frame
     time_offsets: list[float]  # s, at the end of each recording
 
 
-def follow(recorded: Recorded, noise: float, aided: bool, skipped: int) -> Followed:
-    """Track all recordings; the first frames of each are not counted."""
-    frames = recorded.frames
-    camera = believed(frames.camera)
-    tracker = Tracker(Localizer(camera), recorded.settings if aided else None)
-    scores: list[Score] = []
-    seconds, offsets = [], []
-    for frame in range(len(frames)):
+class _Follower:
+    """A tracker that goes through recordings, and how good it was."""
+
+    def __init__(self, recorded: Recorded, noise: float, aided: bool, skipped: int) -> None:
+        self._recorded, self._noise, self._aided = recorded, noise, aided
+        self._skipped = skipped
+        self._camera = believed(recorded.frames.camera)
+        self._tracker = Tracker(Localizer(self._camera), recorded.settings if aided else None)
+        self._middle: list[Score] = []
+        self._first: list[Score] = []
+        self._seconds: list[float] = []
+        self._offsets: list[float] = []
+
+    def localize(self, frame: int) -> None:
+        """Localize the next frame."""
+        frames, tracker = self._recorded.frames, self._tracker
         place, recording = int(frames.place[frame]), int(frames.recording[frame])
         if place == 0:
             tracker.reset()
-        points, pixels = frames.seen(frame, noise)
-        imu = recorded.around(frame) if aided else None
+        points, pixels = frames.seen(frame, self._noise)
+        imu = self._recorded.around(frame) if self._aided else None
         start = time.thread_time()
         found = tracker.localize(frames.middle_ns(frame), points, pixels, None, imu)
         taken = time.thread_time() - start
-        if place >= skipped:
-            seconds.append(taken)
-            truth = truth_of(frames.middle, frame)
-            scores.append(score_at(found, 0.0, camera.readout_time, truth, recording))
+        if place >= self._skipped:
+            self._seconds.append(taken)
+            for scores, states, tau in (
+                (self._middle, frames.middle, 0.0),
+                (self._first, frames.first, -0.5),
+            ):
+                truth = truth_of(states, frame)
+                scores.append(score_at(found, tau, self._camera.readout_time, truth, recording))
         if place == frames.place.max() and tracker.inertial is not None:
-            offsets.append(tracker.inertial.time_offset)
-    return Followed(Scores(scores), seconds, offsets)
+            self._offsets.append(tracker.inertial.time_offset)
+
+    @property
+    def followed(self) -> Followed:
+        return Followed(Scores(self._middle), Scores(self._first), self._seconds, self._offsets)
+
+
+def follow(recorded: Recorded, noise: float, aided: bool, skipped: int) -> Followed:
+    """Track all recordings; the first frames of each are not counted."""
+    follower = _Follower(recorded, noise, aided, skipped)
+    for frame in range(len(recorded.frames)):
+        follower.localize(frame)
+    return follower.followed
+
+
+def follow_both(recorded: Recorded, noise: float, skipped: int) -> tuple[Followed, Followed]:
+    """The same without and with the gyroscope, frame by frame in turn."""
+    both = [_Follower(recorded, noise, aided, skipped) for aided in (False, True)]
+    for frame in range(len(recorded.frames)):
+        for follower in both[:: 1 - 2 * (frame % 2)]:
+            follower.localize(frame)
+    return both[0].followed, both[1].followed
 
 
 def alone_and_aided(
     recorded: Recorded, localizer: Localizer, frame: int, points: Array, pixels: Array
 ) -> tuple[Estimate | Failure, Estimate | Failure]:
     """Results of a single frame without and with a gyroscope that is known by now."""
+    turn = turn_of_frame(recorded, frame, localizer.camera.readout_time)
+    return localizer.localize(points, pixels), localizer.localize(points, pixels, turn=turn)
+
+
+def turn_of_frame(recorded: Recorded, frame: int, readout_time: float) -> KnownTurn:
+    """How the camera turned during a frame, by a gyroscope that is known by now."""
     samples, errors = recorded.around(frame), _known_errors(recorded)
-    middle, readout_time = recorded.frames.middle_ns(frame), localizer.camera.readout_time
-    within = turn_within(samples, middle, readout_time, errors)
+    within = turn_within(samples, recorded.frames.middle_ns(frame), readout_time, errors)
     assert within is not None
-    return (
-        localizer.localize(points, pixels),
-        localizer.localize(points, pixels, turn=within.known),
-    )
+    return within.known
 
 
 def _known_errors(recorded: Recorded) -> GyroscopeErrors:

@@ -1,6 +1,6 @@
 """The figures of ``docs/mapping.md`` and of an IMU in ``docs/map_build.md``:
 
-python -m rs_localizer.lab.experiments.mapping bend bound large surveys weighing
+python -m rs_localizer.lab.experiments.mapping bend bound large surveys rendered weighing
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import sys
 from collections.abc import Callable, Iterator
 
 from rs_localizer.lab.experiments.mapping.refining import bend, bound, large
-from rs_localizer.lab.experiments.mapping.surveying import surveys
+from rs_localizer.lab.experiments.mapping.surveying import rendered, surveys
 from rs_localizer.lab.experiments.mapping.weighing import weighing
 from rs_localizer.process.arguments import integer
 
 _PARTS: dict[str, Callable[[int], Iterator[str]]] = {
     "bend": bend, "bound": bound, "large": large, "surveys": surveys,
-    "weighing": weighing,
+    "rendered": rendered, "weighing": weighing,
 }  # fmt: skip
 
 

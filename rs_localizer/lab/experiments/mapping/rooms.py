@@ -14,7 +14,7 @@ from rs_localizer.mapping.sightings import Sightings, Start
 from rs_localizer.mapping.spotting import Spotted
 
 _HALF = 2.5  # m, of the room
-_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 _STEEPEST = 0.35  # cosine of the angle at which markers are still seen
 _LEAST_SIDE = 12.0  # px
 
@@ -101,7 +101,7 @@ class Film:
         self, poses: list[tuple[Array, Array]], size: float, noise: float, rng: np.random.Generator
     ) -> list[Spotted]:
         """The markers that images show whole, large and not too slanted."""
-        corners = np.concatenate([size * _SQUARE @ turn.T + place for turn, place in poses])
+        corners = np.concatenate([size * SQUARE @ turn.T + place for turn, place in poses])
         normals = np.array([turn[:, 2] for turn, _ in poses])
         middles = np.array([place for _, place in poses])
         spotted = []

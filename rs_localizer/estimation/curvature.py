@@ -1,0 +1,62 @@
+"""How far a motion leaves its ellipsoid where the camera may have turned about what it sees.
+
+The points say precisely in which direction they are and roughly how far away. A camera whose
+orientation they hardly tell is somewhere on an arc about them, and arcs leave their tangents: by
+half of 3 m times the square of 4 degrees, 7 mm, where the ellipsoid is thinner than 1 mm. In the
+terms of a step (turn ``phi``, move ``rho``; see :mod:`rs_localizer.estimation.refine`), points at
+``p`` in camera axes that move there by ``d`` are seen from
+
+    rho = p - exp([phi]x) (p + d)
+        = -d - phi x p - (phi x (phi x p) / 2 + phi x d) - ...
+
+of which the ellipsoid has the first two.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.state import MOVE
+
+
+@kernel
+def along_arcs(covariance: Array, centre: Array) -> Array:
+    """The covariance (18,18) with the second order of the move; that of the turn has none.
+
+    The mean stays where the points fit best, so that the mean of the second order counts, too: for
+    ``s_i = y^T H_i y`` of Gaussians ``y`` with covariance ``C``, ``E[s_i s_j]`` is
+    ``tr(H_i C) tr(H_j C) + 2 tr(H_i C H_j C)``.
+
+    Args:
+        covariance: of a step.
+        centre: (3,) of the points, in camera axes.
+    """
+    # y = (phi, d): d = -rho + [p]x phi.
+    by_step = np.zeros((6, 6))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        by_step[i, i], by_step[3 + i, 3 + i] = 1.0, -1.0
+        by_step[3 + j, i], by_step[3 + k, i] = centre[k], -centre[j]
+    both = by_step @ np.ascontiguousarray(covariance[:6, :6]) @ by_step.T
+    forms = np.zeros((3, 6, 6))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        # (phi x (phi x p))_i = phi_i (phi . p) - p_i (phi . phi)
+        for m in range(3):
+            forms[i, i, m] -= 0.25 * centre[m]
+            forms[i, m, i] -= 0.25 * centre[m]
+            forms[i, m, m] += 0.5 * centre[i]
+        forms[i, j, 3 + k] = forms[i, 3 + k, j] = -0.5
+        forms[i, k, 3 + j] = forms[i, 3 + j, k] = 0.5
+    products = np.empty((3, 6, 6))
+    for i in range(3):
+        products[i] = forms[i] @ both
+    farther = covariance.copy()
+    for i in range(3):
+        for j in range(3):
+            second = np.trace(products[i]) * np.trace(products[j])
+            second += 2.0 * np.sum(products[i] * products[j].T)
+            farther[MOVE, MOVE][i, j] += second
+    return farther

@@ -1,0 +1,108 @@
+"""How much worse all is known because errors of keypoints that follow each other are alike.
+
+The corners of a marker, or the features of a surface, look nearly the same from image to image, and
+so do their errors: a hundred of them say less than a hundred independent ones. Errors of a second
+are taken together (cluster-robust covariance: Liang and Zeger, *Longitudinal data analysis using
+generalized linear models*, Biometrika 1986), by what they pull at all that is estimated. As one
+factor: a recording has too few seconds to tell one for each number.
+
+Of independent errors, what a second pulls has the expectation ``tr B - tr B^2``, where ``B`` is the
+share of all information that comes from it: what was estimated fits its own errors, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.mapping.border_rows import border_rows
+from rs_localizer.trajectory.fit import Fit, steepness
+from rs_localizer.trajectory.problem import Problem
+
+SECONDS = 1.0
+"""Errors farther apart than this are taken for independent."""
+# As if so many numbers had been found known as well as independent errors let them: what few
+# seconds say is chance.
+_DOUBT = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """What errors pull at what is estimated, in its own covariance, all seconds together."""
+
+    found: float
+    expected: float  # of independent errors of the noise that the covariance stands for
+
+    def inflation(self, independent: float) -> float:
+        """Of the covariance, if it would be so large for independent errors."""
+        share = (self.found + _DOUBT * independent) / (self.expected + _DOUBT)
+        return max(share, independent)
+
+
+def with_alike_errors(problem: Problem, found: Fit) -> Fit:
+    """The estimate with covariances as large as its own errors show.
+
+    Args:
+        problem: whose minimum it is, with the same freedom and without delays of images.
+    """
+    of_errors = steepness(found.squared_errors[found.inliers], found.deviation) ** 2
+    pull = _pull(problem, found)
+    inflation = Pull(of_errors * pull.found, pull.expected).inflation(found.inflation)
+    return replace(
+        found,
+        border_covariance=found.border_covariance * (inflation / found.inflation),
+        inflation=inflation,
+    )
+
+
+def _pull(problem: Problem, found: Fit) -> Pull:
+    curve, parts = problem.look(found.state)
+    terms = problem.terms(found.state, found.deviation)
+    lifted = found.factored.lifted
+    whitening = np.linalg.cholesky(found.border_covariance / found.inflation)
+    total, expected, start = 0.0, 0.0, 0
+    for sights in parts:
+        times = problem.observations.times[start : start + len(sights.first)]
+        start += len(sights.first)
+        for first, end in _seconds(times):
+            rows = np.empty((end - first, 2, lifted.shape[1] + 1))
+            border_rows(curve, sights, terms, lifted, first, rows)
+            own = rows[..., :-1].reshape(2 * len(rows), -1) @ whitening
+            total += float(np.sum((own.T @ rows[..., -1].ravel()) ** 2))
+            share = own.T @ own if own.shape[0] > own.shape[1] else own @ own.T
+            expected += float(np.trace(share) - np.sum(share**2))
+    return Pull(total, expected)
+
+
+def _seconds(times: Array) -> list[tuple[int, int]]:
+    """First and end of the keypoints of each second, at rising times (n,)."""
+    starts = np.flatnonzero(np.diff(np.floor(times / SECONDS), prepend=-np.inf))
+    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(times)], strict=True))
+
+
+def pull_at_landmarks(rows: Array, landmarks: IntArray, times: Array, held: Array) -> Pull:
+    """What errors pull at landmarks, the motion taken for given.
+
+    Args:
+        rows: (n,2,4) whitened derivatives by the landmark, and the error.
+        landmarks: (n,) numbers of the landmarks.
+        times: (n,) s.
+        held: (p,) 1/m^2, of what is known of the landmarks beforehand.
+    """
+    seconds = np.floor(times / SECONDS)
+    order = np.lexsort((seconds, landmarks))
+    own, errors = rows[order, :, :3], rows[order, :, 3]
+    of, at = landmarks[order], seconds[order]
+    starts = np.flatnonzero((np.diff(of, prepend=-1) != 0) | (np.diff(at, prepend=-np.inf) != 0))
+    information = np.add.reduceat(np.einsum("nri,nrj->nij", own, own), starts)
+    pulls = np.add.reduceat(np.einsum("nri,nr->ni", own, errors), starts)
+    every = held[:, None, None] * np.eye(3)
+    np.add.at(every, of[starts], information)
+    inverse = np.linalg.inv(every[of[starts]])
+    shares = inverse @ information
+    return Pull(
+        float(np.einsum("ki,kij,kj->", pulls, inverse, pulls)),
+        float(np.einsum("kii->", shares) - np.einsum("kij,kji->", shares, shares)),
+    )

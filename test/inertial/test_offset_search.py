@@ -1,0 +1,83 @@
+"""The time offset from nothing: whatever shakes, the right one of its periods is found."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.sight import sight_of
+from rs_localizer.lab.experiments.honesty.estimating import believed
+from rs_localizer.lab.experiments.inertial.recordings import record
+from rs_localizer.lab.independent.cameras import Camera
+from rs_localizer.lab.independent.gyroscopes import Imu
+from rs_localizer.lab.independent.motions import hand, rest, shaken_hand
+from rs_localizer.lab.independent.scenes import Rich
+from rs_localizer.localizer import Localizer
+from rs_localizer.tracking import Tracker
+
+
+def tracker_of(recorded, estimated=True):
+    settings = InertialSettings(recorded.imu.noise, 1e-4, estimated)
+    return Tracker(Localizer(believed(recorded.frames.camera)), settings)
+
+
+def followed(tracker, recorded, frames):
+    """Whether the search goes on after each frame, and the last status."""
+    going = []
+    for frame in range(frames):
+        seen = recorded.frames.seen(frame, 1.0)
+        middle = recorded.frames.middle_ns(frame)
+        assert tracker.localize(middle, *seen, None, recorded.around(frame))
+        going.append(tracker._aid.searches)
+    return going, tracker.inertial
+
+
+@pytest.mark.parametrize("hertz", [60.0, 61.3, 120.0])
+@pytest.mark.parametrize("offset", [0.005, -0.011])
+def test_no_period_of_a_vibration_is_mistaken_for_another(hertz, offset):
+    motion = partial(shaken_hand, shaking=((0.2, hertz),))
+    recorded = record(Camera(), motion, Rich(), (1, 30), 5, replace(Imu(), offset=offset))
+    going, status = followed(tracker_of(recorded), recorded, 30)
+    assert not going[-1]
+    assert abs(status.time_offset - offset) < 5e-4
+    assert abs(status.time_offset - offset) < 4.0 * status.time_offset_deviation + 4e-5
+
+
+def test_a_camera_at_rest_says_nothing():
+    recorded = record(Camera(), rest, Rich(), (1, 12), 5)
+    going, status = followed(tracker_of(recorded), recorded, 12)
+    assert all(going)
+    assert status.time_offset_deviation > 5e-3
+
+
+def test_a_hand_alone_is_left_to_the_filter():
+    recorded = record(Camera(), hand, Rich(), (1, 8), 5)
+    tracker = tracker_of(recorded)
+    followed(tracker, recorded, 8)
+    assert not tracker._aid.wants_sight()
+
+
+def test_a_given_offset_is_not_searched():
+    recorded = record(Camera(), rest, Rich(), (1, 2), 5)
+    assert not followed(tracker_of(recorded, estimated=False), recorded, 2)[0][0]
+
+
+def test_a_reset_begins_anew():
+    motion = partial(shaken_hand, shaking=((0.3, 60.0),))
+    recorded = record(Camera(), motion, Rich(), (1, 20), 5)
+    tracker = tracker_of(recorded)
+    assert not followed(tracker, recorded, 20)[0][-1]
+    tracker.reset()
+    assert tracker._aid.searches
+
+
+def test_few_inliers_say_nothing():
+    recorded = record(Camera(), rest, Rich(), (1, 1), 5)
+    points, pixels = recorded.frames.seen(0, 0.3)
+    camera = believed(recorded.frames.camera)
+    found = Localizer(camera).localize(points, pixels)
+    assert sight_of(camera, points, pixels, found, 0) is not None
+    few = replace(found, inliers=found.inliers & (np.arange(len(points)) < 8))
+    assert sight_of(camera, points, pixels, few, 0) is None

@@ -1,0 +1,75 @@
+"""Errors that are alike from image to image, and how much less they say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import camera, ring, spot
+
+from rs_localizer.mapping.alike import Pull, pull_at_landmarks
+from rs_localizer.mapping.spotting import every_marker
+from rs_localizer.mapping.survey import Survey, survey
+from rs_localizer.markers.families import family
+
+RATE, LANDMARKS, SECONDS = 30, 60, 10
+
+
+def alike(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> np.ndarray:
+    """Errors of variance 1 in time (the first axis): such a share of one image goes on."""
+    fresh = rng.normal(size=shape)
+    errors = fresh.copy()
+    for k in range(1, len(errors)):
+        errors[k] = share * errors[k - 1] + np.sqrt(1.0 - share**2) * fresh[k]
+    return errors
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7])
+def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share: float) -> None:
+    rng = np.random.default_rng(0)
+    times = np.repeat(np.arange(RATE * SECONDS) / RATE, LANDMARKS)
+    landmarks = np.tile(np.arange(LANDMARKS), RATE * SECONDS)
+    errors = alike(rng, (RATE * SECONDS, LANDMARKS, 2), share).reshape(-1, 2)
+    first, last = rng.normal(size=(2, LANDMARKS, 2, 3))
+    gone = (times / SECONDS)[:, None, None]
+    own = (1.0 - gone) * first[landmarks] + gone * last[landmarks]
+    # What is left of the errors, the landmarks estimated.
+    left = np.empty_like(errors)
+    for landmark in range(LANDMARKS):
+        of = landmarks == landmark
+        rows = own[of].reshape(-1, 3)
+        fit = np.linalg.lstsq(rows, errors[of].ravel(), rcond=None)[0]
+        left[of] = errors[of] - (rows @ fit).reshape(-1, 2)
+    pull = pull_at_landmarks(
+        np.concatenate([own, left[..., None]], axis=2), landmarks, times, np.zeros(LANDMARKS)
+    )
+    assert pull.found / pull.expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)
+
+
+def test_few_seconds_are_not_believed() -> None:
+    assert Pull(0.0, 0.0).inflation(1.3) == pytest.approx(1.3)
+    assert Pull(10.0, 2.0).inflation(1.3) < 0.6 * 5.0
+    assert Pull(500.0, 100.0).inflation(1.3) == pytest.approx(5.0, rel=0.05)
+    assert Pull(50.0, 100.0).inflation(1.3) == 1.3
+
+
+def surveyed(share: float) -> Survey:
+    """Five markers of 0.15 m, 5 s, 0.1 px."""
+    rng = np.random.default_rng(1)
+    poses, stamps = ring(rng, 5, 0.15), np.arange(0.0, 5.0, 1.0 / 30.0)
+    exact = spot(np.random.default_rng(2), poses, 0.15, stamps, 0.0)
+    errors = 0.1 * alike(rng, (len(stamps), 5, 4, 2), share)
+    seen = [
+        replace(one, quads=one.quads + of[one.markers])
+        for one, of in zip(exact, errors, strict=True)
+    ]
+    return survey(camera(), seen, every_marker([family("4x4_50")], 0.15, {}))
+
+
+def test_a_survey_knows_less_when_errors_are_alike() -> None:
+    independent, much = surveyed(0.0), surveyed(0.8)
+    assert 1.0 < independent.fit.inflation < 2.2
+    assert much.fit.inflation > 2.5 * independent.fit.inflation
+    ratio = much.deviations_of_shape / independent.deviations_of_shape
+    assert np.all(ratio > 1.3)
