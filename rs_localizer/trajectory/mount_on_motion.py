@@ -104,6 +104,8 @@ def mount_on_motion(
 
 def _calmed(samples: GyroSamples) -> GyroSamples:
     """Averaged over a moment: vibration, which no image shows, would be most of the rates."""
+    if len(samples.times) < 2:
+        return samples
     turned = cumulative_trapezoid(samples.rates, samples.times, axis=0, initial=0.0)
     ends = np.clip(
         samples.times + np.array([[-0.5], [0.5]]) * _CALMED, samples.times[0], samples.times[-1]

@@ -204,6 +204,8 @@ def test_another_ones_turns_are_no_mount() -> None:
     stamps = felt.stamps(SECONDS)
     with pytest.raises(NoMount, match="are not the camera's"):
         mount_on_motion(GyroSamples(stamps, other.rates(stamps)), felt.spline(SECONDS))
+    with pytest.raises(NoMount, match="0 samples"):
+        mount_on_motion(GyroSamples(np.zeros(0), np.zeros((0, 3))), felt.spline(SECONDS))
 
 
 def test_gaps_are_left_out() -> None:
