@@ -83,8 +83,8 @@ class ImageClock:
         source = own if self.rate is None else f"--rate {self.rate:g}"
         own_rate = self.own_rate
         pace = f", {own_rate:.4g} images/s on average" if own_rate and self.rate is None else ""
-        start = (self.start_ns or 0) * 1e-9
-        return f"times: {source}{pace}; the first image at {start:.9g} s (--start sets it)"
+        start = round((self.start_ns or 0) * 1e-9, 3)
+        return f"times: {source}{pace}; the first image at {start:.14g} s (--start sets it)"
 
     def fault(self) -> str | None:
         """What speaks against a given rate."""

@@ -36,7 +36,7 @@ def read_imu_csv(path: Path) -> ImuReadings:
         ImuFileError: for a file that cannot be read, or is another one, with the line.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
         raise ImuFileError(f"{path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -54,7 +54,8 @@ def read_imu_csv(path: Path) -> ImuReadings:
                 raise ValueError
         except ValueError:
             raise ImuFileError(
-                f"{path}, line {number}: must be {_COLUMNS}; got {line[:60]!r}"
+                f"{path}, line {number}: must be {_COLUMNS} (headings begin with #); got "
+                f"{line[:60]!r}"
             ) from None
         stamps.append(stamp)
         values.append(numbers)

@@ -22,7 +22,12 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.mapping.anchors import Anchors, Placement, place
 from rs_localizer.mapping.errors import MappingError
 from rs_localizer.mapping.following import follow
-from rs_localizer.mapping.inertial_placing import GivenImu, InertialPlace, place_by_imu
+from rs_localizer.mapping.inertial_placing import (
+    GivenImu,
+    InertialPlace,
+    place_by_imu,
+    refuse_early,
+)
 from rs_localizer.mapping.keyframes import Keyframes, choose_keyframes
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.mapping.sightings import Sightings
@@ -138,6 +143,8 @@ def build_map(given: Given, work: Workshop) -> Built:
         ValueError: when the images make no map, saying what was found.
     """
     keyframes = _keyframes(given)
+    if given.imu is not None and not given.anchors.tell_scale:
+        refuse_early(given.imu, given.stamps_ns)
     structure = _structure(given, keyframes, work)
     descriptors = _descriptors(given.views, structure)
     first = Map(structure.points, None, descriptors, given.frame)

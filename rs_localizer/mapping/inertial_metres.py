@@ -9,7 +9,6 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
 from rs_localizer.mapping.refine import RefinedMap
-from rs_localizer.trajectory.blocks import disagreement
 from rs_localizer.trajectory.gyro import NoMount
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.mean_accelerations import Means, mean_accelerations
@@ -30,6 +29,8 @@ _MOST_TURN = np.radians(2.0)
 _LEAST_SECONDS, _LEAST_COVERED = 3.0, 0.5
 # A rotation that TF has otherwise by more than this (rad), and more than chance, is doubted.
 _DOUBTED, _SIGMAS = np.radians(2.0), 4.0
+
+NO_FORCES = "the IMU has no accelerometer (its messages hold no linear_acceleration)"
 
 
 class NoMetres(ValueError):
@@ -89,7 +90,7 @@ def inertial_metres(refined: RefinedMap, imu: ImuRecording) -> InertialMetres:
         NoMetres: when IMU and camera do not go together, or nothing can be told, with the reason.
     """
     if imu.specific_forces is None:
-        raise NoMetres("the IMU has no accelerometer (its messages hold no linear_acceleration)")
+        raise NoMetres(NO_FORCES)
     mount, turned = _mount(refined, imu)
     samples = imu.forces(refined.start_ns, mount.mount.delay)
     spacing = max(_SPACING, _IMAGES * float(np.median(np.diff(refined.times))))
@@ -99,10 +100,8 @@ def inertial_metres(refined: RefinedMap, imu: ImuRecording) -> InertialMetres:
         found = metric(means, _lever(imu))
     except NoMetric as error:
         raise NoMetres(str(error)) from error
-    parts = np.array(found.parts)
-    inflation = disagreement(parts[:, 0], parts[:, 0] * parts[:, 1])
     covered = found.means * spacing / _length(refined)
-    return InertialMetres(found, mount, inflation * found.share, turned, covered)
+    return InertialMetres(found, mount, found.inflation * found.share, turned, covered)
 
 
 def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[MountOnMotion, float | None]:
@@ -111,7 +110,8 @@ def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[MountOnMotion, float
     try:
         found = mount_on_motion(imu.samples(refined.start_ns), refined.spline, given)
     except NoMount as error:
-        raise NoMetres(f"{error}{_elsewhen(refined, imu)}") from error
+        ends = refined.start_ns * 1e-9 + refined.times[[0, -1]]
+        raise NoMetres(elsewhen(imu, *ends.tolist()) or str(error)) from error
     if found.turn_deviation > _MOST_TURN:
         if given is None:
             raise NoMetres(
@@ -126,15 +126,14 @@ def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[MountOnMotion, float
     return found, float(np.linalg.norm(so3.log(between)))
 
 
-def _elsewhen(refined: RefinedMap, imu: ImuRecording) -> str:
-    """Whether the stamps of images and IMU are of different times."""
-    ends = refined.start_ns * 1e-9 + refined.times[[0, -1]]
-    first, last = 1e-9 * imu.stamps_ns.min(), 1e-9 * imu.stamps_ns.max()
-    if first < ends[1] and last > ends[0]:
+def elsewhen(imu: ImuRecording, first: float, last: float) -> str:
+    """What is to be said where an IMU was not read from ``first`` to ``last`` (s), else nothing."""
+    begin, end = 1e-9 * imu.stamps_ns.min(), 1e-9 * imu.stamps_ns.max()
+    if begin < last and end > first:
         return ""
     return (
-        f"; its stamps are {first:.3f} to {last:.3f} s, those of the images {ends[0]:.3f} to "
-        f"{ends[1]:.3f} s"
+        f"its stamps are {begin:.3f} to {end:.3f} s, those of the images {first:.3f} to {last:.3f} "
+        "s: they must be by one clock"
     )
 
 

@@ -6,10 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.mapping.anchors import Placement
 from rs_localizer.mapping.errors import MappingError
-from rs_localizer.mapping.inertial_metres import InertialMetres, NoMetres, inertial_metres
+from rs_localizer.mapping.inertial_metres import (
+    NO_FORCES,
+    InertialMetres,
+    NoMetres,
+    elsewhen,
+    inertial_metres,
+)
 from rs_localizer.mapping.refine import RefinedMap
 from rs_localizer.mapping.similarity import Similarity, upright
 from rs_localizer.trajectory.imu import ImuRecording
@@ -57,6 +63,23 @@ class InertialPlace:
         assert self.metres is not None
         down = self.placement.similarity.rotation @ self.metres.metric.gravity
         return float(np.arctan2(np.hypot(down[0], down[1]), -down[2]))
+
+
+def refuse_early(imu: GivenImu, stamps_ns: IntArray) -> None:
+    """Before minutes of work: an IMU that has to give the scale, and plainly cannot.
+
+    Args:
+        stamps_ns: (n,) of the images.
+
+    Raises:
+        MappingError: when it has to, and was read at another time or without an accelerometer.
+    """
+    first, last = 1e-9 * stamps_ns.min(), 1e-9 * stamps_ns.max()
+    fault = elsewhen(imu.recording, first, last)
+    if imu.recording.specific_forces is None:
+        fault = NO_FORCES
+    if imu.asked and fault:
+        raise MappingError(f"the IMU gives no scale: {fault}")
 
 
 def place_by_imu(placement: Placement, refined: RefinedMap, imu: GivenImu | None) -> InertialPlace:

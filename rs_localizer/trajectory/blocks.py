@@ -96,3 +96,20 @@ def disagreement(values: Array, deviations: Array) -> float:
     # What the blocks disagree in is not their noise: none of them is better than the others.
     scatter = np.std(values, ddof=1) / math.sqrt(len(values))
     return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
+
+
+def excess(values: Array, deviations: Array) -> float:
+    """By how much the deviation of the weighted mean of values (b,) is too small, as they scatter
+    more than by their deviations (b,); 1 if that may be chance.
+
+    Blocks may be known very differently well; all are taken to differ by the same on top
+    (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 1986).
+    """
+    weights = deviations**-2.0
+    total, squares = float(np.sum(weights)), float(np.sum(weights**2))
+    mean = np.sum(weights * values) / total
+    squared, freedoms = float(np.sum(weights * (values - mean) ** 2)), len(values) - 1
+    if freedoms < 1 or chi2.sf(squared, freedoms) > _DISAGREEMENT:
+        return 1.0
+    own = max(squared - freedoms, 0.0) / (total - squares / total)
+    return math.sqrt(1.0 + own * squares / total)

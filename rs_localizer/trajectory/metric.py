@@ -24,6 +24,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
+from rs_localizer.trajectory.blocks import excess
 from rs_localizer.trajectory.mean_accelerations import Means
 from rs_localizer.trajectory.metric_equations import (
     BIAS,
@@ -49,6 +50,9 @@ _OUTLIER = 15.0
 _BEND = 5e-4
 # Rounding leaves at least this share of squares, and a camera at rest has none.
 _EXACT, _NOTHING = 1e-12, 1e-30
+# A part whose scale is known so many times worse than the best one's hardly moved, and is not asked
+# whether it agrees: it shows the noise of what it is compared with.
+_RESTING = 7.0
 # So much of the accelerations that images show must be the accelerometer's.
 _LEAST_EXPLAINED = 0.5
 
@@ -73,7 +77,7 @@ class Metric:
     lever: Array  # (3,) m, of the IMU in the camera's axes
     force: float  # scale of the forces' own by that of gravity
     explained: float  # share of the accelerations that camera and IMU have in common
-    parts: tuple[tuple[float, float], ...]  # scale and deviation (share) of parts on their own
+    inflation: float  # of the scale's deviation, because parts disagree; 1: they do not
     means: int  # number of mean accelerations
 
 
@@ -124,11 +128,7 @@ def metric(means: Sequence[Means], lever: Lever) -> Metric:
         lever=fit.found[LEVER] / inverse,
         force=float(fit.found[FORCE]) / inverse,
         explained=fit.explained,
-        parts=tuple(
-            _part(part, chosen, fit)
-            for part, chosen in zip(means, kept, strict=True)
-            if np.any(chosen)
-        ),
+        inflation=_inflation(means, kept, fit),
         means=int(sum(map(np.count_nonzero, kept))),
     )
 
@@ -208,10 +208,27 @@ def _known(inverse: float, down: Array, lever: Lever) -> tuple[Array, Array]:
     return rows, np.zeros(8)
 
 
+def _inflation(means: Sequence[Means], kept: Sequence[BoolArray], fit: _Fitted) -> float:
+    parts = [
+        _part(part, chosen, fit) for part, chosen in zip(means, kept, strict=True) if np.any(chosen)
+    ]
+    values, deviations = np.array(parts).T
+    moved = deviations < _RESTING * deviations.min()
+    return excess(values[moved], deviations[moved])
+
+
 def _part(part: Means, kept: BoolArray, fit: _Fitted) -> tuple[float, float]:
-    """The scale of a part with gravity, bias and lever of the whole, and its deviation (share)."""
+    """1 / scale of a part, with gravity, bias and lever of the whole, by that of the whole.
+
+    In the deviation is that gravity, bias and lever are not known exactly: where the camera rests,
+    their errors are all that looks like an acceleration.
+    """
     alone = Whitened([part], [kept], fit.ratio)
-    metres = fit.found[:INVERSE] / fit.found[INVERSE]  # of accelerations in m/s^2
-    weight = float(metres @ alone.normal @ metres)
-    inverse = float(metres @ alone.right) / weight
-    return 1.0 / inverse, float(np.sqrt(fit.variance / weight) / abs(inverse))
+    whole = fit.found[:INVERSE]
+    slope = alone.normal @ whole
+    weight = max(float(whole @ slope), _NOTHING)
+    across = fit.covariance[:INVERSE, INVERSE]
+    others = fit.covariance[:INVERSE, :INVERSE]
+    others = others - np.outer(across, across) / fit.covariance[INVERSE, INVERSE]
+    variance = fit.variance / weight + float(slope @ others @ slope) / weight**2
+    return float(whole @ alone.right) / weight, float(np.sqrt(variance))

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
@@ -26,11 +27,14 @@ from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
 from rs_localizer.trajectory.gyro_terms import by_shape
 from rs_localizer.trajectory.spline import Layout, Spline
 
-# Turns are taken over so long (s): short beside the motion, long beside the images' noise.
-_WHILE = 0.15
+# Turns are taken over about so long (s): short beside the motion, long beside the images' noise.
+_WHILE, _UNEVEN = 0.15, 0.05
 # Turns with a longer step between samples (s) in them, or nearer to the motion's ends, are none.
 _LONGEST_STEP, _MARGIN = 0.03, 0.02
+# Rates are averaged over so long (s) for a first guess: a third of a period of a hand's quickest.
+_CALMED = 0.06
 _ROUNDS = 10
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _STEP = 1e-3  # s, of the derivative by the delay
 # Squared errors of three axes count up to so many times their median.
 _LIMIT = 16.0
@@ -74,16 +78,17 @@ def mount_on_motion(
     Raises:
         NoMount: when there are too few samples during the motion, or they show other turns.
     """
-    start = mount = first_mount(samples, spline, given)
-    shown = _Shown(samples)
-    times = _times(spline.layout, samples.times + mount.delay)
+    calmed = _calmed(samples)
+    start = mount = first_mount(calmed, spline, given)
+    shown = _Shown(samples, calmed)
+    times, whiles = _times(spline.layout, samples.times + mount.delay)
     if len(times) < _LEAST_PARTS * _PART:
         raise NoMount(f"{_WHILE * len(times):.1f} s of the motion have samples without a gap")
-    before, after = (spline.states(times + shift).rotations for shift in (0.0, _WHILE))
+    before, after = (spline.states(ends).rotations for ends in (times, times + whiles))
     seen = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
     parts: IntArray = np.arange(len(times)) // _PART
     for _ in range(_ROUNDS):
-        errors, by_mount = _errors(shown, times, seen, mount)
+        errors, by_mount = _errors(shown, (times, whiles), seen, mount)
         squared = np.sum(np.square(errors), axis=1)
         weights = np.square(np.maximum(1.0 - squared / (_LIMIT * np.median(squared)), 0.0))
         scores = weights[:, None] * np.einsum("nij,ni->nj", by_mount, errors)
@@ -97,16 +102,46 @@ def mount_on_motion(
     return MountOnMotion(mount, inverse @ (sums.T @ sums + variance * held) @ inverse)
 
 
+def _calmed(samples: GyroSamples) -> GyroSamples:
+    """Averaged over a moment: vibration, which no image shows, would be most of the rates."""
+    if len(samples.times) < 2:
+        return samples
+    turned = cumulative_trapezoid(samples.rates, samples.times, axis=0, initial=0.0)
+    ends = np.clip(
+        samples.times + np.array([[-0.5], [0.5]]) * _CALMED, samples.times[0], samples.times[-1]
+    )
+    at = np.array([np.interp(ends, samples.times, axis) for axis in turned.T])
+    return GyroSamples(samples.times, ((at[:, 1] - at[:, 0]) / (ends[1] - ends[0])).T)
+
+
 class _Shown:
-    """Orientations by a gyroscope."""
+    """Turns by a gyroscope."""
+
+    def __init__(self, samples: GyroSamples, calmed: GyroSamples) -> None:
+        self._all, self._calm = _Turned(samples), _Turned(calmed)
+
+    def turns(self, times: Array, whiles: Array) -> Array:
+        """Rotation vectors (m,3) from times (m,) on, for whiles (m,)."""
+        return self._all.turns(times, whiles)
+
+    def changes(self, times: Array, whiles: Array) -> Array:
+        """How they change with the times (m,), rad/s, without vibration: with it, an offset would
+        be found at which the tone of a motor happens to be zero at these times.
+        """
+        ahead, behind = (self._calm.turns(times + shift, whiles) for shift in (_STEP, -_STEP))
+        return np.asarray((ahead - behind) / (2.0 * _STEP))
+
+
+class _Turned:
+    """Orientations by samples."""
 
     def __init__(self, samples: GyroSamples) -> None:
         self._times, self._rates = samples.times, np.ascontiguousarray(samples.rates)
         self._turned = rotations_at_knots(self._times, cubics_of(self._times, self._rates))
 
-    def turns(self, times: Array) -> Array:
-        """Rotation vectors (m,3) from times (m,) on, for a while."""
-        before, after = self._at(times), self._at(times + _WHILE)
+    def turns(self, times: Array, whiles: Array) -> Array:
+        """Rotation vectors (m,3) from times (m,) on, for whiles (m,)."""
+        before, after = self._at(times), self._at(times + whiles)
         return np.asarray(Rotation.from_matrix(before @ np.swapaxes(after, 1, 2)).as_rotvec())
 
     def _at(self, times: Array) -> Array:
@@ -119,30 +154,40 @@ class _Shown:
         return np.asarray(turned @ self._turned[place], np.float64)
 
 
-def _times(layout: Layout, sampled: Array) -> Array:
-    """When turns begin (m,), s: one after the other, each within a stretch and without a gap."""
+def _times(layout: Layout, sampled: Array) -> tuple[Array, Array]:
+    """When turns begin (m,), and how long they last (m,), s: one after the other, each within a
+    stretch and without a gap. Not evenly: a tone in step with them would be no noise.
+    """
     parts = [
-        np.arange(start + _MARGIN, end - _MARGIN - _WHILE, _WHILE)
+        _unevenly(np.arange(start + _MARGIN, end - _MARGIN - _UNEVEN, _WHILE))
         for start, end in zip(layout.starts, layout.ends, strict=True)
     ]
-    times = np.concatenate(parts)
+    times = np.concatenate([ends[:-1] for ends in parts])
+    whiles = np.concatenate([np.diff(ends) for ends in parts])
     first = np.searchsorted(sampled, times - _MARGIN)
-    last = np.searchsorted(sampled, times + _WHILE + _MARGIN)
+    last = np.searchsorted(sampled, times + whiles + _MARGIN)
     gaps = np.concatenate([[0], np.cumsum(np.diff(sampled) > _LONGEST_STEP)])
     inside = (first > 0) & (last < len(sampled))
     whole = gaps[first - 1] == gaps[np.minimum(last, len(gaps) - 1)]
-    return np.asarray(times[inside & whole], np.float64)
+    return times[inside & whole], whiles[inside & whole]
 
 
-def _errors(shown: _Shown, times: Array, seen: Array, mount: GyroMount) -> tuple[Array, Array]:
+def _unevenly(times: Array) -> Array:
+    """Times (n,) later by multiples of the golden section, which come back to no tone."""
+    return np.asarray(times + _UNEVEN * np.modf(_GOLDEN * np.arange(len(times)))[0])
+
+
+def _errors(
+    shown: _Shown, when: tuple[Array, Array], seen: Array, mount: GyroMount
+) -> tuple[Array, Array]:
     """What turns (m,3) of the gyroscope should be more, and its derivatives (m,3,13)."""
     turned = seen @ mount.camera_from_imu
-    here = times - mount.delay
-    errors = seen @ mount.matrix.T + _WHILE * mount.bias - shown.turns(here)
-    by_mount = np.empty((len(times), 3, MOUNT))
+    here, whiles = when[0] - mount.delay, when[1]
+    errors = seen @ mount.matrix.T + whiles[:, None] * mount.bias - shown.turns(here, whiles)
+    by_mount = np.empty((len(seen), 3, MOUNT))
     by_mount[:, :, :3] = mount.matrix @ mount.camera_from_imu @ so3.hat(turned)
-    by_mount[:, :, 3:6] = _WHILE * np.eye(3)
-    by_mount[:, :, DELAY] = (shown.turns(here + _STEP) - shown.turns(here - _STEP)) / (2.0 * _STEP)
+    by_mount[:, :, 3:6] = whiles[:, None, None] * np.eye(3)
+    by_mount[:, :, DELAY] = shown.changes(here, whiles)
     by_mount[:, :, DELAY + 1 :] = by_shape(turned)
     return errors, by_mount
 

@@ -23,6 +23,12 @@ def test_presentation_times_from_one_second_on() -> None:
     assert clock.fault() is None
 
 
+def test_a_start_by_a_clock_of_the_world_is_told_to_the_millisecond() -> None:
+    clock = ImageClock(rate=30.0, start_ns=1520531495575280000)
+    clock.relative(0)
+    assert "the first image at 1520531495.575 s" in clock.told()
+
+
 def test_a_rate_overrides_and_is_compared() -> None:
     clock = ImageClock(rate=30.0, start_ns=5 * 10**9)
     stamps = [clock.relative(ms * MS) for ms in OWN]

@@ -23,6 +23,14 @@ def test_a_file_of_euroc(tmp_path: Path) -> None:
     np.testing.assert_array_equal(forces, 2 * [[8.12, -0.3, -3.7]])
 
 
+def test_a_file_from_a_spreadsheet(tmp_path: Path) -> None:
+    """Which marks UTF-8, ends lines twice, and puts spaces."""
+    path = tmp_path / "data.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + (HEAD + LINE.replace(",", ", ")).encode())
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    assert read_imu_csv(path).stamps_ns.tolist() == [1403636579758555392]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -31,6 +39,7 @@ def test_a_file_of_euroc(tmp_path: Path) -> None:
         (LINE.replace("0.07", "nan"), "line 1"),
         (LINE.replace("1403", "99991403"), "line 1"),
         ("stamp;w\n", "line 1"),
+        ("stamp,wx,wy,wz,ax,ay,az\n" + LINE, "line 1.*headings begin with #"),
         (HEAD, "has no readings"),
     ],
 )

@@ -13,7 +13,7 @@ from scenes import SECONDS, START_NS, camera, hand, imu_of, refined_of, walk
 from rs_localizer.mapping.anchors import Placement
 from rs_localizer.mapping.errors import MappingError
 from rs_localizer.mapping.inertial_metres import NoMetres, inertial_metres
-from rs_localizer.mapping.inertial_placing import GivenImu, place_by_imu
+from rs_localizer.mapping.inertial_placing import GivenImu, place_by_imu, refuse_early
 from rs_localizer.mapping.refine import RefinedMap, refine
 from rs_localizer.mapping.similarity import Similarity
 from rs_localizer.trajectory.imu import ImuRecording
@@ -156,7 +156,7 @@ def in_degrees(imu: ImuRecording) -> ImuRecording:
     ("spoilt", "said"),
     [
         (without_accelerometer, "has no accelerometer"),
-        (by_another_clock, r"0 samples .* its stamps are -0.600 to 6.59\d s, those of the images"),
+        (by_another_clock, r"its stamps are -0.600 to 6.59\d s, those of the images .* one clock"),
         (with_gaps, r"0.0 of 6.0 s of the motion have readings"),
         (in_g, "long, gravity is 9.81 m.s.2: it seems to count in g"),
         (mirrored, "at rest it must show .g upwards"),
@@ -184,6 +184,17 @@ def test_no_map_without_a_scale_that_is_asked_for(refined: RefinedMap, imu: ImuR
     place = place_by_imu(scaled, refined, GivenImu(silent, asked=True))
     assert place.placement is scaled
     assert place.doubts[0].startswith("the IMU cannot check the scale: ")
+
+
+def test_another_clock_is_noticed_before_the_work(refined: RefinedMap, imu: ImuRecording) -> None:
+    """Unless the scale may be another's, or nobody asked."""
+    stamps = START_NS + np.round(1e9 * refined.times).astype(np.int64)
+    refuse_early(GivenImu(imu, asked=True), stamps)
+    refuse_early(GivenImu(by_another_clock(imu), asked=False), stamps)
+    with pytest.raises(MappingError, match="must be by one clock"):
+        refuse_early(GivenImu(by_another_clock(imu), asked=True), stamps)
+    with pytest.raises(MappingError, match="has no accelerometer"):
+        refuse_early(GivenImu(without_accelerometer(imu), asked=True), stamps)
 
 
 def test_gravity_that_was_taken_off(felt: Felt, refined: RefinedMap, imu: ImuRecording) -> None:

@@ -68,8 +68,13 @@ def test_an_accelerometer_that_shows_too_much_makes_nothing_larger() -> None:
 
 
 def noisy(seed: int, noise: float = 3e-3) -> tuple[Felt, Metric]:
+    felt = Felt.random(seed)
+    return felt, metric(noisy_means(felt, seed, noise), UNKNOWN)
+
+
+def noisy_means(felt: Felt, seed: int, noise: float = 3e-3) -> list[Means]:
     """Positions known to 3 mm, and orientations to 0.1 deg, for 70 ms each."""
-    felt, rng = Felt.random(seed), np.random.default_rng(1000 + seed)
+    rng = np.random.default_rng(1000 + seed)
     exact = felt.spline(SECONDS)
     layout = Layout.over(np.array([[0.0, SECONDS]]), 0.07)
     off = Spline(
@@ -86,9 +91,7 @@ def noisy(seed: int, noise: float = 3e-3) -> tuple[Felt, Metric]:
     stamps = felt.stamps(SECONDS)
     forces = felt.forces(stamps) + rng.normal(0.0, 0.03, (len(stamps), 3))
     samples = ForceSamples(stamps + felt.delay, forces)
-    parts = mean_accelerations(moved, samples, felt.camera_from_imu.as_matrix(), 0.15)
-    found = metric(parts, UNKNOWN)
-    return felt, found
+    return mean_accelerations(moved, samples, felt.camera_from_imu.as_matrix(), 0.15)
 
 
 def test_deviations_are_honest() -> None:
@@ -101,6 +104,25 @@ def test_deviations_are_honest() -> None:
     assert 0.3 < np.sqrt(np.mean(np.square(scales))) < 1.7
     assert np.max(np.abs(scales)) < 3.5
     assert np.median(tilts) < 2.0
+
+
+def growing(parts: list[Means], more: float) -> list[Means]:
+    """Parts of a map that grows on the way, by a share."""
+    sizes = 1.0 + more * np.linspace(-0.5, 0.5, len(parts))
+    return [replace(part, seen=s * part.seen) for part, s in zip(parts, sizes, strict=True)]
+
+
+def test_parts_of_other_sizes_widen_the_deviation() -> None:
+    """A map that is 4 % larger at its end; a rest of as long says nothing of sizes."""
+    felt = Felt.random(30)
+    parts = noisy_means(felt, 0)
+    assert metric(parts, UNKNOWN).inflation == 1.0
+    alone = metric(growing(parts, 0.04), UNKNOWN)
+    assert 1.5 < alone.inflation < 6.0
+    resting = noisy_means(replace(felt, way=0.0, turn=0.0), 0)
+    found = metric([*growing(parts, 0.04), *resting], UNKNOWN)
+    assert found.inflation == pytest.approx(alone.inflation, rel=0.5)
+    assert abs(found.scale / felt.scale - 1.0) < 3.0 * found.inflation * found.share < 0.06
 
 
 def test_noise_of_positions_makes_nothing_smaller() -> None:
@@ -165,11 +187,25 @@ def test_the_mount_is_found() -> None:
     assert found.turn_deviation < 5e-3
 
 
+def test_a_motor_s_tone_does_not_draw_the_offset() -> None:
+    """Of 0.5 deg, four times the hand's rates, in step with the turns that are compared."""
+    felt = Felt.random(3)
+    stamps = felt.stamps(SECONDS)
+    pulse = 2.0 * np.pi * 9.5 / 0.15
+    tone = np.radians(0.5) * pulse * np.cos(pulse * stamps)
+    samples = GyroSamples(stamps, felt.rates(stamps) + np.outer(tone, [0.5, 0.7, 0.5]))
+    found = mount_on_motion(samples, felt.spline(SECONDS))
+    assert found.mount.delay == pytest.approx(felt.delay, abs=3e-4)
+    assert abs(found.mount.delay - felt.delay) < 3.0 * found.delay_deviation
+
+
 def test_another_ones_turns_are_no_mount() -> None:
     felt, other = Felt.random(4), Felt.random(5)
     stamps = felt.stamps(SECONDS)
     with pytest.raises(NoMount, match="are not the camera's"):
         mount_on_motion(GyroSamples(stamps, other.rates(stamps)), felt.spline(SECONDS))
+    with pytest.raises(NoMount, match="0 samples"):
+        mount_on_motion(GyroSamples(np.zeros(0), np.zeros((0, 3))), felt.spline(SECONDS))
 
 
 def test_gaps_are_left_out() -> None:
