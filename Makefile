@@ -33,10 +33,10 @@ demo: $(ready)
 	@$(python) -m rs_localizer demo --out $(OUT)
 
 # Kernels that two processes compile at once may round differently, and tests compare bits. Of
-# three processes one often waits, for nodes that have to hear of each other.
+# four processes one or two often wait, for nodes that have to hear of each other.
 test: $(ready)
 	@$(MAKE) --no-print-directory --jobs 2 lint warm
-	@$(python) -m pytest -q -n 3 --dist loadfile
+	@$(python) -m pytest -q -n 4 --dist loadfile
 
 warm: $(ready)
 	@$(python) -m rs_localizer warm >/dev/null

@@ -18,7 +18,14 @@ from rs_localizer.lab.experiments.table import EXPERIMENTS
 
 TRIALS = 300
 # Of many conditions; what they measure is held by tests of their own.
-FEW = {"honesty": 3, "inertial": 10, "augmented-reality": 200, "motion": 200, "readout-time": 200}
+FEW = {
+    "honesty": 2,
+    "inertial": 10,
+    "augmented-reality": 200,
+    "motion": 200,
+    "readout-time": 100,
+    "tracking": 400,
+}
 
 HELD = {
     "motion.r6p_vcwt_equals_r6p",
