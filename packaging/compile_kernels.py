@@ -1,10 +1,11 @@
 """Compiles the kernels for kinds of CPUs into the package, for a wheel whose users do not wait.
 
-    python packaging/compile_kernels.py [--cpu x86-64-v3] ...
+    python packaging/compile_kernels.py [--cpu x86-64-v3] ... [--solver r6p_vcwt] ...
 
 Run it in an environment that has the libraries of the package, in the versions for which the wheel
 is: the code is Python's (3.11 or 3.12) and Numba's (to the last digit), and setup.py then says so.
 The package itself is taken from this tree. Without --cpu: for all kinds that this machine can be.
+With --solver: only what nodes with it need; all else is compiled by who uses it.
 """
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ def run(arguments: list[str], **environment: str) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cpu", action="append", help="x86-64-v3, x86-64-v4; may be repeated")
-    given = parser.parse_args().cpu
+    parser.add_argument("--solver", action="append", default=[], help="as of rs_localizer warm")
+    arguments = parser.parse_args()
+    given = arguments.cpu
+    solvers = [word for name in arguments.solver for word in ("--solver", name)]
     about = json.loads(run(["-c", _ABOUT]))
     wanted = given or about["cpus"]
     if not wanted or not set(wanted) <= set(about["cpus"]):
@@ -64,7 +68,7 @@ def main() -> int:
         # No features beside the name: Numba would add those of this machine. Its names of symbols
         # follow the order of sets.
         target = {"NUMBA_CPU_NAME": cpu, "NUMBA_CPU_FEATURES": "", "PYTHONHASHSEED": "0"}
-        run(["-m", "rs_localizer", "warm"], **target, NUMBA_CACHE_DIR=str(folder))
+        run(["-m", "rs_localizer", "warm", *solvers], **target, NUMBA_CACHE_DIR=str(folder))
     (folder / "about.json").write_text(json.dumps(about | {"cpus": wanted}) + "\n")
     size = sum(path.stat().st_size for path in folder.rglob("*.nb?"))
     print(f"{folder}: kernels for {' and '.join(wanted)}, {size / 1e6:.0f} MB")

@@ -78,7 +78,7 @@ def test_a_global_shutter_is_one() -> None:
 
 
 def test_a_camera_at_rest_determines_nothing() -> None:
-    found = calibrate(CAMERA, list(recording(0.02, turn=1e-5)))
+    found = calibrate(CAMERA, list(recording(0.02, turn=1e-5, seconds=1.2)))
     assert not found.determined
     assert "not observable" in verdict.refusal(found)
 

@@ -16,14 +16,13 @@ from rs_localizer import data
 from rs_localizer.lab.experiments.results import Context, Result, Verdict
 from rs_localizer.lab.experiments.table import EXPERIMENTS
 
-TRIALS = 300
+TRIALS = 200
 # Of many conditions; what they measure is held by tests of their own.
 FEW = {
     "honesty": 2,
     "inertial": 10,
-    "augmented-reality": 200,
-    "motion": 200,
     "readout-time": 100,
+    "robustness": 300,
     "tracking": 400,
 }
 
