@@ -22,6 +22,8 @@ _PATIENCE, _PERIOD = 60.0, 1.0
 # How often in a row all tasks may be given out without a single outcome.
 _ROUNDS = 5
 _CONNECT_TIMEOUT = 5.0
+# How often it is looked whether a task has ended, in s.
+_LOOK_PERIOD = 0.02
 
 
 class ClusterError(ValueError):
@@ -54,21 +56,22 @@ def perform_all(tasks: Sequence[Task], where: Where) -> Generator[Outcome, None,
     _silence()
     left = {task.name: task for task in tasks}
     patience, idle = 0.0, 0
-    with _cluster(where, len(tasks)) as cluster:
-        while left:
-            before = len(left)
-            try:
+    while left:
+        before = len(left)
+        try:
+            with _cluster(where, before) as cluster:
                 yield from _all_done(left, cluster, patience)
-            except ClusterError as error:
-                if not patience:
-                    raise
-                yield from _given_up(left, str(error))
-                return
-            # What is left was lost on its way, or with the scheduler: who has done it, tells again.
-            patience, idle = _PATIENCE, idle + 1 if len(left) == before else 0
-            if idle == _ROUNDS:
-                yield from _given_up(left, "the scheduler never answers with its result")
-                return
+        except ClusterError as error:
+            if not patience:
+                raise
+            yield from _given_up(left, str(error))
+            return
+        # What is left was lost on its way, with the scheduler, or because no worker of this
+        # machine was left: who has done it, tells again.
+        patience, idle = _PATIENCE, idle + 1 if len(left) == before else 0
+        if idle == _ROUNDS:
+            yield from _given_up(left, "the scheduler never answers with its result")
+            return
 
 
 def _given_up(left: Iterable[str], reason: str) -> Iterator[Outcome]:
@@ -97,13 +100,11 @@ def _check_address(address: str) -> None:
 
 def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Iterator[Outcome]:
     """The outcomes of tasks, each of which is taken out of ``left``; some may be lost."""
-    from distributed import as_completed
-
     with _client(cluster, patience) as client:
         # Not by what they are: a result that has been removed meanwhile would be taken as done.
         tasks = list(left.values())
         futures = dict(zip(client.map(perform, tasks, pure=False), tasks, strict=True))
-        for future in as_completed(futures, loop=client.loop):
+        for future in _as_they_end(list(futures), client, cluster):
             task = futures.pop(future)
             try:
                 outcome = _outcome(task, future)
@@ -111,6 +112,34 @@ def _all_done(left: dict[str, Task], cluster: Any, patience: float = 0.0) -> Ite
                 continue
             del left[task.name]
             yield outcome
+
+
+def _as_they_end(futures: Sequence[Any], client: Any, cluster: Any) -> Iterator[Any]:
+    """Futures that have ended, however; no more once no worker of this machine is left.
+
+    Dask starts a worker again that has died, but gives it up if it takes too long to come.
+    """
+    from distributed import as_completed
+
+    ended, left = as_completed(futures, loop=client.loop), len(futures)
+    while left:
+        batch = ended.next_batch(block=False)
+        left -= len(batch)
+        yield from batch
+        if not batch:
+            if _deserted(cluster):
+                return
+            time.sleep(_LOOK_PERIOD)
+
+
+def _deserted(cluster: Any) -> bool:
+    """Whether all workers of this machine have been given up; those of a scheduler are its own."""
+    from distributed import LocalCluster, Status
+
+    if not isinstance(cluster, LocalCluster):
+        return False
+    given_up = (Status.closing, Status.closed, Status.failed)
+    return all(nanny.status in given_up for nanny in list(cluster.workers.values()))
 
 
 def _silence() -> None:

@@ -9,7 +9,10 @@ import sys
 import threading
 import time
 from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -60,6 +63,32 @@ def test_a_recording_whose_worker_is_killed_is_done_by_another(tmp_path: Path) -
     check(done, tmp_path / "out", {"deadly"})
     (reason,) = [outcome.reason for outcome in done if outcome.name == "deadly"]
     assert reason == "every worker process that took it died (out of memory, or killed)"
+
+
+def test_workers_that_dask_gives_up_are_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a machine that is too slow to start them again: nobody would do what is left."""
+    made, local = [], cluster._local
+
+    @contextmanager
+    def seen(workers: int) -> Iterator[Any]:
+        with local(workers) as found:
+            made.append(found)
+            yield found
+
+    monkeypatch.setattr(cluster, "_local", seen)
+    with subprocess.Popen(["sleep", "60"]) as victim:  # the second one takes a while
+        given = tasks(tmp_path, first="", second=str(victim.pid), third="")
+        outcomes = perform_all(given, Where(workers=1))
+        done = [next(outcomes)]
+        victim.wait()
+    for nanny in made[0].workers.values():
+        made[0].sync(nanny.close)
+    done += outcomes
+    assert len(made) == 2
+    assert sorted(outcome.name for outcome in done) == ["first", "second", "third"]
+    check(done, tmp_path / "out", set())
 
 
 class Cluster:
