@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import PARAMETERS, at_rest, depths, step_between
+from rs_localizer.core.state import PARAMETERS, TURN, at_rest, depths, step_between
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
-from rs_localizer.estimation.curvature import along_arcs
+from rs_localizer.estimation.curvature import along_arcs, told_from
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
@@ -148,8 +148,8 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     state = apply_step(modes[best].state, mean)
     offsets = steps - mean
     covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
-    for probability, mode in zip(possible, modes, strict=True):
-        covariance += probability * mode.covariance
+    for probability, mode, offset in zip(possible, modes, offsets, strict=True):
+        covariance += probability * told_from(mode.covariance, offset[TURN])
     # Shaking that was not seen may be there all the same, unless the camera rests.
     joint = (1.0 - possible @ at_rest) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
