@@ -74,9 +74,9 @@ def test_a_global_shutter_stays_one(messages, p3p, name: str) -> None:
             or velocities @ np.linalg.solve(twist.covariance, velocities) < REGION
         )
     found = f"jitter {median:.3f} and {most:.3f} deg, {np.mean(still):.1%} insignificant"
-    # What a tracker knows of the real motion it expects within the image, where a global shutter
-    # has none: a wrong readout time is not for the pose to mend, the node's watch names it.
-    allowed, least = (1.6, 0.8) if "tracked" in name else (1.1, 0.93)
+    # Who remembers finds out that map and lens are a little off, and which readout time is wrong,
+    # that after a second or two. Frames that stand alone are wrong now and then.
+    allowed = {"default": 1.001, "20 ms, tracked": 1.05, "20 ms, single": 1.08}[name]
     assert median <= allowed * p3p[0], found
     assert most <= allowed * p3p[1], found
-    assert np.mean(still) >= least, found
+    assert np.mean(still) >= (0.93 if name == "20 ms, single" else 0.99), found

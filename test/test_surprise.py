@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.tracking import _followed, _surprise, _Track
 
@@ -82,7 +83,7 @@ def followed(times_deviation, tracked=True, jolts=1.0):
     step = times_deviation * np.sqrt(18.0) * np.linalg.cholesky(spread)[:, 0]
     found = replace(at(step, 0.01 * spread), tracked=tracked,
                     inliers=np.array([True, False, False, False, False]))  # fmt: skip
-    track = _Track(first, 0, 1.0, np.array([1.0, 1.0]), np.array([2.0, 0.0, 1.0]), jolts)
+    track = _Track(first, 0, 1.0, Experience.of(first), jolts)
     return _followed(track, predicted(spread), found, 5)
 
 
@@ -95,22 +96,10 @@ def test_surprises_raise_what_is_expected_and_calm_lowers_it():
     assert followed(100.0, jolts=9e3).jolts == 1e4
 
 
-def test_what_frames_say_of_sizes_adds_up_and_fades():
-    track = followed(1.0)
-    np.testing.assert_allclose(track.of_shake_sizes, 0.95 * np.ones(2) + 0.3 * np.array([0.0, 2.0]))
-    np.testing.assert_allclose(
-        track.of_field_sizes, 0.95 * np.array([2.0, 0.0, 1.0]) + 0.3 * np.array([0.0, -1.0, 4.0])
-    )
-    # A constant message settles at six times itself: 0.3 / (1 - 0.95).
-    for _ in range(400):
-        track = _followed(track, predicted(covariance(np.random.default_rng(2))), track.estimate, 9)
-    np.testing.assert_allclose(track.of_shake_sizes, [0.0, 12.0], atol=1e-6)
-
-
 def test_a_first_frame_is_taken_as_it_is():
     found = at(np.zeros(18), np.eye(18))
     track = _followed(None, None, found, 7)
-    np.testing.assert_array_equal(track.of_field_sizes, found.of_field_sizes)
+    np.testing.assert_array_equal(track.experience.of_field_sizes, found.of_field_sizes)
     assert (track.time_ns, track.share, track.jolts) == (7, 1.0, 1.0)
 
 

@@ -27,6 +27,8 @@ _SHARE = 300
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
+# Of the setting: from here on frames that stand alone are better than tracked ones.
+_FAR_OFF = 0.5
 
 
 class ReadoutWatch:
@@ -46,6 +48,10 @@ class ReadoutWatch:
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
         self.fault = ""  # how that contradicts the setting, in one sentence
+        # Whether the setting is wrong by so much that what the camera does from frame to frame
+        # says nothing of what it does within them: a global shutter, or a reversed one. Once it
+        # was, doubts are not enough.
+        self.far_off = False
 
     def warm_up(self, camera: Camera) -> None:
         """Compile what frames of this camera need."""
@@ -56,7 +62,7 @@ class ReadoutWatch:
         self._monitor.reset()
         self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
-        self._said, self.measured, self.fault = False, None, ""
+        self._said, self.measured, self.fault, self.far_off = False, None, "", False
 
     def add(
         self,
@@ -87,6 +93,8 @@ class ReadoutWatch:
         if estimates:
             return self._adopt(config, found)
         self.fault = _fault(config, found) if found.contradicts(config.readout_time) else ""
+        may_be = found.readout_time < _FAR_OFF * config.readout_time
+        self.far_off = may_be and (self.far_off or bool(self.fault))
         if self.fault and not self._said:
             self._said = True
             self._notice(Notice.READOUT_TIME, self.fault)
