@@ -240,7 +240,8 @@ def _surprise(prior: Prior, found: Estimate) -> float:
     """How many times farther than predicted the motion has changed, squared; 1 is as predicted.
 
     The squared step from the prediction to the estimate, in standard deviations of the prediction,
-    is expected to be what the points decide of the parameters.
+    is expected to be what the points decide of the parameters. Errors of map and lens make a step
+    larger, and its covariance larger than the prediction's: by at least that much.
     """
     assert prior.motion is not None
     assert prior.covariance is not None
@@ -250,5 +251,5 @@ def _surprise(prior: Prior, found: Estimate) -> float:
     motion = found.beside_turn()
     step = step_between(state_in(prior.motion, np.zeros(3)), state_in(motion, np.zeros(3)))
     posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
-    expected = PARAMETERS - float(np.sum(information * posterior))
+    expected = abs(PARAMETERS - float(np.sum(information * posterior)))
     return float(step @ information @ step) / max(expected, 1.0)

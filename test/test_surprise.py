@@ -40,22 +40,28 @@ def predicted(spread):
     return Prior(motion=still, covariance=spread)
 
 
-def surprises(times, seen=slice(0, 18), frames=400):
-    """Of motions that change ``times`` as much as predicted, of which part is measured."""
+def surprises(times, seen=slice(0, 18), frames=400, field=0.0):
+    """Of motions that change ``times`` as much as predicted, of which part is measured.
+
+    ``field``: error of a map, as many times the prediction's deviations, that the gain ignores.
+    """
     rng = np.random.default_rng(0)
     # Small steps: what is not linear in them is left out of the filter here.
     prior, noise = (covariance(rng, size) for size in (1e-2, 5e-3))
     measured = np.eye(18)[seen]
     gain = prior @ measured.T @ np.linalg.inv(measured @ (prior + noise) @ measured.T)
-    posterior = prior - gain @ measured @ prior
+    off = field**2 * prior
+    posterior = prior - gain @ measured @ prior + gain @ measured @ off @ measured.T @ gain.T
     # Shaking behind the motion is none of its business.
     joint = np.eye(24)
     joint[:18, :18] = posterior
     found = []
     for _ in range(frames):
         truth = times * rng.multivariate_normal(np.zeros(18), prior)
-        look = measured @ (truth + rng.multivariate_normal(np.zeros(18), noise))
-        found.append(_surprise(predicted(prior), at(gain @ look, joint)))
+        error = rng.multivariate_normal(np.zeros(18), noise)
+        if field:
+            error += rng.multivariate_normal(np.zeros(18), off)
+        found.append(_surprise(predicted(prior), at(gain @ measured @ (truth + error), joint)))
     return np.array(found)
 
 
@@ -68,6 +74,11 @@ def test_larger_changes_surprise_by_their_square():
     calm, wild = (np.mean(surprises(times)) for times in (1.0, 5.0))
     assert 0.7 * 25 < wild / calm < 25
     assert np.mean(surprises(0.0)) < 0.5
+
+
+@pytest.mark.parametrize("field", [2.0, 5.0, 20.0])
+def test_a_map_that_is_off_hardly_surprises(field):
+    assert 0.9 < np.mean(surprises(1.0, field=field)) < 2.5
 
 
 def test_a_frame_that_decides_nothing_does_not_surprise():
