@@ -31,16 +31,16 @@ def messages():
 
 
 def replayed(messages, **settings):
-    """What the node would publish: every frame has a pose."""
-    localizer = FrameLocalizer(NodeConfig(**settings))
-    frames = []
+    """What the node would publish, a pose of every frame, and what it would say."""
+    frames, notices = [], []
+    localizer = FrameLocalizer(NodeConfig(**settings), lambda _, text: notices.append(text))
     for topic, _, message in messages:
         if topic == "/camera/camera_info":
             localizer.calibrate(read_camera_info(message))
         else:
             frames.append(localizer.localize(message))
     assert all(frames)
-    return frames
+    return frames, notices
 
 
 def jitter(frames) -> tuple[float, float]:
@@ -54,7 +54,7 @@ def jitter(frames) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def p3p(messages):
-    return jitter(replayed(messages, solver="p3p"))
+    return jitter(replayed(messages, solver="p3p")[0])
 
 
 def test_p3p_is_what_it_was(p3p) -> None:
@@ -63,7 +63,8 @@ def test_p3p_is_what_it_was(p3p) -> None:
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_global_shutter_stays_one(messages, p3p, name: str) -> None:
-    frames = replayed(messages, **SETTINGS[name])
+    frames, notices = replayed(messages, **SETTINGS[name])
+    assert any("as of a global shutter" in text for text in notices) == ("20 ms" in name)
     median, most = jitter(frames)
     still = []
     for frame in frames:
