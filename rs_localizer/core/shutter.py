@@ -25,6 +25,9 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 
+Numbers = tuple[Array, Array, Array, Array, Array, Array]
+"""The fields of a :class:`Motion`, in their order, as kernels take them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
@@ -37,6 +40,24 @@ class Motion:
     # (3,) rad and m per readout squared, in camera axes at tau = 0
     angular_acceleration: Array = field(default_factory=lambda: np.zeros(3), kw_only=True)
     linear_acceleration: Array = field(default_factory=lambda: np.zeros(3), kw_only=True)
+
+    @staticmethod
+    def of(numbers: Numbers) -> Motion:
+        """The motion of these numbers."""
+        *velocities, change, acceleration = numbers
+        return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
+
+    @property
+    def numbers(self) -> Numbers:
+        """What kernels take."""
+        return (
+            np.ascontiguousarray(self.rotation, np.float64),
+            np.ascontiguousarray(self.translation, np.float64),
+            np.ascontiguousarray(self.angular_velocity, np.float64),
+            np.ascontiguousarray(self.linear_velocity, np.float64),
+            np.ascontiguousarray(self.angular_acceleration, np.float64),
+            np.ascontiguousarray(self.linear_acceleration, np.float64),
+        )
 
     def at(self, tau: float) -> tuple[Array, Array]:
         """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""

@@ -96,7 +96,6 @@ class GyroscopeAid:
         span_of(times, 0, 1)
         warm_up()
         within.known.at(0.0)
-        within.known.late(0.0)
         contradicts(np.zeros(3), within.known.error[:3, :3])
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         identity = np.eye(PARAMETERS)

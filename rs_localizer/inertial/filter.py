@@ -11,7 +11,7 @@ update of the whole filter: given the motion, the image says nothing more of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,6 +66,8 @@ class GyroscopeFilter:
 
     def __init__(self, settings: InertialSettings) -> None:
         self._settings = settings
+        offset_walk = OFFSET_WALK if settings.estimate_time_offset else 0.0
+        self._walks = np.square([*3 * [settings.gyroscope_bias_walk], offset_walk])  # per s
         self.reset()
 
     def reset(self, time_offset: float = 0.0, deviation: float | None = None) -> None:
@@ -99,10 +101,9 @@ class GyroscopeFilter:
 
     def walk(self, seconds: float) -> None:
         """Let time pass."""
-        offset_walk = OFFSET_WALK if self._settings.estimate_time_offset else 0.0
-        added = np.array([*3 * [self._settings.gyroscope_bias_walk], offset_walk]) ** 2
-        covariance = self.errors.covariance + np.diag(seconds * added)
-        self.errors = replace(self.errors, covariance=covariance)
+        errors, covariance = self.errors, self.errors.covariance.copy()
+        covariance.flat[:: turning.PARAMETERS + 1] += seconds * self._walks
+        self.errors = GyroscopeErrors(errors.bias, errors.time_offset, covariance, errors.noise)
 
     def predict(
         self,
