@@ -20,17 +20,17 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
     predict,
+    surprise_of,
     unshaken,
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -236,16 +236,10 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
 
 
 def _surprise(prior: Prior, found: Estimate) -> float:
-    """How many times farther than predicted the motion has changed, squared; 1 is as predicted.
-
-    The squared step from the prediction to the estimate, in standard deviations of the prediction,
-    is expected to be what the points decide of the parameters.
-    """
+    """How many times farther than predicted the motion has changed, squared."""
     assert prior.motion is not None
     assert prior.covariance is not None
-    information = inverted(prior.covariance)
-    motion = found.beside_turn()
-    step = step_between(state_in(prior.motion, np.zeros(3)), state_in(motion, np.zeros(3)))
-    posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
-    expected = PARAMETERS - float(np.sum(information * posterior))
-    return float(step @ information @ step) / max(expected, 1.0)
+    motion, origin = found.beside_turn(), np.zeros(3)
+    step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
+    joint = np.ascontiguousarray(found.joint_covariance)
+    return surprise_of(step, np.ascontiguousarray(prior.covariance), joint)

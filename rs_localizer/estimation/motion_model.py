@@ -19,6 +19,7 @@ from rs_localizer.core.shake import shake_in_the_middle
 from rs_localizer.core.shutter import Motion, Numbers
 from rs_localizer.core.state import ANGULAR, PARAMETERS
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.refine import inverted
 
 # Time (s) in which accelerations fade: hands and drones change them about twice a second.
 FADING = 0.1
@@ -192,3 +193,24 @@ def with_mean_turn(motion: Motion, covariance: Array, turn: KnownTurn) -> tuple[
     spread[ANGULAR, ANGULAR] = np.mean((rates - mean) ** 2) * np.eye(3)
     faster = replace(motion, angular_velocity=motion.angular_velocity + mean)
     return faster, covariance + spread
+
+
+@kernel
+def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
+    """How many times farther than predicted a motion has changed, squared; 1 is as predicted.
+
+    The squared step from the prediction to the estimate, in standard deviations of the prediction,
+    is expected to be what the points decide of the parameters.
+
+    Args:
+        step: (18,).
+        covariance: (18,18) of the prediction.
+        posterior: (18 + k,18 + k) of the estimate, and of what it has beside the motion.
+    """
+    information = inverted(covariance)
+    squared, expected = 0.0, float(PARAMETERS)
+    for i in range(PARAMETERS):
+        for j in range(PARAMETERS):
+            squared += step[i] * information[i, j] * step[j]
+            expected -= information[i, j] * posterior[i, j]
+    return squared / max(expected, 1.0)

@@ -186,10 +186,10 @@ def _inverse(covariance: Array) -> Array:
     for i in range(known):
         for j in range(known):
             block[i, j] = covariance[places[i], places[j]]
-    block = np.linalg.inv(block)
+    inverse = np.linalg.inv(block)
     for i in range(known):
         for j in range(known):
-            information[places[i], places[j]] = block[i, j]
+            information[places[i], places[j]] = inverse[i, j]
     return information
 
 
