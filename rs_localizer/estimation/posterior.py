@@ -22,7 +22,8 @@ GATE = 3.5
 WIDEST_GATE = 2.0
 _ROUNDS = 3
 _ITERATIONS = 50
-_TOLERANCE = 1e-6  # noise variances
+# Noise variances; what is left after a step that gains so little is far less.
+_TOLERANCE = 1e-4
 # Positions of image points are never better than this, in pixels; it also keeps noise-free data
 # from claiming an infinite information.
 _LEAST_NOISE = 1e-4
