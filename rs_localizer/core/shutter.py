@@ -41,24 +41,6 @@ class Motion:
     angular_acceleration: Array = field(default_factory=lambda: np.zeros(3), kw_only=True)
     linear_acceleration: Array = field(default_factory=lambda: np.zeros(3), kw_only=True)
 
-    @staticmethod
-    def of(numbers: Numbers) -> Motion:
-        """The motion of these numbers."""
-        *velocities, change, acceleration = numbers
-        return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
-
-    @property
-    def numbers(self) -> Numbers:
-        """What kernels take."""
-        return (
-            np.ascontiguousarray(self.rotation, np.float64),
-            np.ascontiguousarray(self.translation, np.float64),
-            np.ascontiguousarray(self.angular_velocity, np.float64),
-            np.ascontiguousarray(self.linear_velocity, np.float64),
-            np.ascontiguousarray(self.angular_acceleration, np.float64),
-            np.ascontiguousarray(self.linear_acceleration, np.float64),
-        )
-
     def at(self, tau: float) -> tuple[Array, Array]:
         """Rotation (3,3) and translation (3,) camera_from_map at row time ``tau``."""
         turn = so3.exp(-self.angle_at(tau))
@@ -91,6 +73,24 @@ class Motion:
         """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
         velocity = self.linear_velocity + tau * self.linear_acceleration
         return so3.exp(-self.angle_at(tau)) @ velocity
+
+
+def numbers_of(motion: Motion) -> Numbers:
+    """A motion as kernels take it."""
+    return (
+        np.ascontiguousarray(motion.rotation, np.float64),
+        np.ascontiguousarray(motion.translation, np.float64),
+        np.ascontiguousarray(motion.angular_velocity, np.float64),
+        np.ascontiguousarray(motion.linear_velocity, np.float64),
+        np.ascontiguousarray(motion.angular_acceleration, np.float64),
+        np.ascontiguousarray(motion.linear_acceleration, np.float64),
+    )
+
+
+def motion_of(numbers: Numbers) -> Motion:
+    """The motion that a kernel gave."""
+    *velocities, change, acceleration = numbers
+    return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
 
 
 # Secant steps double the digits; even rows that overtake the image settle well before this.

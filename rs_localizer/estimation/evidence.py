@@ -123,9 +123,10 @@ def tridiagonal(matrix: Array, column: Array) -> tuple[Array, Array, float]:
     mirror, pulled = np.empty(size), np.empty(size)
     for k in range(size - 1):
         diagonal[k] = bordered[k, k]
-        square = 0.0
         for i in range(k + 1, size):
             mirror[i] = bordered[i, k]
+        square = 0.0
+        for i in range(k + 1, size):
             square += mirror[i] * mirror[i]
         length = -np.sqrt(square) if mirror[k + 1] > 0.0 else np.sqrt(square)
         beside[k] = length

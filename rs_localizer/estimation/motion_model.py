@@ -16,7 +16,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import shake_in_the_middle
-from rs_localizer.core.shutter import Motion, Numbers
+from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
 from rs_localizer.core.state import ANGULAR, PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import inverted
@@ -38,8 +38,8 @@ def predict(
     and ``c + R way``; all parts of the error are carried to first order into the camera axes of
     then.
     """
-    later, carried = _later(motion.numbers, covariance, float(readouts), float(fading))
-    return Motion.of(later), carried
+    later, carried = _later(numbers_of(motion), covariance, float(readouts), float(fading))
+    return motion_of(later), carried
 
 
 @kernel
@@ -140,12 +140,12 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
     """
     count = (len(estimate.joint_covariance) - PARAMETERS) // 3
     motion, covariance, swing = _unshaken(
-        estimate.beside_turn().numbers,
+        numbers_of(estimate.beside_turn()),
         np.ascontiguousarray(estimate.shake),
         np.ascontiguousarray(estimate.joint_covariance),
         *shake_in_the_middle(max(count, len(estimate.shake))),
     )
-    return Motion.of(motion), covariance, swing
+    return motion_of(motion), covariance, swing
 
 
 @kernel

@@ -6,7 +6,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.shutter import Motion, Numbers
+from rs_localizer.core.shutter import Motion, Numbers, numbers_of
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 
 # Numbers whose squares are finite.
@@ -34,7 +34,7 @@ def check_motion(motion: Motion) -> None:
                 f"the prior motion's {name} must be of shape {shape}, "
                 f"got {np.shape(getattr(motion, name))}"
             )
-    numbers = motion.numbers
+    numbers = numbers_of(motion)
     if not _is_finite(numbers):
         name = next(n for n in _OF_MOTION if not np.all(np.abs(getattr(motion, n)) < _MOST))
         raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")

@@ -200,14 +200,9 @@ def refine(
 
 @kernel
 def anneal(
-    data: Array,
-    start: Array,
-    gradient: Array,
-    first_scale: float,
-    last_scale: float,
-    prior: PriorTerms,
-    noise: float,
-) -> Array:
+    data: Array, start: Array, gradient: Array, first_scale: float, last_scale: float,
+    prior: PriorTerms, noise: float,
+) -> Array:  # fmt: skip
     """State after one Gauss-Newton step at each scale of Tukey's loss, from the first to the last.
 
     No step is tried twice: the next scale judges the points anew (graduated non-convexity).

@@ -17,7 +17,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.shutter import Motion, Numbers
+from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,
@@ -129,10 +129,10 @@ class GyroscopeFilter:
             fading: of accelerations, in readouts.
         """
         later, predicted, with_parameters = _carried(
-            motion.numbers, covariance, self._with_motion, self.errors.covariance,
+            numbers_of(motion), covariance, self._with_motion, self.errors.covariance,
             between.numbers, within.numbers, float(readouts), float(fading),
         )  # fmt: skip
-        return Predicted(Motion.of(later), predicted, with_parameters)
+        return Predicted(motion_of(later), predicted, with_parameters)
 
     def update(self, predicted: Predicted, step: Array, posterior: Array) -> None:
         """Take in a frame that was found near its prediction.

@@ -36,7 +36,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
 from rs_localizer.core.shake import shake_at, within_rows
-from rs_localizer.core.shutter import Numbers
+from rs_localizer.core.shutter import Numbers, numbers_of
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.outputs import Pose, Twist
 
@@ -66,7 +66,7 @@ def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Tur
     """An estimate at a row time, as kernels take it."""
     turn = NO_TURN if estimate.turn is None else estimate.turn.numbers
     joint = np.ascontiguousarray(estimate.joint_covariance)
-    return estimate.numbers, np.ascontiguousarray(estimate.shake), joint, turn, float(tau)
+    return numbers_of(estimate), np.ascontiguousarray(estimate.shake), joint, turn, float(tau)
 
 
 def with_timing(pose: Pose, twist: Twist, deviation: float, delay: float) -> tuple[Pose, Twist]:
