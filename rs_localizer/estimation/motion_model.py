@@ -200,7 +200,8 @@ def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
     """How many times farther than predicted a motion has changed, squared; 1 is as predicted.
 
     The squared step from the prediction to the estimate, in standard deviations of the prediction,
-    is expected to be what the points decide of the parameters.
+    is expected to be what the points decide of the parameters. Errors of map and lens make a step
+    larger, and its covariance larger than the prediction's: by at least that much.
 
     Args:
         step: (18,).
@@ -213,4 +214,4 @@ def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
         for j in range(PARAMETERS):
             squared += step[i] * information[i, j] * step[j]
             expected -= information[i, j] * posterior[i, j]
-    return squared / max(expected, 1.0)
+    return squared / max(abs(expected), 1.0)
