@@ -215,3 +215,13 @@ def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
             squared += step[i] * information[i, j] * step[j]
             expected -= information[i, j] * posterior[i, j]
     return squared / max(abs(expected), 1.0)
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them from the cache."""
+    still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    identity = np.eye(PARAMETERS)
+    predict(still, identity, 1.0, 1.0)
+    acceleration_covariance(Acceleration(1.0, 1.0), 1.0, 1.0)
+    _unshaken(numbers_of(still), np.zeros((0, 3)), identity, *shake_in_the_middle(0))
+    surprise_of(np.zeros(PARAMETERS), identity, identity)
