@@ -26,11 +26,11 @@ from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
     predict,
+    surprise_of,
     unshaken,
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -237,19 +237,12 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
 
 
 def _surprise(prior: Prior, found: Estimate) -> float:
-    """How many times farther than predicted the motion has changed, squared; 1 is as predicted.
-
-    The squared step from the prediction to the estimate, in standard deviations of the prediction,
-    is expected to be what the points decide of the parameters. Errors of map and lens make a step
-    larger, and its covariance larger than the prediction's: by at least that much.
-    """
+    """How many times farther than predicted the motion has changed, squared."""
     assert prior.motion is not None
     assert prior.covariance is not None
     if np.isinf(prior.covariance.diagonal()).any():
         return 1.0  # a first guess surprises nobody
-    information = inverted(prior.covariance)
-    motion = found.beside_turn()
-    step = step_between(state_in(prior.motion, np.zeros(3)), state_in(motion, np.zeros(3)))
-    posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
-    expected = abs(PARAMETERS - float(np.sum(information * posterior)))
-    return float(step @ information @ step) / max(expected, 1.0)
+    motion, origin = found.beside_turn(), np.zeros(3)
+    step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
+    joint = np.ascontiguousarray(found.joint_covariance)
+    return surprise_of(step, np.ascontiguousarray(prior.covariance), joint)

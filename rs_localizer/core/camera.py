@@ -230,13 +230,16 @@ class Camera:
         if len(self.D) == 0 or len(sensor) == 0:
             plain: Array = (sensor - self.K[:2, 2]) / (self.K[0, 0], self.K[1, 1])
             return plain, self.pixel_jacobian(plain)
-        usable = np.all(np.isfinite(sensor), axis=1)
-        rays = np.full(sensor.shape, np.nan)
-        if np.any(usable):
-            rays[usable] = self._undistort(sensor[usable])
+        usable = np.isfinite(sensor[:, 0]) & np.isfinite(sensor[:, 1])
+        if usable.all():
+            rays = self._undistort(sensor)
+        else:
+            rays = np.full(sensor.shape, np.nan)
+            if usable.any():
+                rays[usable] = self._undistort(sensor[usable])
         back, jacobian = self.distort(rays)
-        lost = ~(np.abs(back - pixels).max(axis=1) < _ROUND_TRIP_TOLERANCE)
-        rays[lost] = np.nan
+        near = np.abs(back - pixels) < _ROUND_TRIP_TOLERANCE
+        rays[~(near[:, 0] & near[:, 1])] = np.nan
         return rays, jacobian
 
     def project(self, points: Array) -> Array:

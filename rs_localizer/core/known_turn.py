@@ -6,6 +6,7 @@ The body rate is a natural cubic spline through the samples (:mod:`rs_localizer.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from rs_localizer.core.rate_spline import (
 
 # Gauss' rule on the readout; the sum of the weights is its length.
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(5))
+_UNKNOWN = np.diag(np.full(3, np.inf))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,29 +87,37 @@ class KnownTurn:
         found: tuple[Array, Array] = _turn_at_rows(times, *self.spline)
         return found
 
-    def late(self, tau: float) -> tuple[Array, Array]:
-        """Turn (3,) and rate (3,) at ``tau`` that a delay of one readout would leave.
-
-        What a motion under constant acceleration follows is told by the points and left out.
-        """
-        found: tuple[Array, Array] = _late(float(tau), self.tau, self.rates, self.parabola)
-        return found
-
-    def rate_at(self, tau: float) -> tuple[Array, Array] | None:
-        """Rate (3,) at ``tau`` by the gyroscope alone and its covariance (3,3).
-
-        None where its samples do not reach, or nothing is known of its error.
-        """
-        if self.rate_error is None or not self.tau[0] <= tau <= self.tau[-1]:
-            return None
-        late = self.delay * change_at(float(tau), self.tau, self.rates)
-        own = self.rate_noise**2 * np.eye(3)
-        return self.at(tau)[1], self.rate_error + own + np.outer(late, late)
-
     @property
     def spline(self) -> tuple[Array, Array, Array, Array]:
         """What :func:`find_turn` takes."""
         return self.tau, self.rates, self.rotations, self.parabola
+
+    @property
+    def numbers(self) -> Turning:
+        """As kernels take it."""
+        error = _UNKNOWN if self.rate_error is None else self.rate_error
+        return Turning(*self.spline, self.rate, self.change, self.delay, self.rate_noise, error)
+
+
+class Turning(NamedTuple):
+    """What kernels need of a :class:`KnownTurn`; the fields are the same."""
+
+    tau: Array
+    rates: Array
+    rotations: Array
+    parabola: Array
+    rate: Array
+    change: Array
+    delay: float
+    rate_noise: float
+    rate_error: Array  # infinite where it is not known
+
+
+NO_TURN = Turning(
+    np.array([-0.5, 0.5]), np.zeros((1, 4, 3)), np.stack([np.eye(3)] * 2), np.zeros((3, 3)),
+    np.zeros(3), np.zeros(3), 0.0, 0.0, _UNKNOWN,
+)  # fmt: skip
+"""Of a camera beside which there is no gyroscope."""
 
 
 @kernel
@@ -140,7 +150,11 @@ def _turn_at_rows(
 
 
 @kernel
-def _late(tau: float, times: Array, cubics: Array, parabola: Array) -> tuple[Array, Array]:
+def late_at(tau: float, times: Array, cubics: Array, parabola: Array) -> tuple[Array, Array]:
+    """Turn (3,) and rate (3,) at a row time that a delay of one readout would leave.
+
+    What a motion under constant acceleration follows is told by the points and left out.
+    """
     time = min(max(tau, times[0]), times[-1])
     rate, change = rate_at(time, times, cubics), change_at(time, times, cubics)
     for axis in range(3):

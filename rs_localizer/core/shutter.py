@@ -25,6 +25,9 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 
+Numbers = tuple[Array, Array, Array, Array, Array, Array]
+"""The fields of a :class:`Motion`, in their order, as kernels take them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
@@ -70,6 +73,24 @@ class Motion:
         """Velocity (3,) of the camera centre in the camera axes at ``tau``, m per readout."""
         velocity = self.linear_velocity + tau * self.linear_acceleration
         return so3.exp(-self.angle_at(tau)) @ velocity
+
+
+def numbers_of(motion: Motion) -> Numbers:
+    """A motion as kernels take it."""
+    return (
+        np.ascontiguousarray(motion.rotation, np.float64),
+        np.ascontiguousarray(motion.translation, np.float64),
+        np.ascontiguousarray(motion.angular_velocity, np.float64),
+        np.ascontiguousarray(motion.linear_velocity, np.float64),
+        np.ascontiguousarray(motion.angular_acceleration, np.float64),
+        np.ascontiguousarray(motion.linear_acceleration, np.float64),
+    )
+
+
+def motion_of(numbers: Numbers) -> Motion:
+    """The motion that a kernel gave."""
+    *velocities, change, acceleration = numbers
+    return Motion(*velocities, angular_acceleration=change, linear_acceleration=acceleration)
 
 
 # Secant steps double the digits; even rows that overtake the image settle well before this.

@@ -97,7 +97,7 @@ def hat(vector: Array) -> Array:
     """Skew matrices (..., 3, 3) with ``hat(v) @ x == cross(v, x)`` of vectors (..., 3)."""
     vector = np.asarray(vector, float)
     if vector.ndim == 1:
-        return _hat(vector)
+        return hat_of(vector)
     matrix = np.zeros((*vector.shape, 3))
     matrix[..., 0, 1], matrix[..., 0, 2] = -vector[..., 2], vector[..., 1]
     matrix[..., 1, 0], matrix[..., 1, 2] = vector[..., 2], -vector[..., 0]
@@ -110,11 +110,12 @@ def right_jacobian(vector: Array) -> Array:
 
     ``exp(a + d) = exp(a) exp(right_jacobian(a) d)`` to first order.
     """
-    return _right_jacobian(np.asarray(vector, float))
+    return right_jacobian_of(np.asarray(vector, float))
 
 
 @kernel
-def _hat(vector: Array) -> Array:
+def hat_of(vector: Array) -> Array:
+    """One of :func:`hat`, for kernels."""
     matrix = np.zeros((3, 3))
     matrix[0, 1], matrix[0, 2] = -vector[2], vector[1]
     matrix[1, 0], matrix[1, 2] = vector[2], -vector[0]
@@ -123,7 +124,8 @@ def _hat(vector: Array) -> Array:
 
 
 @kernel
-def _right_jacobian(vector: Array) -> Array:
+def right_jacobian_of(vector: Array) -> Array:
+    """:func:`right_jacobian`, for kernels."""
     x, y, z = vector[0], vector[1], vector[2]
     _, second, third = coefficients(x * x + y * y + z * z)
     jacobian = np.empty((3, 3))

@@ -12,6 +12,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.lanes.jit import kernel
 
 STATE_SIZE = 24
 PARAMETERS = 18
@@ -51,8 +52,20 @@ def depths(state: Array, points: Array) -> Array:
     return found
 
 
+@kernel
 def step_between(state: Array, other: Array) -> Array:
     """The step (18,) that leads from one state to another."""
-    turn = rotation_of(state) @ rotation_of(other).T
-    moved = state[STATE_TRANSLATION] - turn @ other[STATE_TRANSLATION]
-    return np.concatenate([so3.log(turn), moved, other[_POSE_SIZE:] - state[_POSE_SIZE:]])
+    turn, step = np.empty((3, 3)), np.empty(PARAMETERS)
+    for i in range(3):
+        moved = state[_POSE_SIZE - 3 + i]
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += state[3 * i + k] * other[3 * j + k]
+            turn[i, j] = total
+            moved -= total * other[_POSE_SIZE - 3 + j]
+        step[3 + i] = moved
+    step[:3] = so3.log(turn)
+    for i in range(6, PARAMETERS):
+        step[i] = other[6 + i] - state[6 + i]
+    return step

@@ -66,7 +66,9 @@ def columns_of(
     shake = 3 * polynomials
     size = PARAMETERS + shake + (2 * _FIELD_TERMS if field else 0)
     products, with_errors, squared = np.zeros((size, size)), np.zeros(size), 0.0
-    row = np.empty(size)
+    # Of the errors in the one direction and in the other, which have the shaking's turn in common,
+    # but not the field.
+    first, second = np.zeros(size), np.zeros(size)
     values, rates = np.empty(polynomials), np.empty(polynomials)
     terms, x, y = np.empty(_FIELD_TERMS), np.empty(_FIELD_DEGREE + 1), np.empty(_FIELD_DEGREE + 1)
     for i in range(len(errors)):
@@ -78,23 +80,24 @@ def columns_of(
             legendre((2.0 * rays[i, 0] - low[0] - high[0]) / max(high[0] - low[0], 1e-12), x)
             legendre((2.0 * rays[i, 1] - low[1] - high[1]) / max(high[1] - low[1], 1e-12), y)
             _field_terms(x, y, terms)
-        for line in range(2):
-            for k in range(PARAMETERS):
-                row[k] = by_motion[i, line, k]
-            for k in range(polynomials):
-                for axis in range(3):
-                    row[PARAMETERS + 3 * k + axis] = values[k] * by_turn[i, line, axis]
-            if field:
-                for k in range(_FIELD_TERMS):
-                    row[PARAMETERS + shake + k] = terms[k] if line == 0 else 0.0
-                    row[PARAMETERS + shake + _FIELD_TERMS + k] = terms[k] if line == 1 else 0.0
-            error = errors[i, line]
-            squared += error * error
-            for k in range(size):
-                if row[k] != 0.0:
-                    with_errors[k] -= row[k] * error
-                    for m in range(k + 1):
-                        products[k, m] += row[k] * row[m]
+            for k in range(_FIELD_TERMS):
+                first[PARAMETERS + shake + k] = terms[k]
+                second[PARAMETERS + shake + _FIELD_TERMS + k] = terms[k]
+        for k in range(PARAMETERS):
+            first[k], second[k] = by_motion[i, 0, k], by_motion[i, 1, k]
+        for k in range(polynomials):
+            for axis in range(3):
+                place = PARAMETERS + 3 * k + axis
+                first[place] = values[k] * by_turn[i, 0, axis]
+                second[place] = values[k] * by_turn[i, 1, axis]
+        one, other = errors[i, 0], errors[i, 1]
+        squared += one * one + other * other
+        for k in range(size):
+            here, there = first[k], second[k]
+            with_errors[k] -= here * one + there * other
+            row = products[k]
+            for m in range(k + 1):
+                row[m] += here * first[m] + there * second[m]
     for k in range(size):
         for m in range(k):
             products[m, k] = products[k, m]

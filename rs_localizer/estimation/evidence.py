@@ -21,7 +21,7 @@ _NOTHING_TO_SHARE = 1.0
 class Projected(NamedTuple):
     """A group of columns after the best motion was taken out of them."""
 
-    products: Array  # (q,q) remaining
+    products: Array  # (q,q) remaining, the lower triangle
     with_errors: Array  # (q,) remaining
     squared_errors: float  # remaining, px^2
 
@@ -79,34 +79,76 @@ def evidence_of_sizes(
         noise: a first estimate, px.
     """
     evidence, noises = np.empty(len(sizes)), np.empty(len(sizes))
-    count = len(projected.with_errors)
-    factor, half = np.empty((count, count)), np.empty(count)
+    diagonal, beside, along = tridiagonal(projected.products, projected.with_errors)
     for index in range(len(sizes)):
         variance = noise * noise
         left, volume = projected.squared_errors, 0.0
         for _ in range(3):
             ratio = sizes[index] ** 2 / variance
-            left, volume = projected.squared_errors, 0.0
-            # Cholesky factor of I + ratio * products.
-            for i in range(count):
-                solved = ratio * projected.with_errors[i]
-                for j in range(i + 1):
-                    total = ratio * projected.products[i, j]
-                    for k in range(j):
-                        total -= factor[i, k] * factor[j, k]
-                    if i == j:
-                        factor[i, i] = np.sqrt(1.0 + max(total, 0.0))
-                        volume += 2.0 * np.log(factor[i, i])
-                    else:
-                        factor[i, j] = total / factor[j, j]
-                        solved -= factor[i, j] * half[j]
-                half[i] = solved / factor[i, i]
-                left -= half[i] * half[i] / ratio
+            # Pivots of I + ratio * products, from the last one to the one that the errors meet.
+            pivot, volume = 1.0, 0.0
+            for i in range(len(diagonal) - 1, -1, -1):
+                coupled = ratio * beside[i]
+                pivot = 1.0 + max(ratio * diagonal[i] - coupled * coupled / pivot, 0.0)
+                volume += np.log(pivot)
+            left = projected.squared_errors - ratio * along * along / pivot
             left = max(left, _LEAST_VARIANCE * freedom)
             variance = left / freedom
         evidence[index] = -0.5 * (freedom * np.log(variance) + volume)
         noises[index] = np.sqrt(variance)
     return evidence, noises
+
+
+@kernel
+def tridiagonal(matrix: Array, column: Array) -> tuple[Array, Array, float]:
+    """A symmetric matrix (q,q) in the axes in which it is tridiagonal and a column lies along the
+    first one: shifted by any multiple of the identity, it is solved and has its determinant in q
+    steps. Of the matrix the lower triangle is read.
+
+    Householder's reflections (Golub, Van Loan, "Matrix computations", 8.3) of the matrix that has
+    the column as its border.
+
+    Returns:
+        diagonal (q,), what stands beside it behind each (q,), the last of which is 0, and the
+        length of the column, or its negative.
+    """
+    size = len(column) + 1
+    bordered = np.zeros((size, size))
+    for i in range(size - 1):
+        bordered[1 + i, 0] = column[i]
+        for j in range(i + 1):
+            bordered[1 + i, 1 + j] = matrix[i, j]
+            bordered[1 + j, 1 + i] = matrix[i, j]
+    diagonal, beside = np.empty(size), np.zeros(size)
+    mirror, pulled = np.empty(size), np.empty(size)
+    for k in range(size - 1):
+        diagonal[k] = bordered[k, k]
+        for i in range(k + 1, size):
+            mirror[i] = bordered[i, k]
+        square = 0.0
+        for i in range(k + 1, size):
+            square += mirror[i] * mirror[i]
+        length = -np.sqrt(square) if mirror[k + 1] > 0.0 else np.sqrt(square)
+        beside[k] = length
+        mirror[k + 1] -= length
+        # The reflection is I - mirror mirror^T / half.
+        half = -length * mirror[k + 1]
+        if not half > 0.0:
+            continue
+        across = 0.0
+        for i in range(k + 1, size):
+            total = 0.0
+            for j in range(k + 1, size):
+                total += bordered[i, j] * mirror[j]
+            pulled[i] = total / half
+            across += pulled[i] * mirror[i]
+        for i in range(k + 1, size):
+            pulled[i] -= 0.5 * across / half * mirror[i]
+        for i in range(k + 1, size):
+            for j in range(k + 1, size):
+                bordered[i, j] -= mirror[i] * pulled[j] + pulled[i] * mirror[j]
+    diagonal[size - 1] = bordered[size - 1, size - 1]
+    return diagonal[1:], beside[1:], beside[0]
 
 
 class Sizes(NamedTuple):

@@ -72,7 +72,8 @@ def near_image(camera: Camera, pixels: Array) -> BoolArray:
     """Which pixels (n,2) lie in the image, or as far outside as noise may have put them."""
     size = np.array(camera.size)
     margin = _MARGIN * size
-    near: BoolArray = np.all((pixels > -margin) & (pixels < size + margin), axis=1)
+    inside = (pixels > -margin) & (pixels < size + margin)
+    near: BoolArray = inside[:, 0] & inside[:, 1]  # along a short axis NumPy takes its time
     return near
 
 

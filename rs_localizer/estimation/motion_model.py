@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -15,24 +14,19 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import shake_in_the_middle
-from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import (
-    ANGULAR,
-    ANGULAR_ACCELERATION,
-    LINEAR,
-    LINEAR_ACCELERATION,
-    MOVE,
-    PARAMETERS,
-    TURN,
-)
+from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
+from rs_localizer.core.state import ANGULAR, PARAMETERS
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.refine import inverted
 
 # Time (s) in which accelerations fade: hands and drones change them about twice a second.
 FADING = 0.1
 # Below this part of the time of fading the closed form of the noise is rounding errors.
 _SHORT = 0.03
-_IDENTITY = np.eye(3)
+# Where the parts of a step begin (see :mod:`rs_localizer.core.state`).
+_TURN, _MOVE, _ANGULAR, _LINEAR, _CHANGE, _ACCELERATION = range(0, PARAMETERS, 3)
 
 
 def predict(
@@ -44,41 +38,58 @@ def predict(
     and ``c + R way``; all parts of the error are carried to first order into the camera axes of
     then.
     """
+    later, carried = _later(numbers_of(motion), covariance, float(readouts), float(fading))
+    return motion_of(later), carried
+
+
+@kernel
+def _later(
+    motion: Numbers, covariance: Array, readouts: float, fading: float
+) -> tuple[Numbers, Array]:
+    rotation, translation, angular, linear, change, acceleration = motion
     left = math.exp(-readouts / fading)
     # What a unit of acceleration adds to the velocity and to the way.
     faster = fading * (1.0 - left)
     farther = fading * (readouts - faster)
-    angle = readouts * motion.angular_velocity + farther * motion.angular_acceleration
-    way = readouts * motion.linear_velocity + farther * motion.linear_acceleration
+    angle = readouts * angular + farther * change
+    way = readouts * linear + farther * acceleration
     back = so3.exp(-angle)  # then_from_now
-    turned = so3.right_jacobian(angle)
-    velocity = back @ (motion.linear_velocity + faster * motion.linear_acceleration)
-    later = Motion(
-        back @ motion.rotation,
-        back @ (motion.translation - way),
-        turned @ (motion.angular_velocity + faster * motion.angular_acceleration),
-        velocity,
-        angular_acceleration=left * motion.angular_acceleration,
-        linear_acceleration=left * back @ motion.linear_acceleration,
-    )
-    transport = np.eye(PARAMETERS)
-    transport[TURN, TURN] = back
-    transport[TURN, ANGULAR] = readouts * turned
-    transport[TURN, ANGULAR_ACCELERATION] = farther * turned
-    transport[MOVE, MOVE] = back
-    transport[MOVE, TURN] = -back @ so3.hat(way)
-    transport[MOVE, LINEAR] = readouts * back
-    transport[MOVE, LINEAR_ACCELERATION] = farther * back
+    turned = so3.right_jacobian_of(angle)
+    velocity = back @ (linear + faster * acceleration)
+    transport = np.zeros((PARAMETERS, PARAMETERS))
+    _place(transport, _TURN, _TURN, 1.0, back)
+    _place(transport, _TURN, _ANGULAR, readouts, turned)
+    _place(transport, _TURN, _CHANGE, farther, turned)
+    _place(transport, _MOVE, _MOVE, 1.0, back)
+    _place(transport, _MOVE, _TURN, -1.0, back @ so3.hat_of(way))
+    _place(transport, _MOVE, _LINEAR, readouts, back)
+    _place(transport, _MOVE, _ACCELERATION, farther, back)
+    _place(transport, _LINEAR, _LINEAR, 1.0, back)
+    _place(transport, _LINEAR, _ACCELERATION, faster, back)
+    _place(transport, _ACCELERATION, _ACCELERATION, left, back)
+    across = so3.hat_of(velocity) @ turned
+    _place(transport, _LINEAR, _ANGULAR, readouts, across)
+    _place(transport, _LINEAR, _CHANGE, farther, across)
     # Without acceleration the body rate stays what it is, however far the camera turns.
     mean = farther / readouts
-    transport[ANGULAR, ANGULAR_ACCELERATION] = mean * np.eye(3) + (faster - mean) * turned
-    transport[LINEAR, LINEAR] = back
-    transport[LINEAR, LINEAR_ACCELERATION] = faster * back
-    transport[LINEAR, ANGULAR] = readouts * so3.hat(velocity) @ turned
-    transport[LINEAR, ANGULAR_ACCELERATION] = farther * so3.hat(velocity) @ turned
-    transport[ANGULAR_ACCELERATION, ANGULAR_ACCELERATION] = left * np.eye(3)
-    transport[LINEAR_ACCELERATION, LINEAR_ACCELERATION] = left * back
+    _place(transport, _ANGULAR, _CHANGE, faster - mean, turned)
+    for axis in range(3):
+        transport[_ANGULAR + axis, _ANGULAR + axis] = 1.0
+        transport[_ANGULAR + axis, _CHANGE + axis] += mean
+        transport[_CHANGE + axis, _CHANGE + axis] = left
+    later = (
+        back @ rotation, back @ (translation - way), turned @ (angular + faster * change), velocity,
+        left * change, left * (back @ acceleration),
+    )  # fmt: skip
     return later, transport @ covariance @ transport.T
+
+
+@kernel
+def _place(matrix: Array, row: int, column: int, factor: float, block: Array) -> None:
+    """Write a multiple of a block (3,3) into a matrix."""
+    for i in range(3):
+        for j in range(3):
+            matrix[row + i, column + j] = factor * block[i, j]
 
 
 def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:
@@ -87,45 +98,38 @@ def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time:
     The deviations are those of the accelerations themselves, at any time (Singer's model in closed
     form).
     """
+    deviations = float(acceleration.angular), float(acceleration.linear)
+    added: Array = _singer(*deviations, float(dt), float(readout_time))
+    return added
+
+
+@kernel
+def _singer(angular: float, linear: float, dt: float, readout_time: float) -> Array:
     x = dt / FADING
+    block = np.empty((3, 3))  # of way, velocity and acceleration
     if x < _SHORT:
         # White noise on the acceleration, to first order.
-        upper = [[x**5 / 10.0, x**4 / 4.0, x**3 / 3.0], [0.0, 2.0 * x**3 / 3.0, x**2]]
-        last = 2.0 * x
+        block[0, 0], block[0, 1], block[0, 2] = x**5 / 10.0, x**4 / 4.0, x**3 / 3.0
+        block[1, 1], block[1, 2], block[2, 2] = 2.0 * x**3 / 3.0, x**2, 2.0 * x
     else:
         e, e2 = math.exp(-x), math.exp(-2.0 * x)
-        upper = [
-            [
-                1.0 - e2 + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * e,
-                e2 + 1.0 - 2.0 * e + 2.0 * x * e - 2.0 * x + x**2,
-                1.0 - e2 - 2.0 * x * e,
-            ],
-            [0.0, 4.0 * e - 3.0 - e2 + 2.0 * x, e2 + 1.0 - 2.0 * e],
-        ]
-        last = 1.0 - e2
-    block = np.array([*upper, [0.0, 0.0, last]])
-    block = np.triu(block) + np.triu(block, 1).T
+        block[0, 0] = 1.0 - e2 + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * e
+        block[0, 1] = e2 + 1.0 - 2.0 * e + 2.0 * x * e - 2.0 * x + x**2
+        block[0, 2] = 1.0 - e2 - 2.0 * x * e
+        block[1, 1] = 4.0 * e - 3.0 - e2 + 2.0 * x
+        block[1, 2] = e2 + 1.0 - 2.0 * e
+        block[2, 2] = 1.0 - e2
     # Way, velocity per readout and acceleration per readout squared of a unit acceleration.
-    units = np.array([FADING**2, FADING * readout_time, readout_time**2])
-    block *= np.outer(units, units)
+    units = (FADING * FADING, FADING * readout_time, readout_time * readout_time)
     covariance = np.zeros((PARAMETERS, PARAMETERS))
-    angular, linear = (TURN, ANGULAR, ANGULAR_ACCELERATION), (MOVE, LINEAR, LINEAR_ACCELERATION)
-    for deviation, parts in ((acceleration.angular, angular), (acceleration.linear, linear)):
-        for i, rows in enumerate(parts):
-            for j, columns in enumerate(parts):
-                covariance[rows, columns] = deviation**2 * block[i, j] * _IDENTITY
+    for i in range(3):
+        for j in range(3):
+            value = units[i] * units[j] * block[min(i, j), max(i, j)]
+            for axis in range(3):
+                row, column = 6 * i + axis, 6 * j + axis
+                covariance[row, column] = angular * angular * value
+                covariance[3 + row, 3 + column] = linear * linear * value
     return covariance
-
-
-@cache
-def _without_shaking(coefficients: int) -> Array:
-    """Derivatives (18,18 + 3 k) of a motion without its shaking by motion and coefficients."""
-    jacobian = np.eye(PARAMETERS, PARAMETERS + 3 * coefficients)
-    if coefficients:
-        values, slopes = shake_in_the_middle(coefficients)
-        jacobian[TURN, PARAMETERS:] = -np.kron(values[None], np.eye(3))
-        jacobian[ANGULAR, PARAMETERS:] = -np.kron(slopes[None], np.eye(3))
-    return jacobian
 
 
 def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
@@ -134,27 +138,48 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
     A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
     somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.
     """
-    values, slopes = shake_in_the_middle(len(estimate.shake))
-    turn, rate = values @ estimate.shake, slopes @ estimate.shake
+    count = (len(estimate.joint_covariance) - PARAMETERS) // 3
+    motion, covariance, swing = _unshaken(
+        numbers_of(estimate.beside_turn()),
+        np.ascontiguousarray(estimate.shake),
+        np.ascontiguousarray(estimate.joint_covariance),
+        *shake_in_the_middle(max(count, len(estimate.shake))),
+    )
+    return motion_of(motion), covariance, swing
+
+
+@kernel
+def _unshaken(
+    motion: Numbers, shake: Array, joint: Array, values: Array, slopes: Array
+) -> tuple[Numbers, Array, Array]:
+    """``values`` and ``slopes``: of the polynomials in the middle row."""
+    rotation, translation, angular, linear, change, acceleration = motion
+    turn, rate, swing = np.zeros(3), np.zeros(3), np.zeros((PARAMETERS, PARAMETERS))
+    for k in range(len(shake)):
+        square = 0.0
+        for axis in range(3):
+            turn[axis] += values[k] * shake[k, axis]
+            rate[axis] += slopes[k] * shake[k, axis]
+            square += shake[k, axis] * shake[k, axis] / 3.0
+        for axis in range(3):
+            swing[_TURN + axis, _TURN + axis] += values[k] * values[k] * square
+            swing[_ANGULAR + axis, _ANGULAR + axis] += slopes[k] * slopes[k] * square
+    # Derivatives of the motion without its shaking by motion and coefficients.
+    jacobian = np.zeros((PARAMETERS, len(joint)))
+    for i in range(PARAMETERS):
+        jacobian[i, i] = 1.0
+    for k in range((len(joint) - PARAMETERS) // 3):
+        for axis in range(3):
+            place = PARAMETERS + 3 * k + axis
+            jacobian[_TURN + axis, place] = -values[k]
+            jacobian[_ANGULAR + axis, place] = -slopes[k]
     # As if turned back in its own axes: exp(-[-turn]x) R.
     turned = so3.exp(turn)
-    beside = estimate.beside_turn()
-    motion = Motion(
-        turned @ beside.rotation,
-        turned @ beside.translation,
-        beside.angular_velocity - rate,
-        beside.linear_velocity,
-        angular_acceleration=beside.angular_acceleration,
-        linear_acceleration=beside.linear_acceleration,
-    )
-    jacobian = _without_shaking((len(estimate.joint_covariance) - PARAMETERS) // 3)
-    swing = np.zeros((PARAMETERS, PARAMETERS))
-    squares = np.mean(estimate.shake**2, axis=1)
-    if len(squares):
-        values, slopes = shake_in_the_middle(len(squares))
-        swing[TURN, TURN] = (values**2 @ squares) * np.eye(3)
-        swing[ANGULAR, ANGULAR] = (slopes**2 @ squares) * np.eye(3)
-    return motion, jacobian @ estimate.joint_covariance @ jacobian.T, swing
+    beside = (
+        turned @ rotation, turned @ translation, angular - rate, linear.copy(), change.copy(),
+        acceleration.copy(),
+    )  # fmt: skip
+    return beside, jacobian @ joint @ jacobian.T, swing
 
 
 def with_mean_turn(motion: Motion, covariance: Array, turn: KnownTurn) -> tuple[Motion, Array]:
@@ -168,3 +193,35 @@ def with_mean_turn(motion: Motion, covariance: Array, turn: KnownTurn) -> tuple[
     spread[ANGULAR, ANGULAR] = np.mean((rates - mean) ** 2) * np.eye(3)
     faster = replace(motion, angular_velocity=motion.angular_velocity + mean)
     return faster, covariance + spread
+
+
+@kernel
+def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
+    """How many times farther than predicted a motion has changed, squared; 1 is as predicted.
+
+    The squared step from the prediction to the estimate, in standard deviations of the prediction,
+    is expected to be what the points decide of the parameters. Errors of map and lens make a step
+    larger, and its covariance larger than the prediction's: by at least that much.
+
+    Args:
+        step: (18,).
+        covariance: (18,18) of the prediction.
+        posterior: (18 + k,18 + k) of the estimate, and of what it has beside the motion.
+    """
+    information = inverted(covariance)
+    squared, expected = 0.0, float(PARAMETERS)
+    for i in range(PARAMETERS):
+        for j in range(PARAMETERS):
+            squared += step[i] * information[i, j] * step[j]
+            expected -= information[i, j] * posterior[i, j]
+    return squared / max(abs(expected), 1.0)
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them from the cache."""
+    still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    identity = np.eye(PARAMETERS)
+    predict(still, identity, 1.0, 1.0)
+    acceleration_covariance(Acceleration(1.0, 1.0), 1.0, 1.0)
+    _unshaken(numbers_of(still), np.zeros((0, 3)), identity, *shake_in_the_middle(0))
+    surprise_of(np.zeros(PARAMETERS), identity, identity)

@@ -22,7 +22,9 @@ GATE = 3.5
 WIDEST_GATE = 2.0
 _ROUNDS = 3
 _ITERATIONS = 50
-_TOLERANCE = 1e-6  # noise variances
+# Gain of a last step, noise variances: while the inliers are chosen, and of a fit to those that
+# are, which may be on its way along the flat valley of a small plane.
+_ROUGH, _FINE = 1e-4, 1e-6
 # Positions of image points are never better than this, in pixels; it also keeps noise-free data
 # from claiming an infinite information.
 _LEAST_NOISE = 1e-4
@@ -163,7 +165,7 @@ def _rounds(
             noise,
             2,
             _ITERATIONS,
-            _TOLERANCE,
+            _ROUGH,
         )
         errors = squared_errors(data, count, state, gradient)
         freedom = decided(information, prior, noise)
@@ -216,6 +218,6 @@ def fit(
         noise,
         2,
         _ITERATIONS,
-        _TOLERANCE,
+        _FINE,
     )
     return fitted

@@ -10,20 +10,9 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import (
-    MOTION_PARAMETERS,
-    PARAMETERS,
-)
+from rs_localizer.estimation.prior_checks import check_covariance, check_motion
 
 _LEAST_DEVIATION = 1e-9
-# Numbers whose squares are finite.
-_MOST = 1e100
-_OF_MOTION = (
-    "rotation", "translation", "angular_velocity", "linear_velocity",
-    "angular_acceleration", "linear_acceleration",
-)  # fmt: skip
-# Least eigenvalue of a covariance scaled to a unit diagonal.
-_LEAST_EIGENVALUE = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +49,8 @@ class Prior:
         if (self.motion is None) != (self.covariance is None):
             raise ValueError("a prior motion and its covariance go together")
         if self.motion is not None and self.covariance is not None:
-            _check_motion(self.motion)
-            _check_covariance(np.asarray(self.covariance, float))
+            check_motion(self.motion)
+            check_covariance(np.asarray(self.covariance, float))
         for name in ("angular_velocity", "gravity", "gravity_in_map"):
             vector = getattr(self, name)
             if vector is None:
@@ -77,46 +66,6 @@ class Prior:
                     f"{name}_deviation must be at least {_LEAST_DEVIATION:g} and finite, "
                     f"got {deviation}"
                 )
-
-
-def _check_motion(motion: Motion) -> None:
-    for name in _OF_MOTION:
-        shape = (3, 3) if name == "rotation" else (3,)
-        if np.shape(getattr(motion, name)) != shape:
-            raise ValueError(
-                f"the prior motion's {name} must be of shape {shape}, "
-                f"got {np.shape(getattr(motion, name))}"
-            )
-    # All at once: each frame has one.
-    numbers = np.concatenate([np.ravel(getattr(motion, name)) for name in _OF_MOTION])
-    if not np.abs(numbers).max() < _MOST:
-        name = next(n for n in _OF_MOTION if not np.all(np.abs(getattr(motion, n)) < _MOST))
-        raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
-    rotation = np.asarray(motion.rotation)
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > 1e-6 or np.linalg.det(rotation) < 0.0:
-        raise ValueError(f"the prior motion's rotation is not orthonormal: {rotation.tolist()}")
-
-
-def _check_covariance(covariance: Array) -> None:
-    if covariance.shape not in ((MOTION_PARAMETERS,) * 2, (PARAMETERS,) * 2):
-        raise ValueError(f"covariance must be (12,12) or (18,18), got {covariance.shape}")
-    known = ~np.isinf(np.diag(covariance))
-    if not np.any(known):
-        return  # everything is free: the motion is only a first guess
-    block = covariance if np.all(known) else covariance[np.ix_(known, known)]
-    if not np.all(np.isfinite(block)):
-        raise ValueError("covariance must be finite where its diagonal is")
-    variances = np.diag(block)
-    scale = np.sqrt(np.abs(np.outer(variances, variances)))
-    if not np.all(np.abs(block - block.T) <= 1e-6 * scale):
-        raise ValueError("covariance must be symmetric")
-    try:
-        if not np.all(variances > 0.0):
-            raise np.linalg.LinAlgError
-        np.linalg.cholesky(block / scale - _LEAST_EIGENVALUE * np.eye(len(block)))
-    except np.linalg.LinAlgError:
-        raise ValueError("covariance must be positive definite") from None
 
 
 def state_in(motion: Motion, centre: Array) -> Array:

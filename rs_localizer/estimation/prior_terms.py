@@ -89,16 +89,23 @@ def held_beside(terms: PriorTerms, turn_known: bool = False) -> PriorTerms:
 
 def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
     """The terms of a motion beside a known turn; error (6,6): see ``KnownTurn.error``."""
-    return terms._replace(informations=_with_turn(terms.informations, error))
+    return PriorTerms(_with_turn(terms.informations, error), terms.references, terms.gravity)
 
 
 @kernel
 def _with_turn(informations: Array, error: Array) -> Array:
     changed, precision = informations.copy(), np.linalg.inv(error)
     for i in range(6):
-        for j in range(6):  # the rate, and its change six places behind it
-            changed[0, 6 + i + i // 3 * 3, 6 + j + j // 3 * 3] = precision[i, j]
+        for j in range(6):
+            changed[0, _turning(i), _turning(j)] = precision[i, j]
     return changed
+
+
+@kernel
+def _turning(i: int) -> int:
+    """Where a step has the turn rate, and its change six places behind it."""
+    place: int = 6 + i + i // 3 * 3
+    return place
 
 
 def gravity_cost(terms: PriorTerms, state: Array) -> float:
@@ -145,17 +152,48 @@ def with_motion(
         return terms
     if np.isinf(np.diagonal(prior.covariance)).all():
         return terms  # the motion is a first guess
-    own = terms.informations
-    if len(prior.covariance) == PARAMETERS:  # it knows the accelerations better than a default
-        own = own.copy()
-        own[0, ACCELERATIONS] = 0.0
-        if turn_known:
-            own[0][_TURNING] = 0.0
-    return PriorTerms(
-        np.concatenate([own, _inverse(np.asarray(prior.covariance, float))[None]]),
-        np.concatenate([terms.references, state_in(prior.motion, centre)[None]]),
-        terms.gravity,
+    informations, references = _with_motion(
+        terms.informations,
+        terms.references,
+        np.ascontiguousarray(prior.covariance, np.float64),
+        state_in(prior.motion, centre),
+        turn_known,
     )
+    return PriorTerms(informations, references, terms.gravity)
+
+
+@kernel
+def _with_motion(
+    informations: Array, references: Array, covariance: Array, reference: Array, turn_known: bool
+) -> tuple[Array, Array]:
+    count = len(informations)
+    found = np.empty((count + 1, PARAMETERS, PARAMETERS))
+    of = np.empty((count + 1, STATE_SIZE))
+    found[:count], of[:count] = informations, references
+    found[count], of[count] = _inverse(covariance), reference
+    if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
+        found[0, ACCELERATIONS] = 0.0
+        if turn_known:
+            for i in range(6):
+                for j in range(6):
+                    found[0, _turning(i), _turning(j)] = 0.0
+    return found, of
+
+
+@kernel
+def _inverse(covariance: Array) -> Array:
+    """Information (18,18) of a covariance, zero for parameters of infinite variance."""
+    places = np.flatnonzero(np.isfinite(np.diag(covariance)))
+    known = len(places)
+    block, information = np.empty((known, known)), np.zeros((PARAMETERS, PARAMETERS))
+    for i in range(known):
+        for j in range(known):
+            block[i, j] = covariance[places[i], places[j]]
+    inverse = np.linalg.inv(block)
+    for i in range(known):
+        for j in range(known):
+            information[places[i], places[j]] = inverse[i, j]
+    return information
 
 
 def _unit(vector: ArrayLike) -> Array:
@@ -163,14 +201,3 @@ def _unit(vector: ArrayLike) -> Array:
     array = array / np.abs(array).max()  # squares of very long vectors overflow
     unit: Array = array / np.linalg.norm(array)
     return unit
-
-
-def _inverse(covariance: Array) -> Array:
-    """Information (18,18) of a covariance, zero for parameters of infinite variance."""
-    if len(covariance) == PARAMETERS and np.isfinite(covariance).all():
-        return np.asarray(np.linalg.inv(covariance), np.float64)
-    information = np.zeros((PARAMETERS, PARAMETERS))
-    known = np.flatnonzero(np.isfinite(np.diag(covariance)))
-    block = np.ix_(known, known)
-    information[block] = np.linalg.inv(covariance[block])
-    return information

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -96,12 +96,11 @@ class GyroscopeAid:
         span_of(times, 0, 1)
         warm_up()
         within.known.at(0.0)
-        within.known.late(0.0)
-        contradicts(np.zeros(3), within.known.error[:3, :3])
+        contradicts(np.zeros(3), np.eye(3))
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         identity = np.eye(PARAMETERS)
         predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
-        added = replace(predicted, covariance=predicted.covariance + identity)
+        added = predicted.spread(identity)
         filter_.update(added, np.zeros(PARAMETERS), 0.5 * added.covariance)
 
     @property
@@ -214,7 +213,7 @@ class GyroscopeAid:
         predicted = self.filter.predict(
             last.motion, last.covariance, between, within, readouts, last.fading
         )
-        predicted = replace(predicted, covariance=predicted.covariance + last.added)
+        predicted = predicted.spread(last.added)
         prior = Prior(
             motion=predicted.motion,
             covariance=predicted.covariance,
@@ -284,5 +283,5 @@ def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
 
 def _contradicts(foreseen: Foreseen, step: Array) -> bool:
     if foreseen.predicted is None:
-        return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3])
+        return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3].copy())
     return contradicts(step[SEEN], foreseen.predicted.covariance[_SEEN_BLOCK])

@@ -36,6 +36,8 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
     for i in range(count - 1):
         steps[i] = times[i + 1] - times[i]
     width = 2.0 * np.pi * _BAND / np.median(steps)
+    # The sine of a difference by those of both: n of them, not n^2.
+    sines, cosines = np.sin(width * times), np.cos(width * times)
     factor = np.empty((count, count))
     # Nothing is supposed of the mean.
     mean = np.zeros(3)
@@ -45,7 +47,8 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
     solved = rates - mean
     for i in range(count):  # Cholesky, and the first substitution beside it
         for j in range(i + 1):
-            total = _cardinal(width * (times[i] - times[j])) + (_NOISE if i == j else 0.0)
+            sine = sines[i] * cosines[j] - cosines[i] * sines[j]
+            total = 1.0 + _NOISE if i == j else sine / (width * (times[i] - times[j]))
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
             factor[i, j] = np.sqrt(max(total, _NOISE * _NOISE)) if i == j else total / factor[j, j]
@@ -68,14 +71,10 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
             between = 0.5 * (times[i] + times[i + 1])
             found[2 * i + 1] = mean
             dense[2 * i + 1] = between
+            here, aside = np.sin(width * between), np.cos(width * between)
             for k in range(count):
-                weight = _cardinal(width * (between - times[k]))
+                sine = here * cosines[k] - aside * sines[k]
+                weight = sine / (width * (between - times[k]))
                 for axis in range(3):
                     found[2 * i + 1, axis] += weight * solved[k, axis]
     return dense, found
-
-
-@kernel
-def _cardinal(x: float) -> float:
-    value: float = np.sin(x) / x if abs(x) > 1e-6 else 1.0
-    return value

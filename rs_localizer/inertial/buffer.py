@@ -6,6 +6,7 @@ called from any thread.
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 from enum import StrEnum
@@ -207,11 +208,9 @@ class ReadingBuffer:
             begin = max([begin, *stops[stops <= span.first].tolist()])
             end = min([end, *stops[stops >= span.last].tolist()])
         forces = values[begin:end, 3:6]
-        return Readings(
-            stamps[begin:end],
-            values[begin:end, :3],
-            None if np.isnan(forces).any() else forces,
-        )
+        lacking = math.isnan(forces.sum())
+        rates = np.ascontiguousarray(values[begin:end, :3])
+        return Readings(stamps[begin:end], rates, None if lacking else np.ascontiguousarray(forces))
 
 
 def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:

@@ -11,13 +11,13 @@ update of the whole filter: given the motion, the image says nothing more of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.shutter import Motion
+from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,
@@ -44,7 +44,6 @@ _ROUNDING = 1e-9  # of eigenvalues of what is scaled to 1
 
 RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 """Of a step: what the gyroscope leaves to the points."""
-_TURNS = np.arange(3)
 # Deviations between two values of one offset.
 _FAR = 4.0
 # What the rows say of the time offset is not believed beyond chance (squared, in variances),
@@ -60,12 +59,18 @@ class Predicted:
     covariance: Array  # (18,18)
     with_parameters: Array  # (18,4) covariance with the gyroscope's parameters
 
+    def spread(self, added: Array) -> Predicted:
+        """The same with more covariance (18,18) of what the parameters have no part in."""
+        return Predicted(self.motion, self.covariance + added, self.with_parameters)
+
 
 class GyroscopeFilter:
     """Bias and time offset of a gyroscope, with the covariance that ties them to the motion."""
 
     def __init__(self, settings: InertialSettings) -> None:
         self._settings = settings
+        offset_walk = OFFSET_WALK if settings.estimate_time_offset else 0.0
+        self._walks = np.square([*3 * [settings.gyroscope_bias_walk], offset_walk])  # per s
         self.reset()
 
     def reset(self, time_offset: float = 0.0, deviation: float | None = None) -> None:
@@ -95,14 +100,13 @@ class GyroscopeFilter:
     def _set(self, parameters: Array, covariance: Array) -> None:
         bias, time_offset = parameters[BIAS], float(parameters[OFFSET])
         noise = self._settings.gyroscope_noise
-        self.errors = GyroscopeErrors(bias, time_offset, covariance, noise)
+        self.errors = GyroscopeErrors(bias, time_offset, np.ascontiguousarray(covariance), noise)
 
     def walk(self, seconds: float) -> None:
         """Let time pass."""
-        offset_walk = OFFSET_WALK if self._settings.estimate_time_offset else 0.0
-        added = np.array([*3 * [self._settings.gyroscope_bias_walk], offset_walk]) ** 2
-        covariance = self.errors.covariance + np.diag(seconds * added)
-        self.errors = replace(self.errors, covariance=covariance)
+        errors, covariance = self.errors, self.errors.covariance.copy()
+        covariance.flat[:: turning.PARAMETERS + 1] += seconds * self._walks
+        self.errors = GyroscopeErrors(errors.bias, errors.time_offset, covariance, errors.noise)
 
     def predict(
         self,
@@ -124,27 +128,11 @@ class GyroscopeFilter:
             readouts: from middle row to middle row.
             fading: of accelerations, in readouts.
         """
-        left = math.exp(-readouts / fading)
-        faster = fading * (1.0 - left)
-        farther = fading * (readouts - faster)
-        back = between.rotation
-        way = readouts * motion.linear_velocity + farther * motion.linear_acceleration
-        velocity = back @ (motion.linear_velocity + faster * motion.linear_acceleration)
-        later = Motion(
-            back @ motion.rotation,
-            back @ (motion.translation - way),
-            np.zeros(3),
-            velocity,
-            linear_acceleration=left * back @ motion.linear_acceleration,
-        )
-        predicted, with_parameters = _carried(
-            covariance, self._with_motion, self.errors.covariance, back,
-            between.by_parameters, within.by_parameters, way, velocity,
-            np.array([readouts, farther, faster, left]),
+        later, predicted, with_parameters = _carried(
+            numbers_of(motion), covariance, self._with_motion, self.errors.covariance,
+            between.numbers, within.numbers, float(readouts), float(fading),
         )  # fmt: skip
-        predicted[_TURNS, _TURNS] += between.variances
-        predicted[RATE, RATE] += within.variances
-        return Predicted(later, predicted, with_parameters)
+        return Predicted(motion_of(later), predicted, with_parameters)
 
     def update(self, predicted: Predicted, step: Array, posterior: Array) -> None:
         """Take in a frame that was found near its prediction.
@@ -196,30 +184,38 @@ class GyroscopeFilter:
         """``known``: places of a step that the prediction ``before`` was of."""
         whole = len(known) == PARAMETERS
         after = np.ascontiguousarray(posterior if whole else posterior[np.ix_(known, known)])
-        gain, gained, tied = _gain(
-            np.ascontiguousarray(before), after, np.ascontiguousarray(with_parameters)
-        )
-        covariance = self.errors.covariance - gained
-        parameters = np.append(self.errors.bias, self.errors.time_offset) + gain @ step
+        errors = self.errors
+        change, covariance, tied = _learned(
+            np.ascontiguousarray(before), after, np.ascontiguousarray(with_parameters),
+            errors.covariance, np.ascontiguousarray(step),
+        )  # fmt: skip
         if not whole:
             tied = posterior[:, known] @ np.linalg.solve(after, tied)
         self._with_motion = np.ascontiguousarray(tied)
-        self._set(parameters, 0.5 * (covariance + covariance.T))
+        bias, time_offset = errors.bias + change[BIAS], errors.time_offset + float(change[OFFSET])
+        self.errors = GyroscopeErrors(bias, time_offset, covariance, errors.noise)
 
 
 @kernel
 def _carried(
-    covariance: Array, with_motion: Array, of_parameters: Array, back: Array,
-    turn_by_parameters: Array, rate_by_parameters: Array, way: Array, velocity: Array,
-    times: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Covariance (18,18) of a motion, and with the parameters (18,4), after a turn.
-
-    Args:
-        times: readouts, and what a unit of acceleration adds to way and velocity, and what is
-            left of it.
-    """
-    readouts, farther, faster, left = times
+    motion: Numbers, covariance: Array, with_motion: Array, of_parameters: Array,
+    between: tuple[Array, Array, Array], within: tuple[Array, Array], readouts: float,
+    fading: float,
+) -> tuple[Numbers, Array, Array]:  # fmt: skip
+    """A motion, its covariance (18,18), and that with the parameters (18,4), after a turn."""
+    rotation, translation, _, linear, _, acceleration = motion
+    back, turn_by_parameters, turn_variances = between
+    rate_by_parameters, rate_variances = within
+    left = math.exp(-readouts / fading)
+    # What a unit of acceleration adds to the velocity and to the way.
+    faster = fading * (1.0 - left)
+    farther = fading * (readouts - faster)
+    way = readouts * linear + farther * acceleration
+    velocity = back @ (linear + faster * acceleration)
+    later = (
+        back @ rotation, back @ (translation - way), np.zeros(3), velocity, np.zeros(3),
+        left * (back @ acceleration),
+    )  # fmt: skip
     transport = np.zeros((PARAMETERS, PARAMETERS))
     by_parameters = np.zeros((PARAMETERS, 4))
     for i in range(3):
@@ -248,7 +244,27 @@ def _carried(
     crossed = moved @ by_parameters.T
     predicted = transport @ covariance @ transport.T + crossed + crossed.T
     predicted += by_parameters @ of_parameters @ by_parameters.T
-    return predicted, moved + by_parameters @ of_parameters
+    for i in range(3):
+        predicted[i, i] += turn_variances[i]
+        predicted[6 + i, 6 + i] += rate_variances[i]
+        predicted[12 + i, 12 + i] += rate_variances[3 + i]
+    return later, predicted, moved + by_parameters @ of_parameters
+
+
+@kernel
+def _learned(
+    before: Array, after: Array, with_parameters: Array, of_parameters: Array, step: Array
+) -> tuple[Array, Array, Array]:
+    """How the parameters (4,) change, their covariance (4,4) then, and what is left of the one
+    with the motion (k,4).
+    """
+    gain, gained, tied = _gain(before, after, with_parameters)
+    covariance = of_parameters - gained
+    for i in range(4):
+        for j in range(i):
+            covariance[i, j] = 0.5 * (covariance[i, j] + covariance[j, i])
+            covariance[j, i] = covariance[i, j]
+    return gain @ step, covariance, tied
 
 
 @kernel

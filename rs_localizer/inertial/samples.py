@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.lanes.jit import kernel
 
 MARGIN = 4
 """Samples before and after an interval that the spline through its samples wants to have: what
@@ -27,13 +28,17 @@ class ImuSamples:
 
     def __post_init__(self) -> None:
         count = len(self.times_ns)
-        if np.shape(self.times_ns) != (count,) or (self.times_ns[1:] <= self.times_ns[:-1]).any():
+        if np.shape(self.times_ns) != (count,) or not _increases(
+            np.ascontiguousarray(self.times_ns, np.int64)
+        ):
             raise ValueError("times_ns must be (n,) and increase")
         for name in ("angular_velocity", "specific_force"):
             values = getattr(self, name)
             if values is None:
                 continue
-            if np.shape(values) != (count, 3) or not np.isfinite(values).all():
+            if np.shape(values) != (count, 3) or not _is_finite(
+                np.ascontiguousarray(values, np.float64)
+            ):
                 raise ValueError(
                     f"{name} must be ({count},3) and finite, got shape {np.shape(values)}"
                 )
@@ -60,3 +65,20 @@ def needed(readout_time: float, middle_ns: int, period_ns: int) -> tuple[int, in
     """
     reach = round(0.5e9 * readout_time) + MARGIN * period_ns
     return middle_ns - reach, middle_ns + reach
+
+
+@kernel
+def _increases(times_ns: IntArray) -> bool:
+    increases = True
+    for i in range(len(times_ns) - 1):
+        increases &= times_ns[i] < times_ns[i + 1]
+    return increases
+
+
+@kernel
+def _is_finite(values: Array) -> bool:
+    finite = True
+    for i in range(len(values)):
+        for axis in range(3):
+            finite &= np.isfinite(values[i, axis])
+    return finite

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.known_turn import KnownTurn, turn_of
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
@@ -38,6 +38,9 @@ MOST_ROUGH, _NEAR = 2e-3, 5e-4
 _WAVE_SLOPE = 60.0  # squared slope of a line through a wave, to its mean square; at most
 
 
+_Turn = tuple[Array, Array, Array, Array, Array, Array, float]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroscopeErrors:
     """What is known of a gyroscope's errors."""
@@ -57,6 +60,11 @@ class TurnBetween:
     by_parameters: Array
     variances: Array  # (3,) rad^2, by noise and scale
 
+    @property
+    def numbers(self) -> tuple[Array, Array, Array]:
+        """What kernels take."""
+        return self.rotation, self.by_parameters, self.variances
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnWithin:
@@ -69,6 +77,11 @@ class TurnWithin:
     by_parameters: Array  # (6,4)
     variances: Array  # (6,) by noise and scale
 
+    @property
+    def numbers(self) -> tuple[Array, Array]:
+        """What kernels take."""
+        return self.by_parameters, self.variances
+
 
 def turn_within(
     samples: ImuSamples, middle_ns: int, readout_time: float, errors: GyroscopeErrors
@@ -79,14 +92,15 @@ def turn_within(
         middle_ns: exposure of the middle row.
         readout_time: s.
     """
-    spanning = _spanning(samples, middle_ns, 0.5 * readout_time, 0.5 * readout_time, errors)
-    if spanning is None:
+    here_ns = _by_samples(middle_ns, errors)
+    reach_ns = round(0.5e9 * readout_time)
+    span = samples.around(here_ns - reach_ns, here_ns + reach_ns)
+    if span is None:
         return None
-    times, rates = spanning
-    turn, error, by_parameters, variances = _within(
-        times, rates, readout_time, errors.noise, errors.covariance
-    )
-    period = (times[-1] - times[0]) / (len(times) - 1)
+    turn, error, by_parameters, variances, period = _within(
+        samples.times_ns[span], samples.angular_velocity[span], here_ns, errors.bias, readout_time,
+        errors.noise, errors.covariance,
+    )  # fmt: skip
     rate_noise = errors.noise * readout_time / math.sqrt(period)
     delay = math.sqrt(errors.covariance[OFFSET, OFFSET] + JITTER**2) / readout_time
     rate_error = readout_time**2 * errors.covariance[BIAS, BIAS]
@@ -99,19 +113,45 @@ def turn_between(
 ) -> TurnBetween | None:
     """How the camera turns from one moment to a later one; None if the samples do not cover it."""
     length = 1e-9 * (to_ns - from_ns)
-    spanning = _spanning(samples, to_ns, length, 0.0, errors)
-    if spanning is None:
+    here_ns = _by_samples(to_ns, errors)
+    span = samples.around(here_ns - (to_ns - from_ns), here_ns)
+    if span is None:
         return None
-    deviation = math.sqrt(errors.covariance[OFFSET, OFFSET])
-    return TurnBetween(*_between(*spanning, length, errors.noise, deviation))
+    found = _between(
+        samples.times_ns[span], samples.angular_velocity[span], here_ns, errors.bias, length,
+        errors.noise, math.sqrt(errors.covariance[OFFSET, OFFSET]),
+    )  # fmt: skip
+    return TurnBetween(*found)
+
+
+def _by_samples(at_ns: int, errors: GyroscopeErrors) -> int:
+    """A moment by the clock of the samples."""
+    return at_ns - round(1e9 * errors.time_offset)
+
+
+@kernel
+def _relative(times_ns: IntArray, rates: Array, here_ns: int, bias: Array) -> tuple[Array, Array]:
+    """Times (k,) in s since a moment, and rates (k,3) without the bias."""
+    count = len(times_ns)
+    times, steady = np.empty(count), np.empty((count, 3))
+    for i in range(count):
+        times[i] = 1e-9 * (times_ns[i] - here_ns)
+        for axis in range(3):
+            steady[i, axis] = rates[i, axis] - bias[axis]
+    return times, steady
 
 
 @kernel
 def _within(
-    times: Array, rates: Array, readout_time: float, noise: float, of_parameters: Array
-) -> tuple[tuple[Array, Array, Array, Array, Array, Array, float], Array, Array, Array]:
-    """The turn of a :class:`KnownTurn`, its error, and the other fields of :class:`TurnWithin`."""
-    dense, found = densified(times, rates)
+    times_ns: IntArray, rates: Array, here_ns: int, bias: Array, readout_time: float, noise: float,
+    of_parameters: Array,
+) -> tuple[_Turn, Array, Array, Array, float]:  # fmt: skip
+    """The turn of a :class:`KnownTurn`, its error, and the other fields of :class:`TurnWithin`;
+    and the period of the samples, s.
+    """
+    times, steady = _relative(times_ns, rates, here_ns, bias)
+    period = (times[-1] - times[0]) / (len(times) - 1)
+    dense, found = densified(times, steady)
     tau = dense / readout_time
     cubics, rotations, rate, change, parabola, rough = turn_of(tau, found * readout_time)
     deviation = np.sqrt(of_parameters[OFFSET, OFFSET])
@@ -148,7 +188,7 @@ def _within(
     for k in range(6):
         error[k, k] += variances[k]
     turn = (tau, cubics, rotations, rate, change, parabola, rough)
-    return turn, error, by_parameters, variances
+    return turn, error, by_parameters, variances, period
 
 
 @kernel
@@ -172,10 +212,11 @@ def _halves(rotations: Array) -> Array:
 
 @kernel
 def _between(
-    times: Array, rates: Array, length: float, noise: float, deviation: float
-) -> tuple[Array, Array, Array]:
-    """The fields of a :class:`TurnBetween`; it ends at time 0."""
-    dense, found = densified(times, rates)
+    times_ns: IntArray, rates: Array, here_ns: int, bias: Array, length: float, noise: float,
+    deviation: float,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """The fields of a :class:`TurnBetween`; it ends here."""
+    dense, found = densified(*_relative(times_ns, rates, here_ns, bias))
     cubics = spline(dense, found)
     rotations = rotations_at_knots(dense, cubics)  # from the camera then
     shift = _shift(deviation, dense[0] + length, dense[-1])
@@ -208,15 +249,3 @@ def _between(
         variances[k] = (0.5 * (late[k] + early[k])) ** 2
         variances[k] += noise * noise * length + SCALE_DEVIATION * SCALE_DEVIATION * squared
     return rotation, by_parameters, variances
-
-
-def _spanning(
-    samples: ImuSamples, at_ns: int, before: float, after: float, errors: GyroscopeErrors
-) -> tuple[Array, Array] | None:
-    """Times (k,) in s since a moment and rates (k,3) without the bias that span what is around."""
-    here_ns = at_ns - round(1e9 * errors.time_offset)  # by the clock of the samples
-    part = samples.around(here_ns - round(1e9 * before), here_ns + round(1e9 * after))
-    if part is None:
-        return None
-    times = np.asarray(1e-9 * (samples.times_ns[part] - here_ns), np.float64)
-    return times, samples.angular_velocity[part] - errors.bias

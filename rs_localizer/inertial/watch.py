@@ -10,6 +10,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.filter import GyroscopeFilter
 from rs_localizer.inertial.mounting import fit_mounting
@@ -155,7 +156,12 @@ class GyroscopeWatch:
         )
 
 
+@kernel
 def contradicts(step: Array, covariance: Array) -> bool:
     """Whether a frame moved rotation and turn rate (k,) by more than their prediction allows."""
-    information = inverted(np.ascontiguousarray(covariance))
-    return not step @ information @ step <= _MOST_SURPRISE
+    information = inverted(covariance)
+    distance = 0.0
+    for i in range(len(step)):
+        for j in range(len(step)):
+            distance += step[i] * information[i, j] * step[j]
+    return not distance <= _MOST_SURPRISE

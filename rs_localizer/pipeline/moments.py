@@ -32,95 +32,41 @@ from dataclasses import replace
 
 import numpy as np
 
-from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.shake import shake_at, shake_basis, within_rows
-from rs_localizer.core.state import (
-    ANGULAR,
-    ANGULAR_ACCELERATION,
-    LINEAR,
-    LINEAR_ACCELERATION,
-    MOVE,
-    PARAMETERS,
-    TURN,
-)
+from rs_localizer.core.known_turn import NO_TURN, Turning
+from rs_localizer.core.moment_kernels import pose_of, twist_of
+from rs_localizer.core.shake import shake_at, within_rows
+from rs_localizer.core.shutter import Numbers, numbers_of
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.outputs import Pose, Twist
 
-# Blocks of the published covariances.
-_LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
 # Where the shaking is asked how fast it is.
 _ROWS = np.linspace(-0.5, 0.5, 17)
 
 
 def pose_at(estimate: Estimate, tau: float) -> Pose:
     """Pose of the camera in the map at row time ``tau``."""
-    rotation, translation = estimate.at(tau)
-    map_from_middle, map_from_then = estimate.rotation.T, rotation.T
-    motion = estimate.beside_turn()
-    by_angle = map_from_middle @ so3.right_jacobian(-motion.angle_at(tau))
-    values, _ = _shaking(estimate, tau)
-    jacobian = np.zeros((6, len(estimate.joint_covariance)))
-    jacobian[_LINEAR, TURN] = -map_from_middle @ so3.hat(motion.way_at(tau))
-    jacobian[_LINEAR, MOVE] = map_from_middle
-    jacobian[_LINEAR, LINEAR] = tau * map_from_middle
-    jacobian[_LINEAR, LINEAR_ACCELERATION] = 0.5 * tau * tau * map_from_middle
-    jacobian[_ANGULAR, TURN] = map_from_middle
-    jacobian[_ANGULAR, ANGULAR] = tau * by_angle
-    jacobian[_ANGULAR, ANGULAR_ACCELERATION] = 0.5 * tau * tau * by_angle
-    if estimate.turn is not None:
-        map_from_then = map_from_then @ estimate.turn.at(tau)[0]
-    jacobian[_ANGULAR, PARAMETERS:] = _by_polynomials(values, map_from_then)
-    covariance = _propagate(jacobian, estimate.joint_covariance)
-    if estimate.turn is not None:
-        late = estimate.turn.delay * rotation.T @ estimate.turn.late(tau)[0]
-        covariance[_ANGULAR, _ANGULAR] += np.outer(late, late)
-    covariance[_ANGULAR, _ANGULAR] += _beyond_rows(estimate, tau)[0] * np.eye(3)
-    return Pose(position=-rotation.T @ translation, rotation=rotation.T, covariance=covariance)
+    position, rotation, covariance = pose_of(
+        *_numbers(estimate, tau), _beyond_rows(estimate, tau)[0]
+    )
+    return Pose(position=position, rotation=rotation, covariance=covariance)
 
 
 def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
     """Twist of the camera at row time ``tau``, in its axes at that moment; readout_time in s."""
-    linear = estimate.linear_velocity_at(tau)
-    shaken = estimate.turned_beside(tau)
-    motion = estimate.beside_turn()
-    angle = motion.angle_at(tau)
-    turn = shaken @ so3.exp(-angle)
-    by_angle = so3.hat(linear) @ shaken @ so3.right_jacobian(angle)
-    angular = estimate.angular_velocity_at(tau)
-    by_acceleration = 0.5 * tau * shaken @ (np.eye(3) + so3.right_jacobian(angle))
-    values, rates = _shaking(estimate, tau)
-    jacobian = np.zeros((6, len(estimate.joint_covariance)))
-    jacobian[_LINEAR, ANGULAR] = tau * by_angle
-    jacobian[_LINEAR, ANGULAR_ACCELERATION] = 0.5 * tau * tau * by_angle
-    jacobian[_LINEAR, LINEAR] = turn
-    jacobian[_LINEAR, LINEAR_ACCELERATION] = tau * turn
-    jacobian[_ANGULAR, ANGULAR] = shaken
-    jacobian[_ANGULAR, ANGULAR_ACCELERATION] = by_acceleration
-    known, rate, own = np.eye(3), np.zeros(3), np.zeros((3, 3))
-    if estimate.turn is not None:
-        known, rate = estimate.turn.at(tau)
-        late = estimate.turn.delay * estimate.turn.late(tau)[1]
-        own = np.outer(late, late) + estimate.turn.rate_noise**2 * np.eye(3)
-    jacobian[_LINEAR, PARAMETERS:] = _by_polynomials(values, so3.hat(linear) @ known)
-    by_shake = _by_polynomials(values, so3.hat(angular - rate) @ known)
-    jacobian[_ANGULAR, PARAMETERS:] = _by_polynomials(rates, known) + by_shake
-    covariance = _propagate(jacobian / readout_time, estimate.joint_covariance)
-    turned, changed = _beyond_rows(estimate, tau)
-    own = own + changed * np.eye(3)
-    covariance[_ANGULAR, _ANGULAR] += own / readout_time**2
-    covariance[_LINEAR, _LINEAR] += turned / readout_time**2 * so3.hat(linear) @ so3.hat(linear).T
-    measured = None if estimate.turn is None else estimate.turn.rate_at(tau)
-    if measured is not None:
-        error = measured[1] / readout_time**2
-        if np.trace(error) < np.trace(covariance[_ANGULAR, _ANGULAR]):
-            angular = measured[0]
-            covariance[_ANGULAR] = 0.0
-            covariance[:, _ANGULAR] = 0.0
-            covariance[_ANGULAR, _ANGULAR] = error
+    linear, angular, covariance = twist_of(*_numbers(estimate, tau), _beyond_rows(estimate, tau))
     return Twist(
-        linear=linear / readout_time, angular=angular / readout_time, covariance=covariance
+        linear=linear / readout_time,
+        angular=angular / readout_time,
+        covariance=covariance / readout_time**2,
     )
+
+
+def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Turning, float]:
+    """An estimate at a row time, as kernels take it."""
+    turn = NO_TURN if estimate.turn is None else estimate.turn.numbers
+    joint = np.ascontiguousarray(estimate.joint_covariance)
+    return numbers_of(estimate), np.ascontiguousarray(estimate.shake), joint, turn, float(tau)
 
 
 def with_timing(pose: Pose, twist: Twist, deviation: float, delay: float) -> tuple[Pose, Twist]:
@@ -137,23 +83,6 @@ def with_timing(pose: Pose, twist: Twist, deviation: float, delay: float) -> tup
         replace(pose, covariance=pose.covariance + delay**2 * np.outer(in_map, in_map)),
         replace(twist, covariance=twist.covariance + deviation**2 * np.outer(velocity, velocity)),
     )
-
-
-def _shaking(estimate: Estimate, tau: float) -> tuple[Array, Array]:
-    """The polynomials (k,) of the shaking at ``tau``, and their rates (k,)."""
-    count = (len(estimate.joint_covariance) - PARAMETERS) // 3
-    values, rates = np.empty(count), np.empty(count)
-    if count:
-        shake_basis(within_rows(tau), count + 1, values, rates)
-    if tau != within_rows(tau):  # it stays as it was
-        rates[:] = 0.0
-    return values, rates
-
-
-def _by_polynomials(values: Array, matrix: Array) -> Array:
-    """``matrix`` (3,3) times each of the values (k,), side by side (3,3 k)."""
-    side_by_side: Array = (matrix[:, None, :] * values[:, None]).reshape(3, -1)
-    return side_by_side
 
 
 def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
@@ -178,8 +107,3 @@ def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
             variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
             turn, rate = turn + variance * unknown**2, rate + variance
     return turn, rate
-
-
-def _propagate(jacobian: Array, covariance: Array) -> Array:
-    result: Array = jacobian @ covariance @ jacobian.T
-    return 0.5 * (result + result.T)  # rounding must not cost the symmetry

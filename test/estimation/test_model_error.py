@@ -10,7 +10,13 @@ from scipy.spatial import cKDTree
 
 from rs_localizer.core.shake import shake_at, shake_basis, shake_in_the_middle
 from rs_localizer.estimation.columns import columns_of, with_prior
-from rs_localizer.estimation.evidence import evidence_of_sizes, possible, project_out, sizes_of
+from rs_localizer.estimation.evidence import (
+    evidence_of_sizes,
+    possible,
+    project_out,
+    sizes_of,
+    tridiagonal,
+)
 from rs_localizer.estimation.model_error import neighbours_agree, shared_errors, with_model_error
 from rs_localizer.estimation.prior_terms import motion_terms
 
@@ -355,3 +361,20 @@ def test_noise_is_rarely_said_to_be_shared():
     assert found.max() < 0.3
     assert shared_errors(np.zeros((100, 2)), rays, everything) == 0.0
     assert shared_errors(rng.normal(size=(100, 2)), rays, ~everything) == 0.0
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 20])
+def test_a_tridiagonal_form_has_the_same_eigenvalues_and_solutions(size):
+    rng = np.random.default_rng(size)
+    root, column = rng.normal(size=(size + 2, size)), rng.normal(size=size)
+    matrix = root.T @ root
+    lower = np.tril(matrix) + np.triu(np.full((size, size), np.nan), 1)  # the rest is not read
+    for side in (column, np.zeros(size)):
+        diagonal, beside, length = tridiagonal(lower, side)
+        found = np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1)
+        expected = np.linalg.eigvalsh(matrix)
+        np.testing.assert_allclose(np.linalg.eigvalsh(found), expected, atol=1e-12)
+        for shift in (0.5, 20.0):
+            solved = np.linalg.solve(matrix + shift * np.eye(size), side)
+            along = length * np.linalg.solve(found + shift * np.eye(size), np.eye(size)[0])
+            assert length * along[0] == pytest.approx(side @ solved, abs=1e-12)

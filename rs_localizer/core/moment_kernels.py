@@ -1,0 +1,171 @@
+"""Pose and twist at one row time, with their covariances: the formulas of
+:mod:`rs_localizer.pipeline.moments`, all in one call."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.known_turn import Turning, find_turn, late_at
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.rate_spline import change_at
+from rs_localizer.core.shake import shake_basis
+from rs_localizer.core.shutter import Numbers
+from rs_localizer.core.state import PARAMETERS
+
+
+@kernel
+def pose_of(
+    motion: Numbers, shake: Array, joint: Array, turn: Turning, tau: float, beyond: float
+) -> tuple[Array, Array, Array]:
+    """Position (3,), rotation (3,3) map_from_camera and covariance (6,6): place, then turn.
+
+    Args:
+        motion: at the middle row, with the known turn.
+        shake: (k,3) coefficients.
+        joint: (18 + 3 k,18 + 3 k) covariance of motion and coefficients.
+        turn: what a gyroscope knows.
+        tau: row time.
+        beyond: variance of the turn (rad^2) that no row has seen.
+    """
+    rotation, translation, angular, linear, change, acceleration = motion
+    angle = tau * (angular - turn.rate) + 0.5 * tau * tau * (change - turn.change)
+    way = tau * linear + 0.5 * tau * tau * acceleration
+    map_from_middle = np.ascontiguousarray(rotation.T)
+    values, _, turned, _ = _shaken(shake, tau, max(_columns(joint), len(shake)))
+    known, rate = np.empty((3, 3)), np.empty(3)
+    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, known, rate)
+    map_from_swing = map_from_middle @ so3.exp(angle) @ so3.exp(turned)  # as if not turned beside
+    map_from_then = map_from_swing @ np.ascontiguousarray(known.T)
+    by_angle = map_from_middle @ so3.right_jacobian_of(-angle)
+    jacobian = np.zeros((6, len(joint)))
+    jacobian[0:3, 0:3] = -map_from_middle @ so3.hat_of(way)
+    jacobian[0:3, 3:6] = map_from_middle
+    jacobian[0:3, 9:12] = tau * map_from_middle
+    jacobian[0:3, 15:18] = 0.5 * tau * tau * map_from_middle
+    jacobian[3:6, 0:3] = map_from_middle
+    jacobian[3:6, 6:9] = tau * by_angle
+    jacobian[3:6, 12:15] = 0.5 * tau * tau * by_angle
+    for k in range(_columns(joint)):
+        place = PARAMETERS + 3 * k
+        jacobian[3:6, place : place + 3] = values[k] * map_from_swing
+    covariance = _propagated(jacobian, joint)
+    late = turn.delay * (map_from_then @ late_at(tau, turn.tau, turn.rates, turn.parabola)[0])
+    for i in range(3):
+        for j in range(3):
+            covariance[3 + i, 3 + j] += late[i] * late[j]
+        covariance[3 + i, 3 + i] += beyond
+    return map_from_middle @ (way - translation), map_from_then, covariance
+
+
+@kernel
+def twist_of(
+    motion: Numbers, shake: Array, joint: Array, turn: Turning, tau: float,
+    beyond: tuple[float, float],
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Linear and angular velocity (3,) in camera axes, and their covariance (6,6); per readout.
+
+    Args:
+        motion, shake, joint, turn, tau: as of :func:`pose_of`.
+        beyond: variances of the turn (rad^2) and its rate that no row has seen.
+    """
+    _, _, angular_velocity, linear_velocity, change, acceleration = motion
+    rate, change = angular_velocity - turn.rate, change - turn.change
+    angle = tau * rate + 0.5 * tau * tau * change
+    values, rates, turned, swing = _shaken(shake, tau, max(_columns(joint), len(shake)))
+    known, known_rate = np.empty((3, 3)), np.empty(3)
+    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, known, known_rate)
+    unshaken = so3.exp(-turned)
+    beside = known @ unshaken
+    back, by_angle = so3.exp(-angle), so3.right_jacobian_of(angle)
+    linear = beside @ (back @ (linear_velocity + tau * acceleration))
+    body_rate = unshaken @ (by_angle @ (rate + tau * change))
+    swinging = known @ (body_rate + so3.right_jacobian_of(turned) @ swing)  # without the known rate
+    by_turn = beside @ back
+    by_rate = so3.hat_of(linear) @ (beside @ by_angle)
+    by_acceleration = 0.5 * tau * (beside @ (np.eye(3) + by_angle))
+    jacobian = np.zeros((6, len(joint)))
+    jacobian[0:3, 6:9] = tau * by_rate
+    jacobian[0:3, 12:15] = 0.5 * tau * tau * by_rate
+    jacobian[0:3, 9:12] = by_turn
+    jacobian[0:3, 15:18] = tau * by_turn
+    jacobian[3:6, 6:9] = beside
+    jacobian[3:6, 12:15] = by_acceleration
+    linear_by_shake = so3.hat_of(linear) @ known
+    angular_by_shake = so3.hat_of(swinging) @ known
+    for k in range(_columns(joint)):
+        place = PARAMETERS + 3 * k
+        jacobian[0:3, place : place + 3] = values[k] * linear_by_shake
+        jacobian[3:6, place : place + 3] = rates[k] * known + values[k] * angular_by_shake
+    covariance = _propagated(jacobian, joint)
+    late = turn.delay * late_at(tau, turn.tau, turn.rates, turn.parabola)[1]
+    across = so3.hat_of(linear)
+    for i in range(3):
+        for j in range(3):
+            covariance[3 + i, 3 + j] += late[i] * late[j]
+            for k in range(3):
+                covariance[i, j] += beyond[0] * across[i, k] * across[j, k]
+        covariance[3 + i, 3 + i] += turn.rate_noise * turn.rate_noise + beyond[1]
+    angular = swinging + known_rate
+    if _better_known(turn, tau, covariance):
+        angular = known_rate
+    return linear, angular, covariance
+
+
+@kernel
+def _better_known(turn: Turning, tau: float, covariance: Array) -> bool:
+    """Whether the gyroscope alone knows the rate better; the covariance (6,6) is its own then."""
+    if not turn.tau[0] <= tau <= turn.tau[-1]:
+        return False
+    late = turn.delay * change_at(tau, turn.tau, turn.rates)
+    own, all_in_all = 0.0, 0.0
+    for i in range(3):
+        own += turn.rate_error[i, i] + turn.rate_noise * turn.rate_noise + late[i] * late[i]
+        all_in_all += covariance[3 + i, 3 + i]
+    if not own < all_in_all:
+        return False
+    covariance[3:6] = 0.0
+    covariance[0:3, 3:6] = 0.0
+    for i in range(3):
+        for j in range(3):
+            covariance[3 + i, 3 + j] = turn.rate_error[i, j] + late[i] * late[j]
+        covariance[3 + i, 3 + i] += turn.rate_noise * turn.rate_noise
+    return True
+
+
+@kernel
+def _shaken(shake: Array, tau: float, count: int) -> tuple[Array, Array, Array, Array]:
+    """So many polynomials at a row time, their rates, the turn (3,) that they make, its rate.
+
+    Before the first and after the last row the camera stays as it was.
+    """
+    here = min(max(tau, -0.5), 0.5)
+    values, rates = np.zeros(count), np.zeros(count)
+    if count:
+        shake_basis(here, count + 1, values, rates)
+    if tau != here:
+        rates[:] = 0.0
+    turn, rate = np.zeros(3), np.zeros(3)
+    for k in range(len(shake)):
+        for axis in range(3):
+            turn[axis] += values[k] * shake[k, axis]
+            rate[axis] += rates[k] * shake[k, axis]
+    return values, rates, turn, rate
+
+
+@kernel
+def _columns(joint: Array) -> int:
+    """How many polynomials a joint covariance is of."""
+    return (len(joint) - PARAMETERS) // 3
+
+
+@kernel
+def _propagated(jacobian: Array, covariance: Array) -> Array:
+    """Symmetric to the bit."""
+    found = jacobian @ covariance @ jacobian.T
+    for i in range(len(found)):
+        for j in range(i):
+            found[i, j] = 0.5 * (found[i, j] + found[j, i])
+            found[j, i] = found[i, j]
+    return found
