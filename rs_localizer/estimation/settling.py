@@ -21,6 +21,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
 from rs_localizer.estimation.evidence import Sizes
+from rs_localizer.estimation.humming import Heard, averaged, hear
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.mixture import CLEARLY_WORSE, DISTRUST, Inliers, volume_of, weighed
 from rs_localizer.estimation.model_error import Examined
@@ -28,7 +29,7 @@ from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside
 from rs_localizer.estimation.refine import apply_step, inverted
-from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, follow
+from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, agreement_of, follow
 
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part.
@@ -99,6 +100,9 @@ def _settled(
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
     may_shake = assumed.rolling and not mirrored_fits
+    heard = hear(frame, best, examined.loudness, threshold) if may_shake else None
+    if heard and heard.certain:
+        return _humming(frame, best, sizes, heard)
     seems_to_shake = may_shake and _seems_to_shake(frame, best, examined)
     certain = examined.agreement > _CERTAIN
     if seems_to_shake and (certain or not _rather_rests(frame, best, examined)):
@@ -125,8 +129,8 @@ def _settled(
     planar = other is not None
     turn_known = assumed.turn is not None
     if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
-        return weighed(frame, found, planar)
-    return found
+        found = weighed(frame, found, planar)
+    return averaged(observations, heard, found, found) if heard else found
 
 
 def _seems_to_shake(frame: Inliers, best: Posterior, examined: Examined) -> bool:
@@ -178,6 +182,20 @@ def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -
         inliers=shaken.inliers,
         shake=shaken.coefficients,
         agreement=shaken.agreement,
+        of_shake_sizes=sizes.of_shake_sizes,
+        of_field_sizes=sizes.of_field_sizes,
+    )
+
+
+def _humming(frame: Inliers, best: Posterior, sizes: Sizes, heard: Heard) -> Posterior:
+    found = averaged(frame.observations, heard, None, best)
+    tone = heard.tones[int(np.argmax(heard.probabilities))]
+    agreement = agreement_of(frame.observations, tone.errors, tone.squared_errors, tone.inliers)
+    worth = _worth(_correlation(agreement, tone.inliers))
+    return replace(
+        found,
+        covariance=found.covariance / worth,
+        agreement=agreement,
         of_shake_sizes=sizes.of_shake_sizes,
         of_field_sizes=sizes.of_field_sizes,
     )
