@@ -1,4 +1,4 @@
-"""A tone, shaking of one frequency, as polynomials of the row time (:mod:`rs_localizer.core.shake`).
+"""A tone, shaking of one frequency, as polynomials of the row time.
 
 A cosine and a sine of ``z x`` are series of Legendre polynomials, whose coefficients die out fast
 beyond degree ``z`` (spherical Bessel functions; NIST Digital Library of Mathematical Functions,
@@ -21,11 +21,10 @@ MOST_CYCLES = 8.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-@cache
 def degrees_for(cycles: float) -> int:
     """Degree of the polynomials that follow a tone to a part in a thousand."""
     z = math.pi * cycles
-    return math.ceil(z + 3.0 * z ** (1.0 / 3.0) + 2.0)
+    return math.ceil(z + 3.0 * math.cbrt(z) + 2.0)
 
 
 @cache
@@ -43,12 +42,13 @@ def tone_coefficients(cycles: float, degrees: int) -> Array:
     What is taken away at the middle row is the motion's, as of all shaking.
     """
     angle = math.pi * cycles * _NODES
-    return _polynomials(degrees) @ np.column_stack([np.cos(angle), np.sin(angle)])
+    coefficients: Array = _polynomials(degrees) @ np.column_stack([np.cos(angle), np.sin(angle)])
+    return coefficients
 
 
 def tone_slopes(cycles: float, degrees: int) -> Array:
     """Derivatives (k,2) of the coefficients by the cycles."""
     angle, by_cycles = math.pi * cycles * _NODES, math.pi * _NODES
-    return _polynomials(degrees) @ np.column_stack(
-        [-by_cycles * np.sin(angle), by_cycles * np.cos(angle)]
-    )
+    slopes = [-by_cycles * np.sin(angle), by_cycles * np.cos(angle)]
+    derivatives: Array = _polynomials(degrees) @ np.column_stack(slopes)
+    return derivatives

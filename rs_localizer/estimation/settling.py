@@ -21,7 +21,8 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
 from rs_localizer.estimation.evidence import Sizes
-from rs_localizer.estimation.humming import Heard, averaged, hear
+from rs_localizer.estimation.hearing import hear
+from rs_localizer.estimation.humming import Heard, averaged
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.mixture import CLEARLY_WORSE, DISTRUST, Inliers, volume_of, weighed
 from rs_localizer.estimation.model_error import Examined
@@ -29,7 +30,7 @@ from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside
 from rs_localizer.estimation.refine import apply_step, inverted
-from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, agreement_of, follow
+from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, follow
 
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part.
@@ -100,15 +101,18 @@ def _settled(
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
     may_shake = assumed.rolling and not mirrored_fits
-    heard = hear(frame, best, examined.loudness, threshold) if may_shake else None
-    if heard and heard.certain:
-        return _humming(frame, best, sizes, heard)
+    heard = hear(frame, best, examined, threshold) if may_shake else None
+    humming = _humming(best, sizes, heard) if heard and heard.certain else None
+    if heard and humming and heard.tonal and humming.agreement < AGREEMENT:
+        return humming
     seems_to_shake = may_shake and _seems_to_shake(frame, best, examined)
     certain = examined.agreement > _CERTAIN
     if seems_to_shake and (certain or not _rather_rests(frame, best, examined)):
         shaken = _followed(frame, best, sizes, threshold)
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
-            return shaken
+            return _either(heard, humming, shaken)
+    if humming:
+        return humming
     shared = examined.shared
     if may_shake and not seems_to_shake and examined.agreement > AGREEMENT:
         shared = max(shared, _correlation(examined.agreement, best.inliers))
@@ -130,7 +134,7 @@ def _settled(
     turn_known = assumed.turn is not None
     if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
         found = weighed(frame, found, planar)
-    return averaged(observations, heard, found, found) if heard else found
+    return averaged(heard, found) if heard else found
 
 
 def _seems_to_shake(frame: Inliers, best: Posterior, examined: Examined) -> bool:
@@ -187,18 +191,27 @@ def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -
     )
 
 
-def _humming(frame: Inliers, best: Posterior, sizes: Sizes, heard: Heard) -> Posterior:
-    found = averaged(frame.observations, heard, None, best)
-    tone = heard.tones[int(np.argmax(heard.probabilities))]
-    agreement = agreement_of(frame.observations, tone.errors, tone.squared_errors, tone.inliers)
-    worth = _worth(_correlation(agreement, tone.inliers))
+def _humming(best: Posterior, sizes: Sizes, heard: Heard) -> Posterior:
+    """The posterior of a camera that tones shake."""
+    found = averaged(heard, best)
+    worth = _worth(_correlation(heard.agreement, found.inliers))
     return replace(
         found,
         covariance=found.covariance / worth,
-        agreement=agreement,
         of_shake_sizes=sizes.of_shake_sizes,
         of_field_sizes=sizes.of_field_sizes,
     )
+
+
+def _either(heard: Heard | None, humming: Posterior | None, shaken: Posterior) -> Posterior:
+    """What tones and polynomials make of a shaking together: neither is known to be right."""
+    if heard is None or (humming is None and heard.agreement > AGREEMENT):
+        return shaken
+    if humming is None:
+        return averaged(heard, shaken)
+    if max(humming.agreement, shaken.agreement) > AGREEMENT:
+        return min(humming, shaken, key=lambda found: found.agreement)
+    return averaged(replace(heard, none=0.5, probabilities=0.5 * heard.probabilities), shaken)
 
 
 def _clearly_moving(found: Posterior, terms: PriorTerms, turn_known: bool) -> bool:

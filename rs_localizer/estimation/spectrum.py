@@ -14,7 +14,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.tones import MOST_CYCLES
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
@@ -53,10 +52,9 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
         if chosen[i]:
             place = _bin(tau[i])
             for axis in range(3):
-                for line in range(2):
-                    turn = by_turn[i, line, axis]
-                    heard[axis, place] += turn * errors[i, line]
-                    known[axis] += turn * turn
+                first, second = by_turn[i, 0, axis], by_turn[i, 1, axis]
+                heard[axis, place] += first * errors[i, 0] + second * errors[i, 1]
+                known[axis] += first * first + second * second
             squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
             count += 1
     if not squared > 0.0:
@@ -78,66 +76,67 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
 
 @kernel
 def spectrum(
-    errors: Array, by_motion: Array, by_turn: Array, tau: Array, chosen: BoolArray,
-    motion: Columns, freedom: float, noise: float,
+    errors: Array, columns: Array, by_turn: Array, tau: Array, chosen: BoolArray,
+    known: Columns, freedom: float, noise: float,
 ) -> Array:  # fmt: skip
     """Logarithm of the marginal likelihood (m,s) of tones of all frequencies and sizes.
 
     Args:
-        errors, by_motion, by_turn, tau: of the points.
+        errors, by_turn, tau: of the points.
+        columns: (n,2,p) derivatives of the errors by all that is fitted beside the tone.
         chosen: (n,) the points that count.
-        motion: the columns of these points, with the prior, and without shaking.
+        known: products of these columns, with the prior.
         freedom: degrees of freedom of the errors beside the motion.
         noise: px, a first estimate.
     """
-    # What turns at a row have in common with motion, turns and errors there, side by side.
-    width = PARAMETERS + 4
-    shared = np.zeros((_BINS, 3, width))
+    # What turns at a row have in common with these columns, turns and errors there.
+    base = columns.shape[2]
+    shared = np.zeros((_BINS, 3, base + 4))
     for i in range(len(errors)):
         if chosen[i]:
             at = shared[_bin(tau[i])]
             for axis in range(3):
                 for line in range(2):
                     turn = by_turn[i, line, axis]
-                    for k in range(PARAMETERS):
-                        at[axis, k] += turn * by_motion[i, line, k]
+                    for k in range(base):
+                        at[axis, k] += turn * columns[i, line, k]
                     for other in range(3):
-                        at[axis, PARAMETERS + other] += turn * by_turn[i, line, other]
-                    at[axis, PARAMETERS + 3] += turn * errors[i, line]
-    size = PARAMETERS + _TONE
+                        at[axis, base + other] += turn * by_turn[i, line, other]
+                    at[axis, base + 3] += turn * errors[i, line]
+    size = base + _TONE
     products, right = np.zeros((size, size)), np.zeros(size)
-    products[:PARAMETERS, :PARAMETERS] = motion.products
-    right[:PARAMETERS] = motion.with_errors
+    products[:base, :base] = known.products
+    right[:base] = known.with_errors
     evidence = np.empty((len(CYCLES), len(SWINGS)))
     for m in range(len(CYCLES)):
-        _with_tone(shared, m, products, right)
-        left = project_out(products, right, motion.squared_errors, _TONE)
+        _with_tone(shared, m, base, products, right)
+        left = project_out(products, right, known.squared_errors, _TONE)
         evidence[m], _ = evidence_of_sizes(left, SWINGS, freedom, noise)
     return evidence
 
 
 @kernel
-def _with_tone(shared: Array, tone: int, products: Array, right: Array) -> None:
-    """Fill in the rows and columns of a tone."""
-    for k in range(PARAMETERS, len(right)):
+def _with_tone(shared: Array, tone: int, base: int, products: Array, right: Array) -> None:
+    """Fill in the rows and columns of a tone behind the others."""
+    for k in range(base, len(right)):
         right[k] = 0.0
         products[k] = 0.0
     for place in range(_BINS):
         at = shared[place]
-        if at[0, PARAMETERS] == 0.0:
+        if at[0, base] == 0.0:
             continue
         for wave in range(2):
             along = _WAVES[wave, tone, place]
-            first = PARAMETERS + 3 * wave
+            first = base + 3 * wave
             for axis in range(3):
                 row, there = products[first + axis], at[axis]
-                right[first + axis] -= along * there[PARAMETERS + 3]
-                for k in range(PARAMETERS):
+                right[first + axis] -= along * there[base + 3]
+                for k in range(base):
                     row[k] += along * there[k]
                 for other in range(2):
                     both = along * _WAVES[other, tone, place]
                     for k in range(3):
-                        row[PARAMETERS + 3 * other + k] += both * there[PARAMETERS + k]
-    for k in range(PARAMETERS, len(right)):
-        for j in range(PARAMETERS):
+                        row[base + 3 * other + k] += both * there[base + k]
+    for k in range(base, len(right)):
+        for j in range(base):
             products[j, k] = products[k, j]

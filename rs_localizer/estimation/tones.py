@@ -1,8 +1,7 @@
-"""A camera that shakes at one frequency, however far and fast.
+"""A camera that shakes at a few frequencies, however far and fast.
 
 Large swings leave the search with the rows of one phase; the others are beyond the gate, but not
-far. So tones are looked for among all points that are near (:mod:`.spectrum`), and the gate closes
-while motion, swing and frequency are fitted together.
+far. So the gate closes slowly while motion, swings and frequencies are fitted together.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import ANGULAR, PARAMETERS, TURN
 from rs_localizer.core.tones import MOST_CYCLES, degrees_for, tone_coefficients, tone_slopes
+from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, noise_deviation
 from rs_localizer.estimation.prior_kernels import add_prior
@@ -26,9 +26,6 @@ from rs_localizer.estimation.residuals import linearized
 
 FEWEST = 20
 """Points that a tone could be told from."""
-PARAMETERS_OF_TONE = 7
-_SWINGS = slice(PARAMETERS, PARAMETERS + 6)
-_CYCLES = PARAMETERS + 6
 _LEAST_SIZE = 1e-6  # rad
 _SLOWEST, _FASTEST = 0.5, MOST_CYCLES + 0.5  # cycles per readout
 # A tone found on a grid of frequencies is no farther from one of its lines (deviation), and no step
@@ -37,182 +34,195 @@ _OFF_GRID, _FARTHEST = 0.25, 0.15
 _CLOSING = 0.6  # of the gate, from step to step
 _STEPS = 20
 _CLOSE = 0.01  # squared length of the last step, in standard deviations
-
-
-class Start(NamedTuple):
-    """Where a tone is looked for."""
-
-    state: Array  # (24,) the motion
-    cycles: float
-    size: float  # rad
-    gate: float  # px
-    noise: float  # px
+_BEHIND = 1e150  # px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tone:
-    """A motion and a tone beside it: ``swings[0] cos(w tau) + swings[1] sin(w tau)``.
+class Tones:
+    """A motion and tones beside it, each ``swings[0] cos(w tau) + swings[1] sin(w tau)``.
 
-    Errors are of the motion (18), the swings (6) and the cycles.
+    Parameters: motion (18), swings (6 of each tone), cycles (1 of each).
     """
 
-    beside: Array  # (24,) the motion without the tone
-    swings: Array  # (2,3) rad
-    cycles: float  # per readout
-    size: float  # rad, of the swings' coordinates
-    noise: float  # px
-    covariance: Array  # (25,25)
-    squared_errors: Array  # (n,) px^2
-    inliers: BoolArray  # (n,)
-    errors: Array  # (n,2) px
-    prior_cost: float  # of the motion, noise variances
+    beside: Array  # (24,) the motion without the tones
+    cycles: Array  # (q,) per readout
+    swings: Array  # (q,2,3) rad
+    sizes: Array  # (q,) rad, of the swings' coordinates
+
+    @classmethod
+    def none(cls, state: Array) -> Tones:
+        """A motion (24,) alone."""
+        return cls(state, np.zeros(0), np.zeros((0, 2, 3)), np.zeros(0))
+
+    def with_one(self, cycles: float, size: float) -> Tones:
+        """One tone more, of which only frequency and size are known."""
+        return replace(
+            self,
+            cycles=np.append(self.cycles, cycles),
+            swings=np.concatenate([self.swings, np.zeros((1, 2, 3))]),
+            sizes=np.append(self.sizes, size),
+        )
+
+    @property
+    def swung(self) -> slice:
+        """Where the swings are among the parameters; the cycles are behind them."""
+        return slice(PARAMETERS, PARAMETERS + 6 * len(self.cycles))
+
+    @property
+    def degrees(self) -> int:
+        """Of the polynomials that follow them."""
+        return max((degrees_for(cycles) for cycles in self.cycles), default=1)
 
     @property
     def state(self) -> Array:
-        """The motion (24,) together with the tone at the middle row."""
+        """The motion (24,) together with the tones at the middle row."""
         step = np.zeros(PARAMETERS)
-        step[TURN] = self.swings[0]
-        step[ANGULAR] = 2.0 * math.pi * self.cycles * self.swings[1]
+        step[TURN] = self.swings[:, 0].sum(axis=0)
+        step[ANGULAR] = 2.0 * math.pi * self.cycles @ self.swings[:, 1]
         moved: Array = apply_step(self.beside, step)
         return moved
 
     def coefficients(self, degrees: int) -> Array:
-        """The rest of the tone (k,3), as shaking (:mod:`rs_localizer.core.shake`)."""
-        rest: Array = tone_coefficients(self.cycles, degrees) @ self.swings
-        return rest
+        """The rest of the tones (k,3), as shaking (:mod:`rs_localizer.core.shake`)."""
+        total = np.zeros((degrees - 1, 3))
+        for cycles, swings in zip(self.cycles, self.swings, strict=True):
+            total += tone_coefficients(cycles, degrees) @ swings
+        return total
 
     def by_parameters(self, degrees: int) -> Array:
-        """Derivatives (18 + 3 k, 25) of :attr:`state` and :meth:`coefficients`."""
-        jacobian = np.zeros((PARAMETERS + 3 * (degrees - 1), PARAMETERS + PARAMETERS_OF_TONE))
+        """Derivatives (18 + 3 k, 18 + 7 q) of :attr:`state` and :meth:`coefficients`."""
+        count = len(self.cycles)
+        jacobian = np.zeros((PARAMETERS + 3 * (degrees - 1), PARAMETERS + 7 * count))
         jacobian[:PARAMETERS, :PARAMETERS] = np.eye(PARAMETERS)
-        cosine, sine = _SWINGS.start, _SWINGS.start + 3
-        jacobian[TURN, cosine:sine] = np.eye(3)
-        jacobian[ANGULAR, sine:_CYCLES] = 2.0 * math.pi * self.cycles * np.eye(3)
-        jacobian[ANGULAR, _CYCLES] = 2.0 * math.pi * self.swings[1]
-        by_swings = tone_coefficients(self.cycles, degrees)
-        jacobian[PARAMETERS:, _SWINGS] = np.kron(by_swings, np.eye(3))
-        jacobian[PARAMETERS:, _CYCLES] = (tone_slopes(self.cycles, degrees) @ self.swings).ravel()
+        for index, (cycles, swings) in enumerate(zip(self.cycles, self.swings, strict=True)):
+            cosine = PARAMETERS + 6 * index
+            sine, frequency = cosine + 3, PARAMETERS + 6 * count + index
+            jacobian[TURN, cosine:sine] = np.eye(3)
+            jacobian[ANGULAR, sine : sine + 3] = 2.0 * math.pi * cycles * np.eye(3)
+            jacobian[ANGULAR, frequency] = 2.0 * math.pi * swings[1]
+            by_swings = np.kron(tone_coefficients(cycles, degrees), np.eye(3))
+            jacobian[PARAMETERS:, cosine : sine + 3] = by_swings
+            jacobian[PARAMETERS:, frequency] = (tone_slopes(cycles, degrees) @ swings).ravel()
         return jacobian
 
 
-class _Linear(NamedTuple):
-    """The points at a motion and a tone."""
+class Seen(NamedTuple):
+    """The points of a frame at a motion with tones."""
 
-    errors: Array  # (n,2)
+    errors: Array  # (n,2) px
     squared_errors: Array  # (n,)
-    columns: Array  # (n,2,25)
+    columns: Array  # (n,2,18 + 7 q) derivatives by the parameters
+    by_turn: Array  # (n,2,3)
+    tau: Array  # (n,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The best motion with tones, and what the points say of it."""
+
+    tones: Tones
+    seen: Seen
+    covariance: Array  # (18 + 7 q, 18 + 7 q)
+    noise: float  # px
+    inliers: BoolArray  # (n,)
+    prior_cost: float  # of the motion, noise variances
+
+
+def seen_at(observations: Observations, tones: Tones) -> Seen:
+    """The errors that tones leave, and their derivatives."""
+    shake = shake_at(observations.tau, tones.coefficients(tones.degrees))
+    errors, by_motion, by_turn, tau = linearized(
+        observations.packed,
+        len(observations),
+        tones.state,
+        observations.row_time_gradient,
+        shake,
+    )
+    behind = np.isinf(observations.squared_errors(tones.beside))
+    errors[behind] = _BEHIND
+    squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
+    angle = 2.0 * math.pi * np.outer(tau, tones.cycles)
+    waves = np.stack([np.cos(angle), np.sin(angle)], axis=2)  # (n,q,2)
+    by_swings = np.einsum("nqw,nia->niqwa", waves, by_turn).reshape(*errors.shape, -1)
+    slopes = np.stack([-waves[..., 1], waves[..., 0]], axis=2) * (
+        2.0 * math.pi * tau[:, None, None]
+    )
+    by_cycles = np.einsum("nqw,qwa,nia->niq", slopes, tones.swings, by_turn)
+    columns = np.concatenate([by_motion, by_swings, by_cycles], axis=2)
+    return Seen(errors, squared, columns, by_turn, tau)
+
+
+def products_of(
+    tones: Tones, seen: Seen, chosen: BoolArray, terms: PriorTerms, noise: float
+) -> tuple[Columns, float]:
+    """Products of the columns of the chosen points (n,), with all that is known beforehand, px^2;
+    and the cost of the motion's prior, in noise variances."""
+    columns = seen.columns[chosen].reshape(-1, seen.columns.shape[2])
+    errors = seen.errors[chosen].ravel()
+    products, with_errors = columns.T @ columns, -columns.T @ errors
+    information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    cost = float(add_prior(*terms, tones.beside, 1.0, information, slope))
+    known = np.zeros(len(products))
+    known[tones.swung] = np.repeat(tones.sizes**-2, 6)
+    known[tones.swung.stop :] = _OFF_GRID**-2
+    variance = noise * noise
+    products[:PARAMETERS, :PARAMETERS] += variance * information
+    with_errors[:PARAMETERS] -= variance * slope
+    products[np.diag_indices_from(products)] += variance * known
+    with_errors[tones.swung] -= variance * known[tones.swung] * tones.swings.ravel()
+    return Columns(products, with_errors, float(errors @ errors) + variance * cost, 0), cost
 
 
 def fitted(
-    observations: Observations, start: Start, terms: PriorTerms, threshold: float
-) -> Tone | None:
-    """The tone near another one, with the motion beside it and the points that it explains.
+    observations: Observations, start: Tones, gate: float, terms: PriorTerms, threshold: float
+) -> Fit | None:
+    """The best motion with tones near others, and the points that it explains.
 
     Args:
-        start: its gate closes to that of inliers, as the noise decides it.
-        terms: of the motion without the tone.
+        gate: px, of the points that count at first; it closes to that of inliers, as the noise
+            decides it.
+        terms: of the motion without the tones.
         threshold: px, least gate of inliers.
 
     None where the fit leaves what can be computed, or nearly all points.
     """
-    nothing = np.zeros(len(observations), dtype=np.bool_)
-    tone = Tone(
-        start.state, np.zeros((2, 3)), start.cycles, start.size, start.noise, np.empty((0, 0)),
-        np.empty(0), nothing, np.empty((0, 2)), 0.0,
-    )  # fmt: skip
-    gate, last, chosen = start.gate, start.gate, nothing
+    tones, last = start, gate
+    chosen = np.zeros(len(observations), dtype=np.bool_)
     for index in range(_STEPS):
-        linear = _linear(observations, tone)
+        seen = seen_at(observations, tones)
+        noise = noise_deviation(seen.squared_errors, gate, float(seen.columns.shape[2]))
         if index > 0:
-            noise = noise_deviation(linear.squared_errors, gate, PARAMETERS + PARAMETERS_OF_TONE)
-            tone = replace(tone, noise=noise)
             last = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
             gate = max(_CLOSING * gate, last)
-        before, chosen = chosen, linear.squared_errors < gate * gate
+        before, chosen = chosen, seen.squared_errors < gate * gate
         if np.count_nonzero(chosen) < FEWEST:
             return None
-        found = _step(tone, linear, chosen, terms)
-        if found is None:
+        products, cost = products_of(tones, seen, chosen, terms, noise)
+        if not np.all(np.isfinite(products.products)):
             return None
-        step, tone, length = found
-        if length < _CLOSE and gate == last and np.array_equal(before, chosen):
+        inverse = inverted(products.products)
+        if not np.all(np.isfinite(inverse)):
+            return None
+        step, covariance = inverse @ products.with_errors, noise * noise * inverse
+        small = step @ products.with_errors < _CLOSE * noise * noise
+        settled = small and gate == last and np.array_equal(before, chosen)
+        if settled or index == _STEPS - 1:
             break
-        tone = _moved(tone, step)
-    else:
-        linear = _linear(observations, tone)
-        found = _step(tone, linear, chosen, terms)
-        if found is None:
-            return None
-        _, tone, _ = found
-    return tone
+        tones = _moved(tones, step, covariance)
+    return Fit(tones, seen, covariance, noise, chosen, cost)
 
 
-def _linear(observations: Observations, tone: Tone) -> _Linear:
-    state, count = tone.state, len(observations)
-    shake = shake_at(observations.tau, tone.coefficients(degrees_for(tone.cycles)))
-    errors, by_motion, by_turn, tau = linearized(
-        observations.packed, count, state, observations.row_time_gradient, shake
-    )
-    behind = np.isinf(observations.squared_errors(tone.beside))
-    errors[behind] = 1e150
-    squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
-    angle = 2.0 * math.pi * tone.cycles * tau
-    cosine, sine = np.cos(angle), np.sin(angle)
-    by_cycles = np.outer(cosine, tone.swings[1]) - np.outer(sine, tone.swings[0])
-    by_cycles *= 2.0 * math.pi * tau[:, None]
-    columns = np.concatenate(
-        [
-            by_motion,
-            cosine[:, None, None] * by_turn,
-            sine[:, None, None] * by_turn,
-            np.einsum("nij,nj->ni", by_turn, by_cycles)[..., None],
-        ],
-        axis=2,
-    )
-    return _Linear(errors, squared, columns)
-
-
-def _step(
-    tone: Tone, linear: _Linear, chosen: BoolArray, terms: PriorTerms
-) -> tuple[Array, Tone, float] | None:
-    """Step (25,) from a tone, the tone with what is known of it, and how far (variances)."""
-    columns = linear.columns[chosen].reshape(-1, PARAMETERS + PARAMETERS_OF_TONE)
-    information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    cost = add_prior(*terms, tone.beside, 1.0, information, slope)
-    weight = 1.0 / tone.noise**2
-    matrix, right = weight * (columns.T @ columns), -weight * (
-        columns.T @ linear.errors[chosen].ravel()
-    )
-    matrix[:PARAMETERS, :PARAMETERS] += information
-    right[:PARAMETERS] -= slope
-    matrix[_SWINGS, _SWINGS] += np.eye(6) / tone.size**2
-    right[_SWINGS] -= tone.swings.ravel() / tone.size**2
-    matrix[_CYCLES, _CYCLES] += _OFF_GRID**-2
-    covariance = inverted(matrix) if np.all(np.isfinite(matrix)) else matrix
-    if not np.all(np.isfinite(covariance)):
-        return None
-    step = covariance @ right
-    known = replace(
-        tone,
-        covariance=covariance,
-        squared_errors=linear.squared_errors,
-        inliers=chosen,
-        errors=linear.errors,
-        prior_cost=cost,
-    )
-    return step, known, float(step @ right)
-
-
-def _moved(tone: Tone, step: Array) -> Tone:
-    """A step (25,) farther, with the size that goes with the new swings."""
-    swings = tone.swings + step[_SWINGS].reshape(2, 3)
+def _moved(tones: Tones, step: Array, covariance: Array) -> Tones:
+    """A step (18 + 7 q,) farther, with the sizes that go with the new swings."""
+    swings = tones.swings + step[tones.swung].reshape(tones.swings.shape)
     # Without a swing, no direction is better than the other.
-    move = float(np.clip(step[_CYCLES], -_FARTHEST, _FARTHEST)) if np.any(tone.swings) else 0.0
-    square = (np.sum(swings**2) + np.trace(tone.covariance[_SWINGS, _SWINGS])) / 6.0
-    return replace(
-        tone,
-        beside=apply_step(tone.beside, step[:PARAMETERS]),
-        swings=swings,
-        cycles=min(max(tone.cycles + move, _SLOWEST), _FASTEST),
-        size=max(math.sqrt(square), _LEAST_SIZE),
+    swung = np.any(tones.swings, axis=(1, 2))
+    move = swung * np.clip(step[tones.swung.stop :], -_FARTHEST, _FARTHEST)
+    variances = np.diag(covariance)[tones.swung].reshape(-1, 6).sum(axis=1)
+    squares = (np.sum(swings**2, axis=(1, 2)) + variances) / 6.0
+    return Tones(
+        apply_step(tones.beside, step[:PARAMETERS]),
+        np.clip(tones.cycles + move, _SLOWEST, _FASTEST),
+        swings,
+        np.maximum(np.sqrt(squares), _LEAST_SIZE),
     )
