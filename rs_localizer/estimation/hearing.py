@@ -29,13 +29,13 @@ from rs_localizer.estimation.tone_evidence import (
 )
 from rs_localizer.estimation.tones import FEWEST, Fit, Tones, fitted, seen_at
 
-# Power of the loudest tone that noise exceeds in one frame of twelve.
-_LOUD = 16.5
+# Power of the loudest tone that noise exceeds in one frame of twenty.
+_LOUD = 18.0
 # So many points that are near, but no inliers, and such a part of the inliers: random matches
 # seldom lie there.
 _FEWEST_STRANGERS, _STRANGERS = 4, 0.1
 _WIDE = 3.5  # times the median error, of the points among which tones are looked for
-_IMPROBABLE = 0.1
+_IMPROBABLE = 0.2
 # Logarithm of the odds beside the best tone, beyond which none counts.
 _FAR_LESS_PROBABLE = 6.0
 _ALTERNATIVES = 3
@@ -65,8 +65,11 @@ def hear(frame: Inliers, best: Posterior, examined: Examined, threshold: float) 
         examined: what it leaves of the image.
         threshold: px, of inliers.
     """
-    near = _near(best, threshold)
-    if np.count_nonzero(near.chosen) < FEWEST or (examined.loudness < _LOUD and not near.strangers):
+    strangers = _strangers(best, threshold)
+    if examined.loudness < _LOUD and not strangers:
+        return None
+    near = _near(best, strangers, threshold)
+    if np.count_nonzero(near.chosen) < FEWEST:
         return None
     still = Tones.none(best.state)
     evidence, odds = _first_look(frame, still, examined, near)
@@ -89,10 +92,13 @@ def _first_look(
     """The spectrum (m,s), and the logarithm of the odds that tones are in it."""
     seen = seen_at(frame.observations, still)
     evidence = spectrum_of(frame, still, seen, near.chosen, near.noise)
+    odds = odds_of(frame, evidence)
+    if odds < math.log(_IMPROBABLE):
+        return evidence, odds
     # Map and lens, or slow shaking, may explain as much.
     field = gain_of_field(frame, still.beside, seen, near.chosen, near.noise)
     slow = np.logaddexp.reduce(np.log(frame.shake_prior) + examined.sizes.of_shake_sizes)
-    return evidence, odds_of(frame, evidence) - max(field, float(slow))
+    return evidence, odds - max(field, float(slow))
 
 
 def _heard(
@@ -113,15 +119,21 @@ def _heard(
     return Heard(fits, (1.0 - none) * weights / weights.sum(), none, agreement)
 
 
-def _near(best: Posterior, threshold: float) -> _Near:
-    """The inliers, and what lies beyond if that is more than chance."""
-    lengths = np.sqrt(best.squared_errors)
-    near = lengths < NEAR * threshold
+def _strangers(best: Posterior, threshold: float) -> bool:
+    """Whether more lies just beyond the gate than chance would put there."""
+    near = np.count_nonzero(best.squared_errors < (NEAR * threshold) ** 2)
     inliers = np.count_nonzero(best.inliers)
+    return near - inliers > max(_FEWEST_STRANGERS, _STRANGERS * inliers)
+
+
+def _near(best: Posterior, strangers: bool, threshold: float) -> _Near:
+    """The inliers, and strangers."""
+    lengths = np.sqrt(best.squared_errors)
     gate = float(lengths[best.inliers].max(initial=threshold))
-    if np.count_nonzero(near) - inliers <= max(_FEWEST_STRANGERS, _STRANGERS * inliers):
+    if not strangers:
         return _Near(best.inliers, gate, best.noise, False)
-    gate = min(max(2.0 * gate, _WIDE * float(np.median(lengths[near]))), NEAR * threshold)
+    typical = float(np.median(lengths[lengths < NEAR * threshold]))
+    gate = min(max(2.0 * gate, _WIDE * typical), NEAR * threshold)
     chosen = lengths < gate
     return _Near(chosen, gate, math.sqrt(0.5 * float(np.mean(lengths[chosen] ** 2))), True)
 

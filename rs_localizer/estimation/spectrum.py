@@ -28,6 +28,7 @@ _TONE = 6  # coefficients: of cosine and sine, about three axes
 _BINS = 96
 _ANGLES = 2.0 * math.pi * np.outer(CYCLES, (np.arange(_BINS) + 0.5) / _BINS - 0.5)
 _WAVES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_LITTLE = 1e-300
 
 
 @kernel
@@ -46,14 +47,14 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
             :func:`rs_localizer.estimation.residuals.linearized`.
         chosen: (n,) the points that count.
     """
-    heard, known = np.zeros((3, _BINS)), np.zeros(3)
+    heard, known = np.zeros((_BINS, 3)), np.zeros(3)
     squared, count = 0.0, 0
     for i in range(len(errors)):
         if chosen[i]:
             place = _bin(tau[i])
             for axis in range(3):
                 first, second = by_turn[i, 0, axis], by_turn[i, 1, axis]
-                heard[axis, place] += first * errors[i, 0] + second * errors[i, 1]
+                heard[place, axis] += first * errors[i, 0] + second * errors[i, 1]
                 known[axis] += first * first + second * second
             squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
             count += 1
@@ -62,12 +63,15 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
     most = 0.0
     for m in range(len(CYCLES)):
         power = 0.0
-        for axis in range(3):
-            for wave in range(2):
-                along = 0.0
-                for place in range(_BINS):
-                    along += _WAVES[wave, m, place] * heard[axis, place]
-                power += along * along / max(known[axis], 1e-300)
+        for wave in range(2):
+            x, y, z = 0.0, 0.0, 0.0
+            for place in range(_BINS):
+                along = _WAVES[wave, m, place]
+                x += along * heard[place, 0]
+                y += along * heard[place, 1]
+                z += along * heard[place, 2]
+            power += x * x / max(known[0], _LITTLE) + y * y / max(known[1], _LITTLE)
+            power += z * z / max(known[2], _LITTLE)
         most = max(most, power)
     # The squares of a wave are a half in the mean; squared errors are those of two coordinates.
     loud: float = 2.0 * most / (0.5 * squared / count)
