@@ -2,7 +2,8 @@
 
 The best motion is one point of a posterior that need not look like a Gaussian about it:
 
-* the camera may shake, and map and lens may be a little off (:mod:`.model_error`);
+* the camera may shake (:mod:`.hearing`, :mod:`.shaking`), and map and lens may be a little off
+  (:mod:`.model_error`);
 * the points may hardly tell a slow camera from a resting one, and before a plane motions of
   very different speed fit alike, along a curved valley: the typical speed is an unknown of its own;
 * a plane may lean the other way (:mod:`rs_localizer.estimation.mirror`).
