@@ -160,7 +160,8 @@ class Localizer:
         start = Candidate(predicted, best.cost)
         posterior = self._settle(observed, best, terms)
         innovation = step_between(predicted, posterior.state)
-        if innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION:
+        known = len(terms.informations) > len(observed.terms.informations)
+        if known and innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION:
             # A jump: the points know better.
             posterior = self._settle(observed, best, observed.terms)
         result = self._accept(observed, start, best, posterior)

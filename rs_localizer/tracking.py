@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
@@ -45,15 +45,13 @@ _LONGEST_GAP = 0.5
 _MOST_FAILURES = 5
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
-# What a frame says of shaking and model error fades by this from frame to frame, and counts as part
-# of what an independent frame would say: the next frame shows much the same.
-_MEMORY = 0.95
-_INDEPENDENT = 0.3
 # How fast surprises change the accelerations that are expected (exponent), and how much at most.
 _LEARNING = 0.2
 _MOST_JOLTS = 1e4
 # What a gyroscope knows.
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
+# Of a motion that is but a first guess.
+_UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least angular acceleration there is, rad/s^2: turns are told by a gyroscope.
 _NO_TURN = 0.001
 
@@ -65,8 +63,7 @@ class _Track:
     estimate: Estimate
     time_ns: int
     share: float  # of inliers among the points
-    of_shake_sizes: Array  # what all frames so far say of shaking and model error
-    of_field_sizes: Array
+    experience: Experience  # with shaking, map and lens
     jolts: float  # how many times the configured accelerations, squared
     failures: int = 0  # frames without a pose since then
 
@@ -92,6 +89,9 @@ class Tracker:
                 f"tracking needs velocities, which solver {localizer.config.solver} does not find"
             )
         self.localizer = localizer
+        # A readout time that is far off makes wrong velocities per readout of those from frame to
+        # frame: then each image speaks for itself, and the frames before give a first guess.
+        self.trusts_readout_time = True
         self._track: _Track | None = None
         readout_time = localizer.camera.readout_time
         self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
@@ -132,8 +132,8 @@ class Tracker:
         return Prior(
             motion=motion,
             covariance=covariance,
-            of_shake_sizes=track.of_shake_sizes,
-            of_field_sizes=track.of_field_sizes,
+            of_shake_sizes=track.experience.of_shake_sizes,
+            of_field_sizes=track.experience.of_field_sizes,
         )
 
     def localize(
@@ -162,6 +162,8 @@ class Tracker:
             prior = None if foreseen is None else foreseen.prior
             if prior is None:
                 prior = self.prediction(time_ns)
+                if prior is not None and not self.trusts_readout_time:
+                    prior = replace(prior, covariance=_UNKNOWN)
                 prior = prior if turn is None else _beside(prior, turn)
             return self.localizer.localize(points, pixels, scores, prior, share, turn), prior
 
@@ -198,8 +200,8 @@ class Tracker:
             covariance,
             added,
             FADING / readout_time,
-            track.of_shake_sizes,
-            track.of_field_sizes,
+            track.experience.of_shake_sizes,
+            track.experience.of_field_sizes,
         )
 
 
@@ -221,7 +223,7 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
     """The track and its newest frame."""
     share = float(np.mean(found.inliers))
     if track is None or prior is None or prior.motion is None:
-        return _Track(found, time_ns, share, found.of_shake_sizes, found.of_field_sizes, 1.0)
+        return _Track(found, time_ns, share, Experience.of(found), 1.0)
     if found.tracked:
         share = (1.0 - _NEWEST) * track.share + _NEWEST * share
     surprise = _surprise(prior, found)
@@ -229,8 +231,7 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
         found,
         time_ns,
         share,
-        _MEMORY * track.of_shake_sizes + _INDEPENDENT * found.of_shake_sizes,
-        _MEMORY * track.of_field_sizes + _INDEPENDENT * found.of_field_sizes,
+        track.experience.and_of(found),
         float(np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS)),
     )
 
@@ -239,13 +240,16 @@ def _surprise(prior: Prior, found: Estimate) -> float:
     """How many times farther than predicted the motion has changed, squared; 1 is as predicted.
 
     The squared step from the prediction to the estimate, in standard deviations of the prediction,
-    is expected to be what the points decide of the parameters.
+    is expected to be what the points decide of the parameters. Errors of map and lens make a step
+    larger, and its covariance larger than the prediction's: by at least that much.
     """
     assert prior.motion is not None
     assert prior.covariance is not None
+    if np.isinf(prior.covariance.diagonal()).any():
+        return 1.0  # a first guess surprises nobody
     information = inverted(prior.covariance)
     motion = found.beside_turn()
     step = step_between(state_in(prior.motion, np.zeros(3)), state_in(motion, np.zeros(3)))
     posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
-    expected = PARAMETERS - float(np.sum(information * posterior))
+    expected = abs(PARAMETERS - float(np.sum(information * posterior)))
     return float(step @ information @ step) / max(expected, 1.0)

@@ -31,16 +31,16 @@ def messages():
 
 
 def replayed(messages, **settings):
-    """What the node would publish: every frame has a pose."""
-    localizer = FrameLocalizer(NodeConfig(**settings))
-    frames = []
+    """What the node would publish, a pose of every frame, and what it would say."""
+    frames, notices = [], []
+    localizer = FrameLocalizer(NodeConfig(**settings), lambda _, text: notices.append(text))
     for topic, _, message in messages:
         if topic == "/camera/camera_info":
             localizer.calibrate(read_camera_info(message))
         else:
             frames.append(localizer.localize(message))
     assert all(frames)
-    return frames
+    return frames, notices
 
 
 def jitter(frames) -> tuple[float, float]:
@@ -54,7 +54,7 @@ def jitter(frames) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def p3p(messages):
-    return jitter(replayed(messages, solver="p3p"))
+    return jitter(replayed(messages, solver="p3p")[0])
 
 
 def test_p3p_is_what_it_was(p3p) -> None:
@@ -63,7 +63,8 @@ def test_p3p_is_what_it_was(p3p) -> None:
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_global_shutter_stays_one(messages, p3p, name: str) -> None:
-    frames = replayed(messages, **SETTINGS[name])
+    frames, notices = replayed(messages, **SETTINGS[name])
+    assert any("as of a global shutter" in text for text in notices) == ("20 ms" in name)
     median, most = jitter(frames)
     still = []
     for frame in frames:
@@ -74,9 +75,9 @@ def test_a_global_shutter_stays_one(messages, p3p, name: str) -> None:
             or velocities @ np.linalg.solve(twist.covariance, velocities) < REGION
         )
     found = f"jitter {median:.3f} and {most:.3f} deg, {np.mean(still):.1%} insignificant"
-    # What a tracker knows of the real motion it expects within the image, where a global shutter
-    # has none: a wrong readout time is not for the pose to mend, the node's watch names it.
-    allowed, least = (1.6, 0.8) if "tracked" in name else (1.1, 0.93)
+    # Who remembers finds out that map and lens are a little off, and which readout time is wrong,
+    # that after a second or two. Frames that stand alone are wrong now and then.
+    allowed = {"default": 1.001, "20 ms, tracked": 1.05, "20 ms, single": 1.08}[name]
     assert median <= allowed * p3p[0], found
     assert most <= allowed * p3p[1], found
-    assert np.mean(still) >= least, found
+    assert np.mean(still) >= (0.93 if name == "20 ms, single" else 0.99), found

@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.state import step_between
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import refine
+from rs_localizer.estimation.residuals import linearized
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
@@ -53,6 +56,10 @@ def residual(camera: Camera, cloud, start: rsl.Motion, velocities) -> tuple[rsl.
     rotation = state[:9].reshape(3, 3)
     motion = rsl.Motion(rotation, state[9:12] - rotation @ centre, state[12:15], state[15:18])
     return motion, float(np.sqrt(observations.squared_errors(state).mean()))
+
+
+def state_of(motion):
+    return state_in(motion, np.zeros(3))
 
 
 def central_differences(poses, seconds):
@@ -129,6 +136,58 @@ def test_the_tracked_twist_is_that_of_the_poses(recording):
     y = np.concatenate([results[i].angular_velocity / READOUT for i in fast])
     assert np.corrcoef(x, y)[0, 1] > 0.8
     assert 0.7 < x @ y / (x @ x) < 1.3
+
+
+def squared_normalized(error, covariance):
+    """Along the last axis, of as many dimensions as that has."""
+    return np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+def test_frames_lie_where_the_frames_before_predict_them(recording):
+    calibration, clouds = recording
+    localizer = rsl.Localizer(calibration.camera(READOUT, "top_to_bottom"))
+    tracker, surprises = Tracker(localizer), []
+    for cloud in clouds:
+        time_ns = cloud.stamp_ns + round(READOUT / 2 * 1e9)
+        prediction = tracker.prediction(time_ns)
+        alone = localizer.localize(cloud.points, cloud.pixels)
+        assert tracker.localize(time_ns, cloud.points, cloud.pixels)
+        if prediction is not None:
+            step = step_between(state_of(prediction.motion), state_of(alone))[:6]
+            spread = (prediction.covariance + alone.joint_covariance[:18, :18])[:6, :6]
+            surprises.append(squared_normalized(step, spread))
+    assert len(surprises) > 115
+    assert np.mean(np.array(surprises) < chi2.ppf(0.95, 6)) > 0.93
+    # Neither misled nor without an opinion; 6 are expected of 6 dimensions.
+    assert 1.5 < np.mean(surprises) < 7.0
+
+
+def test_corners_lie_where_those_of_other_rows_say(recording):
+    calibration, clouds = recording
+    camera = calibration.camera(READOUT, "top_to_bottom")
+    tracker, squared = Tracker(rsl.Localizer(camera)), []
+    for frame, cloud in enumerate(clouds):
+        rows = np.arange(len(cloud.points)) // 6  # of the board
+        used = (rows + frame) % 2 == 0
+        time_ns = cloud.stamp_ns + round(READOUT / 2 * 1e9)
+        found = tracker.localize(time_ns, cloud.points[used], cloud.pixels[used])
+        points, pixels = cloud.points[~used], cloud.pixels[~used]
+        rays, still = camera.rays(pixels), np.zeros((len(pixels), 6))
+        observations = Observations.of(
+            points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays),
+            camera.row_time_gradient,
+        )  # fmt: skip
+        errors, by_motion, _, _ = linearized(
+            observations.packed, len(points), state_of(found), camera.row_time_gradient, still
+        )
+        motion = found.joint_covariance[:18, :18]
+        spread = by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
+        # Twelve corners leave some 14 of their 24 coordinates to the noise.
+        noise = 0.5 * 24 / 14 * found.residual_rms**2 + found.model_error**2
+        squared.append(squared_normalized(errors, spread + noise * np.eye(2)))
+    squared = np.concatenate(squared)
+    assert np.mean(squared < chi2.ppf(0.95, 2)) > 0.93
+    assert 1.0 < np.mean(squared) < 2.4  # 2 are expected
 
 
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "p3p"])

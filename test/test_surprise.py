@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.tracking import _followed, _surprise, _Track
 
@@ -39,22 +40,28 @@ def predicted(spread):
     return Prior(motion=still, covariance=spread)
 
 
-def surprises(times, seen=slice(0, 18), frames=400):
-    """Of motions that change ``times`` as much as predicted, of which part is measured."""
+def surprises(times, seen=slice(0, 18), frames=400, field=0.0):
+    """Of motions that change ``times`` as much as predicted, of which part is measured.
+
+    ``field``: error of a map, as many times the prediction's deviations, that the gain ignores.
+    """
     rng = np.random.default_rng(0)
     # Small steps: what is not linear in them is left out of the filter here.
     prior, noise = (covariance(rng, size) for size in (1e-2, 5e-3))
     measured = np.eye(18)[seen]
     gain = prior @ measured.T @ np.linalg.inv(measured @ (prior + noise) @ measured.T)
-    posterior = prior - gain @ measured @ prior
+    off = field**2 * prior
+    posterior = prior - gain @ measured @ prior + gain @ measured @ off @ measured.T @ gain.T
     # Shaking behind the motion is none of its business.
     joint = np.eye(24)
     joint[:18, :18] = posterior
     found = []
     for _ in range(frames):
         truth = times * rng.multivariate_normal(np.zeros(18), prior)
-        look = measured @ (truth + rng.multivariate_normal(np.zeros(18), noise))
-        found.append(_surprise(predicted(prior), at(gain @ look, joint)))
+        error = rng.multivariate_normal(np.zeros(18), noise)
+        if field:
+            error += rng.multivariate_normal(np.zeros(18), off)
+        found.append(_surprise(predicted(prior), at(gain @ measured @ (truth + error), joint)))
     return np.array(found)
 
 
@@ -67,6 +74,11 @@ def test_larger_changes_surprise_by_their_square():
     calm, wild = (np.mean(surprises(times)) for times in (1.0, 5.0))
     assert 0.7 * 25 < wild / calm < 25
     assert np.mean(surprises(0.0)) < 0.5
+
+
+@pytest.mark.parametrize("field", [2.0, 5.0, 20.0])
+def test_a_map_that_is_off_hardly_surprises(field):
+    assert 0.9 < np.mean(surprises(1.0, field=field)) < 2.5
 
 
 def test_a_frame_that_decides_nothing_does_not_surprise():
@@ -82,7 +94,7 @@ def followed(times_deviation, tracked=True, jolts=1.0):
     step = times_deviation * np.sqrt(18.0) * np.linalg.cholesky(spread)[:, 0]
     found = replace(at(step, 0.01 * spread), tracked=tracked,
                     inliers=np.array([True, False, False, False, False]))  # fmt: skip
-    track = _Track(first, 0, 1.0, np.array([1.0, 1.0]), np.array([2.0, 0.0, 1.0]), jolts)
+    track = _Track(first, 0, 1.0, Experience.of(first), jolts)
     return _followed(track, predicted(spread), found, 5)
 
 
@@ -95,22 +107,10 @@ def test_surprises_raise_what_is_expected_and_calm_lowers_it():
     assert followed(100.0, jolts=9e3).jolts == 1e4
 
 
-def test_what_frames_say_of_sizes_adds_up_and_fades():
-    track = followed(1.0)
-    np.testing.assert_allclose(track.of_shake_sizes, 0.95 * np.ones(2) + 0.3 * np.array([0.0, 2.0]))
-    np.testing.assert_allclose(
-        track.of_field_sizes, 0.95 * np.array([2.0, 0.0, 1.0]) + 0.3 * np.array([0.0, -1.0, 4.0])
-    )
-    # A constant message settles at six times itself: 0.3 / (1 - 0.95).
-    for _ in range(400):
-        track = _followed(track, predicted(covariance(np.random.default_rng(2))), track.estimate, 9)
-    np.testing.assert_allclose(track.of_shake_sizes, [0.0, 12.0], atol=1e-6)
-
-
 def test_a_first_frame_is_taken_as_it_is():
     found = at(np.zeros(18), np.eye(18))
     track = _followed(None, None, found, 7)
-    np.testing.assert_array_equal(track.of_field_sizes, found.of_field_sizes)
+    np.testing.assert_array_equal(track.experience.of_field_sizes, found.of_field_sizes)
     assert (track.time_ns, track.share, track.jolts) == (7, 1.0, 1.0)
 
 

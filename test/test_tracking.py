@@ -221,3 +221,20 @@ def test_a_wrong_prior_motion_is_dropped():
     result = localizer.localize(*data, prior=wrong)
     assert result
     assert error(result, truth)[0] < 0.03
+
+
+def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
+    hand, localizer = Hand(), rsl.Localizer(CAMERA)
+    trusting, doubting = Tracker(localizer), Tracker(localizer)
+    doubting.trusts_readout_time = False
+    differences = []
+    for t in times(8):
+        # Frames follow each other faster than they say: so do turns, but not those within a frame.
+        data = hand.frame(1.3 * t, 150, noise=0.3)
+        alone = localizer.localize(*data).angular_velocity
+        found = doubting.localize(ns(t), *data)
+        assert found.tracked == (t > 0.0)  # near the motion before, all the same
+        believed = trusting.localize(ns(t), *data).angular_velocity
+        differences.append([np.linalg.norm(x - alone) for x in (found.angular_velocity, believed)])
+    by_doubt, by_trust = np.median(differences[1:], axis=0)
+    assert by_doubt < 0.2 * by_trust

@@ -138,10 +138,13 @@ def with_motion(
 ) -> PriorTerms:
     """The terms and a prior's motion in the map frame, for points relative to ``centre`` (3,).
 
-    Its term is the last one. Beside a known turn it knows the gyroscope's errors, too.
+    Its term, if it knows anything, is the last one. Beside a known turn it knows the gyroscope's
+    errors, too.
     """
     if prior.motion is None or prior.covariance is None:
         return terms
+    if np.isinf(np.diagonal(prior.covariance)).all():
+        return terms  # the motion is a first guess
     own = terms.informations
     if len(prior.covariance) == PARAMETERS:  # it knows the accelerations better than a default
         own = own.copy()

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.mapping.gauge import Similarity
+from rs_localizer.mapping.similarity import Similarity, upright
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
@@ -62,7 +61,7 @@ def alignment(found: Map | MarkerMap, wishes: Wishes) -> Similarity:
         ValueError: for ids that the map does not have, or points that tell no direction or size.
     """
     place = place_of(found)
-    turn = _levelled(_up(found, wishes, place))
+    turn = upright(-_up(found, wishes, place))
     scale = wishes.scale or 1.0
     if wishes.distance is not None:
         one, other, wanted = wishes.distance
@@ -105,17 +104,6 @@ def _normal(floor: Array, points: Array) -> Array:
         raise ValueError("the ids of the floor lie on a line: they do not say what is level")
     normal = axes[2]
     return np.asarray(normal if (points.mean(axis=0) - middle) @ normal >= 0.0 else -normal)
-
-
-def _levelled(up: Array) -> Array:
-    """The least rotation that turns a direction to z."""
-    up = up / np.linalg.norm(up)
-    axis = np.cross(up, _UP)
-    sine, cosine = float(np.linalg.norm(axis)), float(up @ _UP)
-    if sine < 1e-12:
-        return np.eye(3) if cosine > 0.0 else np.diag([1.0, -1.0, -1.0])
-    turned = Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine))
-    return np.asarray(turned.as_matrix())
 
 
 def moved(found: Map, by: Similarity) -> Map:

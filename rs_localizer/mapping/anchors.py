@@ -97,7 +97,9 @@ class Placement:
     up: str = "as the camera was held on average (a guess)"
 
 
-def place(anchors: Anchors, found: Triangulated, rotations: Array, positions: Array) -> Placement:
+def placement(
+    anchors: Anchors, found: Triangulated, rotations: Array, positions: Array
+) -> Placement:
     """The frame of the map in metres.
 
     Args:

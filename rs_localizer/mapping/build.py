@@ -19,7 +19,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.maps.colmap import medoid
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.mapping.anchors import Anchors, Placement, place
+from rs_localizer.mapping.anchors import Anchors, Placement, placement
 from rs_localizer.mapping.errors import MappingError
 from rs_localizer.mapping.following import follow
 from rs_localizer.mapping.inertial_placing import (
@@ -32,7 +32,7 @@ from rs_localizer.mapping.keyframes import Keyframes, choose_keyframes
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.mapping.sightings import Sightings
 from rs_localizer.mapping.sights import Seen, all_seen, for_adjustment
-from rs_localizer.mapping.similarity import Similarity
+from rs_localizer.mapping.similarity import Similarity, scaled
 from rs_localizer.mapping.structure import Effort, Stage, Structure, build_structure
 from rs_localizer.mapping.tied import tied
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
@@ -221,7 +221,7 @@ def _structure(given: Given, keyframes: Keyframes, work: Workshop) -> Structure:
     places = found.positions[np.searchsorted(found.views, found.seen_views)]
     away = np.linalg.norm(found.points[found.seen_points] - places, axis=1)
     factor = _USUAL_DISTANCE / float(np.median(away))
-    return found.moved(Similarity(factor, np.eye(3), np.zeros(3)))
+    return found.moved(scaled(factor))
 
 
 def _descriptors(views: Sequence[View], structure: Structure) -> np.ndarray:
@@ -265,7 +265,7 @@ def _placement(given: Given, motion: Motion) -> Placement:
     seen = motion.seen(*given.anchors.seen(given.views))
     camera = motion.refined.camera
     found = triangulate(camera, motion.sights(seen), given.anchors.count)
-    return place(given.anchors, found, *motion.poses())
+    return placement(given.anchors, found, *motion.poses())
 
 
 def _kept(found: Triangulated, motion: Motion) -> IntArray:

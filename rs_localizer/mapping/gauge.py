@@ -8,13 +8,12 @@ Teunissen, *Zero order design*, in Optimization and design of geodetic networks,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.mapping.similarity import Similarity, through
 from rs_localizer.trajectory.spline import Spline
 
 # The whole may float so far while it is adjusted, by its size: loose enough to cost nothing.
@@ -22,46 +21,14 @@ _FLOAT = 1e-3
 _ROUNDS, _OUTLIERS = 5, 4.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Similarity:
-    """x -> scale * rotation x + translation."""
-
-    scale: float
-    rotation: Array  # (3,3)
-    translation: Array  # (3,) m
-
-    def __call__(self, points: Array) -> Array:
-        """Points (n,3)."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def moved(self, spline: Spline) -> Spline:
-        """The motion in the map so changed."""
-        return Spline(spline.layout, self.rotation @ spline.rotations, self(spline.positions))
-
-    def covariances(self, before: Array) -> Array:
-        """Of points (n,3,3)."""
-        return np.asarray(self.scale**2 * self.rotation @ before @ self.rotation.T)
-
-
-def similarity(points: Array, onto: Array) -> Similarity:
-    """The one of least squares from points (n,3) onto others (Umeyama, PAMI 1991)."""
-    middle, other = points.mean(axis=0), onto.mean(axis=0)
-    a, b = points - middle, onto - other
-    u, values, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u * sign @ vt
-    scale = float(values @ sign / np.sum(a**2))
-    return Similarity(scale, rotation, other - scale * rotation @ middle)
-
-
 def laid_over(points: Array, onto: Array, usable: BoolArray) -> tuple[Similarity, BoolArray]:
     """The similarity of the landmarks that hardly changed, and which (n,) these are."""
     kept = usable
-    found = similarity(points[kept], onto[kept])
+    found = through(points[kept], onto[kept])
     for _ in range(_ROUNDS):
         off = np.linalg.norm(found(points) - onto, axis=1)
         kept = usable & (off <= _OUTLIERS * max(float(np.median(off[usable])), 1e-12))
-        found = similarity(points[kept], onto[kept])
+        found = through(points[kept], onto[kept])
     return found, kept
 
 

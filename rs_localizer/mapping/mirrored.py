@@ -13,7 +13,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.gauge import similarity
+from rs_localizer.mapping.similarity import through
 from rs_localizer.trajectory.bodies import BODY
 from rs_localizer.trajectory.fit import Fit
 from rs_localizer.trajectory.model import Observations, State
@@ -102,7 +102,7 @@ def _normals(state: State) -> Array:
 
 def _at_the_origin(state: State, landmarks: Array) -> State:
     """With these landmarks (p,3), and all moved so that the first four stay where they were."""
-    back = similarity(landmarks[:4], state.landmarks[:4])
+    back = through(landmarks[:4], state.landmarks[:4])
     moved = back(landmarks)
     moved[:4] = state.landmarks[:4]
     return replace(state, spline=back.moved(state.spline), landmarks=moved)

@@ -24,7 +24,7 @@ class Placed:
     spline: Spline
 
 
-def place(problem: MapProblem, state: State, deviation: float, usable: BoolArray) -> Placed:
+def laid_down(problem: MapProblem, state: State, deviation: float, usable: BoolArray) -> Placed:
     """Lay the map over the given one, unless landmarks of known place hold it.
 
     Args:

@@ -19,7 +19,7 @@ from rs_localizer.mapping.adjustment import MapProblem, sights_of
 from rs_localizer.mapping.alike import Pull, pull_at_landmarks
 from rs_localizer.mapping.asked_readout import AskedReadout, asked_readout
 from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
-from rs_localizer.mapping.placing import place
+from rs_localizer.mapping.placing import laid_down
 from rs_localizer.mapping.preparation import Preparation
 from rs_localizer.mapping.sightings import MapFreedom, Sightings, Start, check
 from rs_localizer.trajectory.banded import Undetermined
@@ -157,7 +157,7 @@ class _Refinement:
         used = _freedoms(state.spline, seen.frames) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.motion.border)
         inflation = self._with_alike_errors(problem, deviation, inflation)
-        placed = place(problem, state, deviation, images > 1)
+        placed = laid_down(problem, state, deviation, images > 1)
         covariances = inflation * placed.covariances
         spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         refined = (images > 1) & (spread < _KNOWN * prepared.size)

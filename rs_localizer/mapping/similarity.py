@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.trajectory.spline import Spline
 
 # Points whose spread across their best line is less than this share of that along it leave the
 # rotation about the line open.
@@ -26,10 +27,14 @@ class Similarity:
         moved: Array = self.scale * points @ self.rotation.T + self.translation
         return moved
 
+    def moved(self, spline: Spline) -> Spline:
+        """A motion, as it is in the other frame."""
+        return Spline(spline.layout, self.rotation @ spline.rotations, self(spline.positions))
 
-def identity() -> Similarity:
-    """Nothing moves."""
-    return Similarity(1.0, np.eye(3), np.zeros(3))
+    def covariances(self, before: Array) -> Array:
+        """Covariances of points (n,3,3) in the other frame."""
+        after: Array = self.scale**2 * self.rotation @ before @ self.rotation.T
+        return after
 
 
 def scaled(factor: float) -> Similarity:

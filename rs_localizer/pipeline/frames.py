@@ -107,8 +107,7 @@ class FrameLocalizer:
 
     def _forget_motion(self) -> None:
         self.readout_watch.reset()
-        if self._method.tracker is not None:
-            self._method.tracker.reset()
+        self._method.forget()
 
     def warm_up(self) -> None:
         """Compile all that the present settings need, from points to messages."""
@@ -210,9 +209,11 @@ class FrameLocalizer:
         given = (cloud.points, cloud.pixels, cloud.scores)
         if method.follower is None:
             self.imu.without_tracker(method.config)
-            result = method.localizer.localize(*given)
+            result = (method.experienced or method.localizer).localize(*given)
         else:
             time_ns = method.middle_row_ns(cloud.stamp_ns)
+            if method.tracker is not None:
+                method.tracker.trusts_readout_time = not self.readout_watch.far_off
             result = self.imu.track(
                 method.follower, method.config, time_ns, frame, self.transforms, given
             )

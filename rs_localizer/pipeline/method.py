@@ -15,6 +15,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.clock import middle_row_ns
+from rs_localizer.pipeline.experienced import ExperiencedFrames
 from rs_localizer.pipeline.imu import inertial_settings
 from rs_localizer.pipeline.moments import pose_at, twist_at
 from rs_localizer.pipeline.single_frames import SingleFrames
@@ -50,6 +51,7 @@ class Method:
     localizer: Localizer
     tracker: Tracker | None  # None: every frame stands alone
     single: SingleFrames | None = None  # without a tracker, but with an IMU
+    experienced: ExperiencedFrames | None = None  # what would track, but for the readout time
 
     @classmethod
     def of(cls, calibration: Calibration, config: NodeConfig) -> Self:
@@ -60,13 +62,22 @@ class Method:
         """
         camera = calibration.camera(config.readout_time, config.scan_direction)
         localizer = Localizer(camera, config)
-        rolling = config.readout_time > 0.0 and find_solver(config.solver).rolling_shutter
+        finds_motion = find_solver(config.solver).rolling_shutter
+        rolling = config.readout_time > 0.0 and finds_motion
         tracks = config.tracking and rolling
         inertial = inertial_settings(config)
         if tracks:
             return cls(calibration, config, camera, localizer, Tracker(localizer, inertial))
         single = SingleFrames(localizer, inertial) if rolling and inertial is not None else None
-        return cls(calibration, config, camera, localizer, None, single)
+        learns = config.tracking and finds_motion
+        experienced = ExperiencedFrames(localizer) if learns else None
+        return cls(calibration, config, camera, localizer, None, single, experienced)
+
+    def forget(self) -> None:
+        """Forget the previous frames."""
+        for remembers in (self.tracker, self.experienced):
+            if remembers is not None:
+                remembers.reset()
 
     @property
     def follower(self) -> Tracker | SingleFrames | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import Enum, auto
 
 import numpy as np
 
@@ -27,14 +28,25 @@ _SHARE = 300
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
+# Of the setting: from here on frames that stand alone are better than tracked ones, and from here
+# on nothing tells the shutter from a global one.
+_FAR_OFF, _GLOBAL = 0.5, 0.2
+
+
+class _Kind(Enum):
+    """What is wrong about a readout time."""
+
+    DURATION = auto()
+    REVERSED = auto()
+    GLOBAL = auto()
 
 
 class ReadoutWatch:
     """Measures the readout time while frames are localized, and says when it contradicts.
 
     Args:
-        notice: told of a contradiction, once until :meth:`reset`, and of a value that is adopted;
-            by the name ``readout_time`` and one sentence.
+        notice: told of a contradiction, once of each kind until :meth:`reset`, and of a value that
+            is adopted; by the name ``readout_time`` and one sentence.
     """
 
     def __init__(self, notice: Notify) -> None:
@@ -42,10 +54,14 @@ class ReadoutWatch:
         self._monitor = ReadoutMonitor()
         self._under_way: Measurement | None = None
         self._frames, self._next = 0, _AT_FIRST
-        self._said = False
+        self._said: set[_Kind] = set()
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
         self.fault = ""  # how that contradicts the setting, in one sentence
+        # Whether the setting is wrong by so much that what the camera does from frame to frame
+        # says nothing of what it does within them: a global shutter, or a reversed one. Once it
+        # was, doubts are not enough.
+        self.far_off = False
 
     def warm_up(self, camera: Camera) -> None:
         """Compile what frames of this camera need."""
@@ -56,7 +72,8 @@ class ReadoutWatch:
         self._monitor.reset()
         self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
-        self._said, self.measured, self.fault = False, None, ""
+        self._said.clear()
+        self.measured, self.fault, self.far_off = None, "", False
 
     def add(
         self,
@@ -86,9 +103,12 @@ class ReadoutWatch:
         self.measured = found
         if estimates:
             return self._adopt(config, found)
-        self.fault = _fault(config, found) if found.contradicts(config.readout_time) else ""
-        if self.fault and not self._said:
-            self._said = True
+        wrong = _wrong(config, found)
+        self.fault = "" if wrong is None else _sentence(wrong, config, found)
+        may_be = found.readout_time < _FAR_OFF * config.readout_time
+        self.far_off = may_be and (self.far_off or wrong is not None)
+        if wrong is not None and wrong not in self._said:
+            self._said.add(wrong)
             self._notice(Notice.READOUT_TIME, self.fault)
         return config
 
@@ -128,17 +148,27 @@ class ReadoutWatch:
         )
 
 
-def _fault(config: NodeConfig, found: MeasuredReadout) -> str:
-    if found.readout_time < -_SURELY * found.deviation:
+def _wrong(config: NodeConfig, found: MeasuredReadout) -> _Kind | None:
+    if not found.contradicts(config.readout_time):
+        return None
+    if abs(found.readout_time) < _GLOBAL * config.readout_time:
+        return _Kind.GLOBAL
+    reversed_ = found.readout_time < -_SURELY * found.deviation
+    return _Kind.REVERSED if reversed_ else _Kind.DURATION
+
+
+def _sentence(kind: _Kind, config: NodeConfig, found: MeasuredReadout) -> str:
+    if kind is _Kind.REVERSED:
         given = ScanDirection(config.scan_direction)
         span = _milliseconds(-found.readout_time, found.deviation)
         return (
             f"the camera's motion says that the shutter moves against scan_direction {given}, in "
             f"{span}: is it {REVERSED[given]}?"
         )
+    as_of = ", as of a global shutter" if kind is _Kind.GLOBAL else ""
     return (
         "the camera's motion says a readout time of "
-        f"{_milliseconds(found.readout_time, found.deviation)}; readout_time is "
+        f"{_milliseconds(found.readout_time, found.deviation)}{as_of}; readout_time is "
         f"{config.readout_time:g}"
     )
 

@@ -78,7 +78,8 @@ def first_mount(samples: GyroSamples, spline: Spline, given: Array | None = None
         NoMount: when there are too few samples during the motion, or they show other turns.
     """
     layout = spline.layout
-    near = samples.subset(samples.covered(layout, 0.0, -_MOST_DELAY))
+    # The same samples at every delay, else the shares they agree by could not be compared.
+    near = samples.subset(samples.covered(layout, 0.0, _MOST_DELAY))
     if len(near.times) < _LEAST_SAMPLES:
         raise NoMount(
             f"{len(near.times)} samples of the IMU lie in the time of the images, at least "

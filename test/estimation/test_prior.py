@@ -152,12 +152,14 @@ def test_a_prior_motion_of_the_wrong_shape_is_refused(part, value):
         Prior(motion=replace(motion(), **{part: value}), covariance=np.eye(12))
 
 
-def test_a_motion_of_which_nothing_is_known_adds_nothing():
-    prior = Prior(motion=motion(), covariance=np.diag(np.full(12, np.inf)))
-    terms = with_motion(NOTHING, prior, CENTRE)
-    cost, information, _ = evaluate(terms, state_in(motion(5), CENTRE))
-    assert cost == 0.0
-    assert not information.any()
+@pytest.mark.parametrize("size", [12, 18])
+def test_a_motion_of_which_nothing_is_known_adds_and_replaces_nothing(size):
+    prior = Prior(motion=motion(), covariance=np.diag(np.full(size, np.inf)))
+    typical = motion_terms((0.1, 0.2), (0.3, 0.4))
+    for own in (NOTHING, typical):
+        terms, state = with_motion(own, prior, CENTRE), state_in(motion(5), CENTRE)
+        for found, expected in zip(evaluate(terms, state), evaluate(own, state), strict=True):
+            np.testing.assert_array_equal(found, expected)
 
 
 def test_a_motion_may_be_given_in_lists():

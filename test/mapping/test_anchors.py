@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.mapping.anchors import Anchors, Distance, PointSight, place
+from rs_localizer.mapping.anchors import Anchors, Distance, PointSight, placement
 from rs_localizer.mapping.errors import MappingError
 from rs_localizer.mapping.similarity import Similarity
 from rs_localizer.mapping.triangulation import Triangulated
@@ -31,7 +31,7 @@ def back(points: np.ndarray) -> np.ndarray:
 
 
 def placed(anchors: Anchors, points: np.ndarray, counts: int = 9):
-    return place(anchors, found(points, counts), HELD.as_matrix(), np.zeros((6, 3)))
+    return placement(anchors, found(points, counts), HELD.as_matrix(), np.zeros((6, 3)))
 
 
 def test_markers_give_frame_and_scale() -> None:

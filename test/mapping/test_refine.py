@@ -10,11 +10,11 @@ from scenes import READOUT, Walk, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, MapStep
-from rs_localizer.mapping.gauge import similarity
 from rs_localizer.mapping.preparation import Preparation
 from rs_localizer.mapping.reduced import MapNormal, Reduced
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.mapping.sightings import Sightings
+from rs_localizer.mapping.similarity import through
 from rs_localizer.trajectory.model import Freedom, State, start_state
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
@@ -24,7 +24,7 @@ VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
 def errors(found: RefinedMap, truth: Walk) -> np.ndarray:
     """Of the refined landmarks (n,), m, but for position, orientation and size of the whole."""
     ours, true = found.points[found.refined], truth.points[found.refined]
-    return np.linalg.norm(similarity(ours, true)(ours) - true, axis=1)
+    return np.linalg.norm(through(ours, true)(ours) - true, axis=1)
 
 
 def dense(normal: MapNormal) -> tuple[np.ndarray, np.ndarray]:
@@ -165,7 +165,7 @@ def test_the_reverse_scan_direction_is_found(video: Walk) -> None:
 def test_the_map_as_a_whole_stays(video: Walk) -> None:
     found = refine(camera(), video.seen, video.start)
     ours, given = found.points[found.refined], video.start.points[found.refined]
-    whole = similarity(ours, given)
+    whole = through(ours, given)
     assert whole.scale == pytest.approx(1.0, abs=0.02)
     assert np.linalg.norm(whole.translation) < 0.04
 

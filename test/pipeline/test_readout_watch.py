@@ -73,6 +73,7 @@ def test_a_wrong_readout_time_is_said_once(factor: float, tracking: bool) -> Non
     assert found is not None
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation < 0.1 * READOUT
     assert frames.readout_watch.fault
+    assert not frames.readout_watch.far_off
 
 
 def test_the_right_one_is_confirmed() -> None:
@@ -95,9 +96,10 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm() -> None:
 
 
 def test_a_reversed_scan_is_said() -> None:
-    _, (text,) = watched(readout_time=READOUT, scan_direction="bottom_to_top")
+    frames, (text,) = watched(readout_time=READOUT, scan_direction="bottom_to_top")
     assert "against scan_direction bottom_to_top" in text
     assert text.endswith("is it top_to_bottom?")
+    assert frames.readout_watch.far_off
 
 
 @pytest.mark.parametrize("change", ["reset", "settings", "camera", "map"])

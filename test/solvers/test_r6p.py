@@ -177,12 +177,12 @@ def test_all_real_solutions_are_found_and_nothing_else(family):
     if FAMILIES[family] is None:  # bearings that fit no motion at all
         rng = np.random.default_rng(6)
         p = SimpleNamespace(
-            points=rng.uniform(-1, 1, (2000, 6, 3)),
-            rays=rng.uniform(-0.5, 0.5, (2000, 6, 2)),
-            tau=rng.uniform(-0.5, 0.5, (2000, 6)),
+            points=rng.uniform(-1, 1, (1000, 6, 3)),
+            rays=rng.uniform(-0.5, 0.5, (1000, 6, 2)),
+            tau=rng.uniform(-0.5, 0.5, (1000, 6)),
         )
     else:
-        p = problems(2000, 7, **FAMILIES[family])
+        p = problems(1000, 7, **FAMILIES[family])
     expected = oracle(p, np.random.default_rng(8))
     found = check_residuals(p, *solutions(p))
     assert len(expected[0]) > 0.05 * len(p.points)
@@ -204,7 +204,7 @@ def test_all_real_solutions_are_found_and_nothing_else(family):
     ],
 )
 def test_the_truth_is_among_the_solutions(motion):
-    p = problems(1500, 9, physical=False, **motion)
+    p = problems(1000, 9, physical=False, **motion)
     found = solutions(p)
     error = sum(
         np.linalg.norm(x - truth[:, None], axis=2)

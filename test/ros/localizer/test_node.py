@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import time
@@ -12,12 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, PointCloud2
@@ -30,10 +27,7 @@ from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.lab.simulation.recording import write_simulated
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import ConstantVelocity
-from rs_localizer.ros.localizer.node import LocalizerNode
-from rs_localizer.ros.node import managed
 from rs_localizer.ros.node.conversion import copy_message, message_class
-from rs_localizer.ros.node.inputs import Inputs
 
 READOUT_TIME = 0.03
 SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
@@ -375,82 +369,6 @@ def test_best_effort_publishers_are_heard(recording: Path, start_node: Start, pe
     assert answers[0].header.frame_id == messages[1].header.frame_id
 
 
-@pytest.mark.parametrize(
-    "signals",
-    [
-        (signal.SIGINT,),
-        (signal.SIGTERM,),
-        (signal.SIGINT, signal.SIGINT),
-        (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGTERM),
-    ],
-)
-def test_signals_end_it_in_order(start_node: Start, signals: tuple[int, ...]) -> None:
-    node = start_node()
-    node.wait_for_log("active with solver")
-    assert node.stop(*signals) == 0
-    assert "Traceback" not in node.log
-    assert "rror" not in node.log
-
-
-# A module that tells that it is being imported, and takes its time.
-SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("slow", ["numba", "rclpy", "cv2"])
-def test_signals_while_it_imports(
-    start_node: Start, tmp_path: Path, number: int, slow: str
-) -> None:
-    (tmp_path / f"{slow}.py").write_text(SLOW)
-    node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
-    while not (tmp_path / f"{slow}.seen").exists():
-        assert node.process.poll() is None, node.log
-        time.sleep(0.02)
-    assert node.stop(number) == 0
-    assert node.log == ""
-
-
-def test_missing_ros_is_said_in_one_line(start_node: Start, tmp_path: Path) -> None:
-    text = "No module named 'rclpy'"
-    (tmp_path / "rclpy.py").write_text(f"raise ModuleNotFoundError({text!r}, name='rclpy')")
-    node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
-    assert node.process.wait(60.0) == 1
-    assert node.log.startswith(f"localizer: {text}; source a ROS 2 workspace")
-    assert node.log.count("\n") == 1
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_while_it_compiles(start_node: Start, tmp_path: Path, number: int) -> None:
-    cache = tmp_path / "cache"
-    node = start_node(XDG_CACHE_HOME=str(cache))
-    deadline = time.monotonic() + 60.0
-    # The first kernel in the cache: the second is being compiled, and there are many.
-    while not list(cache.rglob("*.nbc")):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    start = time.monotonic()
-    assert node.stop(number, number) == 0
-    assert time.monotonic() - start < 10.0
-    assert "active" not in node.log
-    assert "Traceback" not in node.log
-
-
-def test_a_signal_before_it_compiles(start_node: Start, tmp_path: Path) -> None:
-    # In the last moment before compiling, which then must not begin.
-    signalled = (
-        "import os, signal, sys, rs_localizer.ros.node.parameters as p\n"
-        "read = p.read\n"
-        "def kill(*a, **k): os.kill(os.getpid(), signal.SIGTERM); return read(*a, **k)\n"
-        "p.read = kill\n"
-        "from rs_localizer.ros.main import main; sys.exit(main())"
-    )
-    node = start_node(run=signalled, XDG_CACHE_HOME=str(tmp_path / "cache"))
-    assert node.process.wait(60.0) == 0
-    assert "kernels are ready" not in node.log
-    assert "Traceback" not in node.log
-    assert not list(tmp_path.rglob("*.nbc"))
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_a_frame_takes_long(
     recording: Path, start_node: Start, peer: Any, number: int
@@ -470,92 +388,3 @@ def test_a_signal_while_a_frame_takes_long(
     assert node.stop(number, number) == 0
     assert time.monotonic() - start < 10.0
     assert "Traceback" not in node.log
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("-p", "solver:=p4p"), "solver must be one of p3p, r6p, .*; got 'p4p'"),
-        (("-p", "readout_time:=0"), r"readout_time must be of type float, got 0 \(write 0\.0\)"),
-        (("-p", "inlier_threshold:=-1.0"), "inlier_threshold out of range"),
-        (("--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
-    ],
-)
-def test_started_with_bad_parameters(
-    start_node: Start, arguments: tuple[str, ...], text: str
-) -> None:
-    node = start_node(*arguments)
-    assert node.process.wait(60.0) == 1
-    fatal = [line for line in node.log.splitlines() if line.startswith("[FATAL]")]
-    assert len(fatal) == 1
-    assert re.search(text, fatal[0])
-    assert "Traceback" not in node.log
-
-
-@pytest.mark.parametrize(
-    ("override", "text"),
-    [
-        ("/correspondences.subscription.reliability:=foo", "not activated: .*reliability.*foo"),
-        ("/correspondences.subscription.depth:=ten", "not activated: .*ten"),
-        ("/rs_localizer/pose.publisher.depth:=ten", "not configured:"),
-    ],
-)
-def test_qos_overrides_that_make_no_qos(start_node: Start, override: str, text: str) -> None:
-    node = start_node("-p", f"qos_overrides.{override}")
-    assert node.process.wait(60.0) == 1
-    errors = [line for line in node.log.splitlines() if line.startswith("[ERROR]")]
-    assert len(errors) == 1
-    assert re.search(text, errors[0], re.IGNORECASE)
-
-
-def test_publishers_are_active_before_a_frame_can_come(monkeypatch: pytest.MonkeyPatch) -> None:
-    active: list[bool] = []
-
-    class Early(Inputs):
-        def __init__(self, node: LocalizerNode, *arguments: Any) -> None:
-            publishers = node._outputs._publishers.values()
-            active.extend(publisher.is_activated for publisher in publishers)
-            super().__init__(node, *arguments)
-
-    monkeypatch.setattr(managed, "Inputs", Early)
-    context = Context()
-    rclpy.init(context=context)
-    node = LocalizerNode(context=context)
-    try:
-        node.trigger_configure()
-        node.trigger_activate()
-    finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
-    assert active == [True] * len(TYPES)
-
-
-def test_what_it_says_at_start(start_node: Start, tmp_path: Path) -> None:
-    file = tmp_path / "params.yaml"
-    file.write_text("/**:\n  ros__parameters: {min_inlier: 9, use_sim_time: false}\n")
-    node = start_node("--params-file", str(file), "-p", "readout_tim:=0.1")
-    node.wait_for_log("active with solver")
-    lines = [line.partition("]: ")[2] for line in node.log.splitlines()]
-    compiling = lines.index("compiling kernels (once on this machine, up to a minute)")
-    assert re.fullmatch(r"kernels are ready after \d+\.\d s", lines[compiling + 1])
-    ignored = "a parameter is ignored: {} is not a setting; did you mean {}?"
-    assert [line for line in lines if "ignored" in line] == [
-        ignored.format("'min_inlier'", "'min_inliers'"),
-        ignored.format("'readout_tim'", "'readout_time'"),
-    ]
-    silent = "readout_time is 0 (unknown): no twist is published and frames are not tracked"
-    assert lines.count(silent) == 1
-    node = start_node(*SHUTTER)
-    node.wait_for_log("active with solver")
-    assert silent not in node.log
-    assert "ignored" not in node.log
-
-
-def test_the_shipped_params_file_is_taken(start_node: Start, tmp_path: Path) -> None:
-    shipped = Path(__file__).parents[3] / "config" / "rs_localizer.yaml"
-    changed = tmp_path / "mine.yaml"
-    changed.write_text(shipped.read_text().replace("solver: r6p_vcwt", "solver: r9p"))
-    for namespace in ("/", "/robot/front"):
-        node = start_node("--params-file", str(changed), "-r", f"__ns:={namespace}")
-        node.wait_for_log("active with solver r9p")
-        assert node.stop() == 0

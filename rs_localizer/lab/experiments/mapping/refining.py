@@ -17,11 +17,11 @@ from rs_localizer.lab.experiments.mapping.rooms import (
 )
 from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.mapping.adjustment import MapProblem
-from rs_localizer.mapping.gauge import similarity
-from rs_localizer.mapping.placing import place
+from rs_localizer.mapping.placing import laid_down
 from rs_localizer.mapping.preparation import Preparation
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.mapping.sightings import Sightings, Start
+from rs_localizer.mapping.similarity import through
 from rs_localizer.trajectory.model import Freedom, start_state
 
 _NOISE, _OFF = 0.3, 0.02  # px, m
@@ -30,7 +30,7 @@ _READOUT = 0.03
 
 def _errors(points: Array, truth: Array, of: BoolArray) -> str:
     """Of landmarks, but for the whole's place and size."""
-    off = similarity(points[of], truth[of])(points[of]) - truth[of]
+    off = through(points[of], truth[of])(points[of]) - truth[of]
     errors = 1e3 * np.linalg.norm(off, axis=1)
     return f"{np.median(errors):8.2f} {np.percentile(errors, 95):8.2f}"
 
@@ -109,7 +109,7 @@ def _least(seen: Sightings, found: RefinedMap, freedom: MapFreedom) -> Array:
     errors = [sights.errors for sights in problem.motion.look(state)[1]]
     fitting = replace(observed, pixels=observed.pixels + np.concatenate(errors))
     problem = MapProblem(found.camera, fitting, state, free, prepared.deviations, False)
-    return place(problem, state, _NOISE, np.ones(len(found.points), np.bool_)).covariances
+    return laid_down(problem, state, _NOISE, np.ones(len(found.points), np.bool_)).covariances
 
 
 def large(seed: int) -> Iterator[str]:

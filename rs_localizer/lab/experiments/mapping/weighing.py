@@ -11,9 +11,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.lab.experiments.mapping.rooms import Film, Walk, a_walk, estimators_camera, walls
 from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.lab.independent.rotations import exponential, logarithm
-from rs_localizer.mapping.gauge import similarity
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.refine import refine
+from rs_localizer.mapping.similarity import through
 from rs_localizer.trajectory.imu import ImuRecording
 
 _NOISE, _OFF, _READOUT = 0.3, 0.02, 0.03  # px, m, s
@@ -51,7 +51,7 @@ def _weighed(rng: np.random.Generator) -> tuple[Array, Array]:
     refined = refine(estimators_camera(camera, _READOUT), film.see(points, _NOISE, rng, 80), small)
     offset = float(rng.uniform(-0.02, 0.02))
     found = inertial_metres(refined, _imu(walk, offset, rng))
-    truth = similarity(refined.points[refined.refined], points[refined.refined])
+    truth = through(refined.points[refined.refined], points[refined.refined])
     down = truth.rotation @ found.metric.gravity
     tilt = np.degrees(np.arctan2(np.hypot(down[0], down[2]), down[1]))
     return (

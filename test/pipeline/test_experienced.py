@@ -1,0 +1,49 @@
+"""What a camera without a readout time remembers from frame to frame."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.config import NodeConfig
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Failure
+from rs_localizer.pipeline.experienced import ExperiencedFrames
+from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
+
+SIZES = np.array([0.0, -1.0])
+
+
+def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset() -> None:
+    priors: list[Any] = []
+    results: list[Any] = [SimpleNamespace(of_shake_sizes=SIZES, of_field_sizes=2.0 * SIZES)] * 3
+    results.insert(1, Failure(Reason.NO_HYPOTHESIS, ""))
+
+    def localize(points: Any, pixels: Any, scores: Any, prior: Any) -> Any:
+        priors.append(prior)
+        return results[len(priors) - 1]
+
+    localizer: Any = SimpleNamespace(localize=localize)
+    frames = ExperiencedFrames(localizer)
+    for _ in range(3):
+        frames.localize([], [])
+    assert priors[0] is None
+    for prior in priors[1:]:
+        assert prior.motion is None
+        np.testing.assert_array_equal(prior.of_field_sizes, 2.0 * SIZES)
+    frames.reset()
+    frames.localize([], [])
+    assert priors[3] is None
+
+
+def test_it_takes_the_place_of_tracking() -> None:
+    def remembers(**settings: Any) -> tuple[bool, bool]:
+        method = Method.of(ANY_CALIBRATION, NodeConfig(**settings))
+        return method.tracker is not None, method.experienced is not None
+
+    assert remembers() == (False, True)
+    assert remembers(readout_time=0.02) == (True, False)
+    assert remembers(tracking=False) == (False, False)
+    assert remembers(solver="p3p") == (False, False)

@@ -1,0 +1,249 @@
+"""A live node, a peer that talks to it over DDS, and the frames that it sends."""
+
+from __future__ import annotations
+
+import array
+import re
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.landmarks import random_descriptors
+from rs_localizer.lab.simulation.recording import write_simulated
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import ConstantVelocity
+from rs_localizer.ros.localizer.node import LocalizerNode
+from rs_localizer.ros.node.conversion import copy_message
+from rs_localizer.ros.node.run import spin
+
+READOUT_TIME = 0.03
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+PATIENCE = 20.0  # s, of a machine that is busy
+CLOSE = 0.05  # m: the poses are right
+SECOND = 1_000_000_000
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DESCRIPTORS = random_descriptors(5000, np.random.default_rng(9))  # of the landmarks, by number
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Frames, the true position of each, and one camera_info for all."""
+
+    info: CameraInfo
+    clouds: list[PointCloud2]
+    truth: list[np.ndarray]
+
+
+def record(path: Path) -> Recording:
+    """A flight, written to a bag and read again."""
+    camera = Camera(640, 480, K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=READOUT_TIME)
+    motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
+    world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
+    frames = list(simulate_frames(camera, motion, world, FrameSettings(points=100, noise=0.7)))
+    with BagWriter(path) as bag:
+        for frame in frames:
+            write_simulated(bag, camera, frame)
+    found: dict[str, list[Any]] = {"/camera_info": [], "/correspondences": []}
+    with open_bag(path) as bag:
+        for topic, _, message in bag.messages(tuple(found)):
+            found[topic].append(copy_message(message, message.__msgtype__))
+    return Recording(
+        info=found["/camera_info"][0],
+        clouds=found["/correspondences"],
+        truth=[frame.first_row.positions[0] for frame in frames],
+    )
+
+
+class World:
+    """A live node in a thread, a peer that talks to it over DDS, and what the node has said."""
+
+    def __init__(self, recording: Recording, *arguments: str, namespace: str = "") -> None:
+        self.recording = recording
+        self.context = Context()
+        rclpy.init(context=self.context)
+        self.node = LocalizerNode(
+            context=self.context,
+            namespace=namespace,
+            cli_args=["--ros-args", "-p", f"readout_time:={READOUT_TIME}", *arguments],
+        )
+        # Every single one, where the log leaves out repetitions.
+        self.said: list[str] = []
+        notice = self.node.refusals.notice
+        self.node.refusals.notice = lambda *texts: (
+            self.said.append(": ".join(texts)),
+            notice(*texts),
+        )
+        assert self.node.trigger_configure().name == self.node.trigger_activate().name == "SUCCESS"
+        self._stopped = threading.Event()
+        self._threads = [threading.Thread(target=spin, args=(self.node, self._stopped.is_set))]
+        self.peer = Peer(self.context, namespace)
+        self._threads.append(threading.Thread(target=self._spin_peer))
+        for thread in self._threads:
+            thread.start()
+        self.stamp = SECOND
+        self.wait(self.peer.connected)
+
+    # -- what faults need --------------------------------------------------------------------
+
+    def cloud(self, index: int = 0, **changes: Any) -> PointCloud2:
+        """A good frame, later than the last, with fields changed."""
+        source = self.recording.clouds[index]
+        fields = {name: getattr(source, name) for name in source.get_fields_and_field_types()}
+        message = PointCloud2(**(fields | changes))
+        if "header" not in changes:
+            self.stamp += SECOND // 30
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, SECOND)
+        return message
+
+    def info(self, **changes: Any) -> CameraInfo:
+        """A good camera_info with fields changed."""
+        source = self.recording.info
+        fields = {name: getattr(source, name) for name in source.get_fields_and_field_types()}
+        return CameraInfo(**(fields | changes))
+
+    def table(self) -> np.ndarray:
+        """The rows of a good frame."""
+        return self.table_of(self.recording.clouds[0])
+
+    def table_of(self, cloud: PointCloud2) -> np.ndarray:
+        kinds = {PointField.FLOAT32: "<f4", PointField.UINT32: "<u4"}
+        columns = [(item.name, kinds[item.datatype]) for item in cloud.fields]
+        return np.frombuffer(bytes(cloud.data), columns).copy()
+
+    def cloud_of(self, table: np.ndarray) -> PointCloud2:
+        """A frame with these rows."""
+        return self.cloud(
+            width=len(table), row_step=table.nbytes, data=array.array("B", table.tobytes())
+        )
+
+    def send(self, *messages: Any) -> None:
+        for message in messages:
+            self.peer.send(message)
+
+    def poses(self, *messages: Any, count: int = 1, within: float = PATIENCE) -> bool:
+        """Send; whether so many poses come."""
+        before = len(self.peer.poses)
+        self.send(*messages)
+        return self.until(lambda: len(self.peer.poses) >= before + count, within)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        client = self.peer.node.create_client(kind, f"rs_localizer/{name}")
+        assert client.wait_for_service(PATIENCE)
+        future = client.call_async(request)
+        assert self.until(future.done)
+        self.peer.node.destroy_client(client)
+        return future.result()
+
+    def set(self, **values: object) -> str:
+        """Set parameters at once: the reason of a refusal, else nothing."""
+        parameters = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        return str(
+            self.call(SetParametersAtomically, "set_parameters_atomically", request).result.reason
+        )
+
+    def change_state(self, transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self.call(ChangeState, "change_state", request).success)
+
+    def diagnosis(self, text: str) -> bool:
+        """Whether this comes up in the diagnostics."""
+        del self.peer.diagnoses[:-1]
+        return self.until(lambda: any(re.search(text, item) for item in self.peer.diagnoses))
+
+    def until(self, condition: Callable[[], Any], within: float = PATIENCE) -> bool:
+        deadline = time.monotonic() + within
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.002)
+        return True
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        assert self.until(condition)
+
+    # ----------------------------------------------------------------------------------------
+
+    def localizes(self) -> bool:
+        """Whether a good frame is answered, and with the true position."""
+        self.send(self.recording.info)
+        for _ in range(20):  # sensor data may be lost
+            if self.poses(self.cloud(), within=1.0):
+                found = self.peer.poses[-1].pose.position
+                error = np.array([found.x, found.y, found.z]) - self.recording.truth[0]
+                return bool(np.linalg.norm(error) < CLOSE)
+        return False
+
+    def _spin_peer(self) -> None:
+        executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
+        executor.add_node(self.peer.node)
+        while not self._stopped.is_set():
+            executor.spin_once(timeout_sec=0.05)
+
+    def close(self) -> None:
+        self._stopped.set()
+        for thread in self._threads:
+            thread.join()
+        self.node.destroy_node()
+        self.peer.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+class Peer:
+    """Publishes as a camera does, and listens."""
+
+    def __init__(self, context: Context, namespace: str) -> None:
+        self.node = Node("peer", context=context, namespace=namespace)
+        self.poses: list[PoseStamped] = []
+        self.diagnoses: list[str] = []
+        create = self.node.create_publisher
+        self._publishers = {
+            CameraInfo: create(CameraInfo, "camera_info", 10),
+            PointCloud2: create(PointCloud2, "correspondences", 10),
+        }
+        self._others = {
+            "keypoints": create(PointCloud2, "keypoints", 10),
+            "map_points": create(PointCloud2, "map_points", LATCHED),
+        }
+        self.node.create_subscription(PoseStamped, "rs_localizer/pose", self.poses.append, 100)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+
+    def connected(self) -> bool:
+        publishers = [*self._publishers.values(), *self._others.values()]
+        counts = [publisher.get_subscription_count() for publisher in publishers]
+        return min(counts) > 0 and self.node.count_publishers("rs_localizer/pose") > 0
+
+    def send(self, message: Any) -> None:
+        """A camera_info or correspondences, or a pair of another topic and its message."""
+        if isinstance(message, tuple):
+            topic, message = message
+            self._others[topic].publish(message)
+        else:
+            self._publishers[type(message)].publish(message)
+
+    def _take(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = [f"{item.key} = {item.value}" for item in status.values]
+            level = ["OK", "WARN", "ERROR", "STALE"][status.level[0]]
+            self.diagnoses.append("\n".join([f"{level}: {status.message}", *values]))
