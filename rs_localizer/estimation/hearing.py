@@ -123,7 +123,7 @@ def _strangers(best: Posterior, threshold: float) -> bool:
     """Whether more lies just beyond the gate than chance would put there."""
     near = np.count_nonzero(best.squared_errors < (NEAR * threshold) ** 2)
     inliers = np.count_nonzero(best.inliers)
-    return near - inliers > max(_FEWEST_STRANGERS, _STRANGERS * inliers)
+    return bool(near - inliers > max(_FEWEST_STRANGERS, _STRANGERS * inliers))
 
 
 def _near(best: Posterior, strangers: bool, threshold: float) -> _Near:
