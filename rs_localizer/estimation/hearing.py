@@ -29,8 +29,8 @@ from rs_localizer.estimation.tone_evidence import (
 )
 from rs_localizer.estimation.tones import FEWEST, Fit, Tones, fitted, seen_at
 
-# Power of the loudest tone that noise exceeds in one frame of twenty.
-_LOUD = 18.0
+# Power of the loudest tone that noise exceeds in two or three frames of a hundred.
+_LOUD = 20.0
 # So many points that are near, but no inliers, and such a part of the inliers: random matches
 # seldom lie there.
 _FEWEST_STRANGERS, _STRANGERS = 4, 0.1
