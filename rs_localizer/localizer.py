@@ -14,7 +14,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.acceptance import refusal
+from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.assumptions import (
     assumptions,
     known_terms,
@@ -115,6 +115,25 @@ class Localizer:
         Raises:
             ValueError: wrong shapes, or values that are not finite.
         """
+        return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn))
+
+    def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
+        """The same, or a :class:`Failure` where the orientation is too uncertain."""
+        if not found:
+            return found
+        failure = uncertain(found, self.config.max_orientation_deviation)
+        return found if failure is None else failure
+
+    def find(
+        self,
+        points: ArrayLike,
+        pixels: ArrayLike,
+        scores: ArrayLike | None = None,
+        prior: Prior | None = None,
+        expected_share: float = 0.5,
+        turn: KnownTurn | None = None,
+    ) -> Estimate | Failure:
+        """As :meth:`localize`, however uncertain it is: the next frames may know better."""
         if prior is not None and not isinstance(prior, Prior):
             raise ValueError(f"prior must be an rs_localizer.Prior, got {type(prior).__name__}")
         points, pixels, scores = checked(points, pixels, scores)

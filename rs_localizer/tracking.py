@@ -165,7 +165,7 @@ class Tracker:
                 if prior is not None and not self.trusts_readout_time:
                     prior = replace(prior, covariance=_UNKNOWN)
                 prior = prior if turn is None else _beside(prior, turn)
-            return self.localizer.localize(points, pixels, scores, prior, share, turn), prior
+            return self.localizer.find(points, pixels, scores, prior, share, turn), prior
 
         if self._aid is None:
             result, prior = localized(None)
@@ -183,7 +183,7 @@ class Tracker:
         if self._aid is not None and imu is not None and self._aid.wants_sight():
             camera = self.localizer.camera
             self._aid.seek(sight_of(camera, points, pixels, result, time_ns))
-        return result
+        return self.localizer.accepted(result)
 
     def _before(self, time_ns: int) -> Before | None:
         """What the last frame says of the motion beside what a gyroscope sees."""

@@ -116,7 +116,7 @@ def test_no_motion_that_keeps_pace_with_the_rows_is_published():
 @pytest.fixture(scope="module")
 def small_planes():
     """Planes of 0.2 m, 2 to 3 m away, that lean by 20 deg: noise hides which way they lean."""
-    localizer = rsl.Localizer(CAMERA)
+    localizer = rsl.Localizer(CAMERA, max_orientation_deviation=1.0)
     frames = [plane_frame(seed, 20.0, 0.0, 0.0, 0.1) for seed in range(60)]
     return [(localizer.localize(points, pixels), points, pixels, true)
             for points, pixels, true in frames]  # fmt: skip
@@ -141,6 +141,34 @@ def test_a_prediction_says_which_of_both_poses_it_is(small_planes):
             assert not tracked or turn_between(tracked, true) < 10.0
             helped += bool(tracked)
     assert helped > 5
+
+
+def test_orientations_that_the_points_hardly_tell_are_not_published(small_planes):
+    localizer = rsl.Localizer(CAMERA)
+    for result, points, pixels, _ in small_planes[:20]:
+        if result:
+            told = localizer.localize(points, pixels)
+            assert bool(told) == (result.orientation_deviation <= 0.07)
+            assert told or told.reason == "uncertain"
+
+
+def test_a_track_begins_with_an_orientation_that_is_not_published():
+    """Every frame adds what it knows, although the first ones know too little to be published."""
+    camera = rsl.Camera(1000, 1000, CAMERA.K, readout_time=0.03)
+    points, _, motion = plane_frame(3, 30.0, 0.0, 0.0, 0.3)
+    exact, _ = project_rolling(camera, motion.at_rows, points)
+    rng = np.random.default_rng(3)
+    frames = [exact + rng.normal(size=exact.shape) for _ in range(12)]
+    alone = rsl.Localizer(camera, max_orientation_deviation=1.0).localize(points, frames[0])
+    most = 0.7 * alone.orientation_deviation
+    tracker = rsl.Tracker(rsl.Localizer(camera, max_orientation_deviation=most))
+    results = [
+        tracker.localize(33_333_333 * (1 + k), points, frame) for k, frame in enumerate(frames)
+    ]
+    assert results[0].reason == "uncertain"
+    assert results[-1]
+    assert results[-1].tracked
+    assert results[-1].orientation_deviation <= most
 
 
 def test_gravity_levels_a_camera_at_rest():

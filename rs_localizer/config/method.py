@@ -99,6 +99,13 @@ class LocalizerConfig:
     min_inliers: int = setting(
         12, "Fewest inliers of a pose that is accepted", minimum=7, maximum=1_000_000
     )
+    max_orientation_deviation: float = setting(
+        0.07,
+        "Largest standard deviation of the orientation of a pose that is accepted, in rad, about "
+        "the axis known worst",
+        minimum=0.001,
+        maximum=10.0,
+    )
     seed: int = setting(
         0, "Seed of the random samples; every frame starts from it", minimum=0, maximum=2**31 - 1
     )

@@ -186,8 +186,8 @@ class NodeConfig(LocalizerConfig):
     )
     tracking: bool = setting(
         True,
-        "Use the previous pose and twist as first guess and prior; needs readout_time and a "
-        "rolling-shutter solver",
+        "Use the previous pose and twist as first guess and prior, with a rolling-shutter solver; "
+        "without a readout_time only what frames say of map and lens is remembered",
     )
     base_frame: str = setting(
         "",

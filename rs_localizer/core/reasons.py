@@ -18,6 +18,7 @@ class Reason(StrEnum):
     IMPLAUSIBLE = "implausible"
     MIRRORED = "mirrored"
     MODEL_ERROR = "model_error"
+    UNCERTAIN = "uncertain"
     # Messages that cannot be used, or not yet.
     NO_CAMERA_INFO = "no_camera_info"
     BAD_CAMERA_INFO = "bad_camera_info"

@@ -14,7 +14,7 @@ from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import MOTION_PARAMETERS
+from rs_localizer.core.state import MOTION_PARAMETERS, TURN
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -50,6 +50,11 @@ class Estimate(Motion):
     def covariance(self) -> Array:
         """Covariance (12,12) of pose and velocities at tau = 0."""
         return self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+
+    @property
+    def orientation_deviation(self) -> float:
+        """Standard deviation (rad) of the orientation at tau = 0, about the axis known worst."""
+        return math.sqrt(np.linalg.eigvalsh(self.joint_covariance[TURN, TURN])[-1])
 
     def shake_at(self, tau: float) -> tuple[Array, Array]:
         """Turn (3,) of the camera beside the motion, and its rate (3,), at row time ``tau``.

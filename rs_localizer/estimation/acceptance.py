@@ -9,7 +9,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, depths
-from rs_localizer.core.types import Failure
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior
 
@@ -122,6 +122,22 @@ def refusal(
             "sigma^2 worse",
         )
     return None
+
+
+def uncertain(estimate: Estimate, most: float) -> Failure | None:
+    """Why an estimate is too uncertain to be published, or None.
+
+    Args:
+        most: largest standard deviation of the orientation, rad.
+    """
+    deviation = estimate.orientation_deviation
+    if deviation <= most:
+        return None
+    return Failure(
+        Reason.UNCERTAIN,
+        f"the points tell the orientation to {math.degrees(deviation):.1f} deg (one standard "
+        f"deviation), {math.degrees(most):.1f} deg are accepted",
+    )
 
 
 def _median(values: Array, chosen: BoolArray) -> float:

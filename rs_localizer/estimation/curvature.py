@@ -10,6 +10,9 @@ terms of a step (turn ``phi``, move ``rho``; see :mod:`rs_localizer.estimation.r
         = -d - phi x p - (phi x (phi x p) / 2 + phi x d) - ...
 
 of which the ellipsoid has the first two.
+
+Arcs also turn the axes: a step from one point of an arc, told from another one, moves along
+other axes.
 """
 
 from __future__ import annotations
@@ -18,19 +21,20 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.state import MOVE
+from rs_localizer.core.so3 import exp
+from rs_localizer.core.state import MOVE, TURN
 
 
 @kernel
 def along_arcs(covariance: Array, centre: Array) -> Array:
-    """The covariance (18,18) with the second order of the move; that of the turn has none.
+    """The covariance with the second order of the move; that of the turn has none.
 
     The mean stays where the points fit best, so that the mean of the second order counts, too: for
     ``s_i = y^T H_i y`` of Gaussians ``y`` with covariance ``C``, ``E[s_i s_j]`` is
     ``tr(H_i C) tr(H_j C) + 2 tr(H_i C H_j C)``.
 
     Args:
-        covariance: of a step.
+        covariance: (18,18), or more, of a step.
         centre: (3,) of the points, in camera axes.
     """
     # y = (phi, d): d = -rho + [p]x phi.
@@ -60,3 +64,29 @@ def along_arcs(covariance: Array, centre: Array) -> Array:
             second += 2.0 * np.sum(products[i] * products[j].T)
             farther[MOVE, MOVE][i, j] += second
     return farther
+
+
+@kernel
+def told_from(covariance: Array, turn: Array) -> Array:
+    """The covariance (n,n) of steps from one state as that of steps from another one.
+
+    With the turn ``a`` from the other state to the one, steps from the other one are
+
+        log(exp([a]x) exp([phi]x)) = a + J(a)^-1 phi + ...   and   ... + exp([a]x) rho,
+
+    where J is the right Jacobian of SO(3).
+
+    Args:
+        turn: (3,) first part of the step from the other state to the one.
+    """
+    x, y, z = turn[0], turn[1], turn[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    second = 1.0 / 12.0
+    if angle > 1e-3:
+        second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
+    by_step = np.eye(len(covariance))
+    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    by_step[TURN, TURN] += 0.5 * hat + second * hat @ hat
+    by_step[MOVE, MOVE] = exp(turn)
+    return by_step @ covariance @ by_step.T

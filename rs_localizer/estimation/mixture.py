@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import PARAMETERS, at_rest, depths, step_between
+from rs_localizer.core.state import PARAMETERS, TURN, at_rest, depths, step_between
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
-from rs_localizer.estimation.curvature import along_arcs
+from rs_localizer.estimation.curvature import along_arcs, told_from
+from rs_localizer.estimation.face_on import OVERLAP, windows
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
@@ -36,10 +37,14 @@ DISTRUST = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
+# Probabilities that have no part in the covariance.
+_NO_PART = 1e-5
 # Points nearer than this (m) would make any map useless.
 _NEAREST = 1e-6
 # Logarithm of the odds of a typical speed beside a better one, beyond which none is tried.
 _FAR_LESS_PROBABLE = 7.0
+# Likewise, beyond which a typical speed hardly counts in the covariance.
+_HARDLY_COUNTS = 3.0
 # A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
 CLEARLY_WORSE = 9.2
 # The covariance speaks for poses within so many standard deviations of the orientation.
@@ -57,6 +62,11 @@ class Mode:
     cost: float  # of its fit, noise variances
     speed: float
     field: float  # px
+
+    @property
+    def support(self) -> float:
+        """Logarithm of what it counts in the covariance, but for a constant."""
+        return self.evidence - _GENEROSITY * self.volume
 
 
 class Inliers:
@@ -138,9 +148,11 @@ def volume_of(terms: PriorTerms, examined: Examined) -> float:
 def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     """The average of all combinations, and the mirrored pose if it cannot be ruled out."""
     modes = _modes(frame, found, planar)
+    if planar:
+        modes = _in_pieces(frame, modes)
     evidence = np.array([mode.evidence for mode in modes])
     at_rest = np.array([mode.speed == 0.0 for mode in modes])
-    possible = _normalized(evidence - _GENEROSITY * np.array([mode.volume for mode in modes]))
+    possible = _normalized(np.array([mode.support for mode in modes]))
     counting = _normalized(evidence + frame.odds * at_rest)
     best = int(np.argmax(counting))
     steps = np.array([step_between(modes[best].state, mode.state) for mode in modes])
@@ -148,8 +160,8 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     state = apply_step(modes[best].state, mean)
     offsets = steps - mean
     covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
-    for probability, mode in zip(possible, modes, strict=True):
-        covariance += probability * mode.covariance
+    for k in np.flatnonzero(possible > _NO_PART):
+        covariance += possible[k] * told_from(modes[k].covariance, offsets[k, TURN])
     # Shaking that was not seen may be there all the same, unless the camera rests.
     joint = (1.0 - possible @ at_rest) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
@@ -168,16 +180,12 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
 
 def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
     """A Gaussian for each speed and, before a plane, for either way that it may lean."""
-    terms, may_rest = frame.terms, frame.assumed.may_rest
-    turn_known = frame.assumed.turn is not None
+    may_rest = frame.assumed.may_rest
     modes: list[Mode] = []
     near = at_rest(found.state) if may_rest else found.state
     other = mirrored(frame.observations.points, frame.inliers, near) if planar else None
     for speed in _SPEEDS if may_rest else (1.0,):
-        if speed == 0.0:
-            chosen = held_beside(terms, turn_known)
-        else:
-            chosen = terms if speed == 1.0 else slower_terms(terms, speed, turn_known)
+        chosen = _terms_at(frame, speed)
         modes.append(frame.mode(near, chosen, speed))
         near = modes[-1].state
         if planar and other is None:
@@ -190,6 +198,38 @@ def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
         ):
             break  # what moves faster explains even less
     return modes
+
+
+def _terms_at(frame: Inliers, speed: float) -> PriorTerms:
+    turn_known = frame.assumed.turn is not None
+    if speed == 0.0:
+        return held_beside(frame.terms, turn_known)
+    return frame.terms if speed == 1.0 else slower_terms(frame.terms, speed, turn_known)
+
+
+def _in_pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
+    """The modes, and in place of those of planes that nearly face the camera pieces of them."""
+    supports = {mode.speed: -math.inf for mode in modes}
+    for mode in modes:
+        supports[mode.speed] = max(supports[mode.speed], mode.support)
+    pieces: list[Mode] = []
+    for speed, support in supports.items():
+        here = [mode for mode in modes if mode.speed == speed]
+        counts = support > max(supports.values()) - _HARDLY_COUNTS
+        pieces += (_pieces(frame, here) if counts else []) or here
+    return pieces
+
+
+def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
+    best = min(modes, key=lambda mode: mode.cost)
+    terms, pieces = _terms_at(frame, best.speed), list[Mode]()
+    points = frame.observations.points
+    for window in windows(points, frame.inliers, best.state, best.covariance):
+        piece = frame.mode(window.state, window.times(terms), best.speed)
+        pieces.append(replace(piece, evidence=piece.evidence - OVERLAP))
+        if piece.evidence < max(one.evidence for one in pieces) - _FAR_LESS_PROBABLE:
+            break
+    return pieces
 
 
 def _more_probable(prior: Array, odds: Array) -> Array:

@@ -19,8 +19,9 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest
+from rs_localizer.core.state import LINEAR, PARAMETERS, STATE_TRANSLATION, VELOCITIES, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
+from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.hearing import hear
 from rs_localizer.estimation.humming import Heard, averaged
@@ -178,10 +179,11 @@ def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -
     if shaken is None:
         return None
     worth = _worth(_correlation(shaken.agreement, shaken.inliers))
+    covariance = best.inflation / worth * shaken.covariance
     return replace(
         best,
         state=shaken.state,
-        covariance=best.inflation / worth * shaken.covariance,
+        covariance=along_arcs(covariance, shaken.state[STATE_TRANSLATION]),
         noise=shaken.noise,
         squared_errors=shaken.squared_errors,
         inliers=shaken.inliers,

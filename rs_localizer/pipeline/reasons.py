@@ -57,6 +57,12 @@ REASONS: dict[str, Meaning] = {
         "map or calibration that is too far off for any pose",
         f"a stiffer mounting, the calibration, the map; {_TURNED}",
     ),
+    Reason.UNCERTAIN: Meaning(
+        "the points tell the orientation less well than max_orientation_deviation, as those of a "
+        "small plane before a camera that may move",
+        "come nearer, use a larger board or markers on several walls; leave tracking on, give the "
+        "velocity_prior of a slow camera, or raise the limit where a filter weighs each pose",
+    ),
     Reason.NO_CAMERA_INFO: Meaning(
         "no usable camera_info came before it", "is it recorded, is its topic the right one?"
     ),

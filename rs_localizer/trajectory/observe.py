@@ -58,9 +58,9 @@ def localize_each(
     rough = Localizer(camera, inlier_threshold=_ROUGH * localizer.config.inlier_threshold)
     results = []
     for image in images:
-        result = localizer.localize(image.points, image.pixels)
+        result = localizer.find(image.points, image.pixels)
         if isinstance(result, Failure) and result.reason in _OF_THE_LENS:
-            result = rough.localize(image.points, image.pixels)
+            result = rough.find(image.points, image.pixels)
         results.append(result)
         done()
     return results

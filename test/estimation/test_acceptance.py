@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import Reason
-from rs_localizer.estimation.acceptance import refusal
+from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import motion_terms
+from rs_localizer.localizer import Localizer
 
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))
 THRESHOLD = 2.0
@@ -119,3 +120,17 @@ def test_a_mirrored_pose_that_fits_as_well(good, turn, covered, expected):
     step[1] = turn
     doubtful = replace(posterior, mirror=Mirror(step, 1.0, covered))
     assert reason(observations, doubtful) is expected
+
+
+def test_an_orientation_that_is_hardly_known(scene):
+    camera, _, points, _, measured = scene.frame(noise=0.3, count=40)
+    found = Localizer(camera).localize(points, measured)
+    assert found
+    known = found.orientation_deviation
+    worst = np.linalg.eigvalsh(found.covariance[:3, :3])[-1]
+    assert known == pytest.approx(np.sqrt(worst))
+    assert uncertain(found, 1.01 * known) is None
+    assert uncertain(found, 0.99 * known).reason is Reason.UNCERTAIN
+    refused = Localizer(camera, max_orientation_deviation=max(0.001, 0.9 * known))
+    if known > 0.0012:
+        assert refused.localize(points, measured).reason is Reason.UNCERTAIN

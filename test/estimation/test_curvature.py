@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.estimation.curvature import along_arcs
+from rs_localizer.core.state import step_between
+from rs_localizer.estimation.curvature import along_arcs, told_from
+from rs_localizer.estimation.refine import apply_step
 from rs_localizer.lab.experiments.honesty.small_planes import Condition, measure
 
 CENTRE = np.array([0.3, -0.2, 3.0])
@@ -45,9 +47,27 @@ def test_where_the_orientation_is_known_nothing_is_added() -> None:
     assert np.abs(added).max() < 1e-6 * covariance[3, 3]
 
 
+def test_steps_from_one_state_are_told_from_another() -> None:
+    rng = np.random.default_rng(1)
+    here = np.concatenate(
+        [Rotation.random(random_state=1).as_matrix().ravel(), rng.normal(size=15)]
+    )
+    there = apply_step(here, np.concatenate([[0.2, -0.1, 0.3], rng.normal(size=15)]))
+    factor = rng.normal(size=(18, 18))
+
+    def told(step):
+        return step_between(here, apply_step(there, step))
+
+    small = 1e-5 * np.eye(18)
+    jacobian = np.column_stack([(told(one) - told(-one)) / 2e-5 for one in small])
+    expected = jacobian @ factor @ factor.T @ jacobian.T
+    found = told_from(factor @ factor.T, step_between(here, there)[:3])
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
+
+
 def test_regions_before_a_small_tilted_plane_hold_under_motion() -> None:
     """Along the ellipsoid's own axes they held in half of the frames."""
     found = measure(Condition(size=0.6, distance=3.0, tilt=30.0, turn=10.0), frames=40, seed=2)
-    assert np.mean(found.middle.localized) > 0.9
+    assert np.mean(found.middle.localized) > 0.8
     for scores in (found.stamp, found.middle):
-        assert np.mean(scores.inside("pose")) >= 0.8
+        assert np.mean(scores.inside("pose")) >= 0.85

@@ -57,6 +57,12 @@ class MockLocalizer:
     def warm_up(self) -> None:
         pass
 
+    def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
+        return found
+
+    def find(self, *given: Any, **more: Any) -> Estimate | Failure:
+        return self.localize(*given, **more)
+
     def localize(
         self,
         points: Array,
