@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import rs_localizer as rsl
-from rs_localizer.estimation import mixture, settling
+from rs_localizer.estimation import mixture, settling, tone_evidence
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 
@@ -12,8 +12,8 @@ K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
 def test_shaking_is_followed_once(direction, monkeypatch):
     """Its kernels are those that an ordinary frame does not need."""
-    followed, gains = [], []
-    follow, gain = settling.follow, mixture.gain_of_shaking
+    followed, gains, looked = [], [], []
+    follow, gain, look = settling.follow, mixture.gain_of_shaking, tone_evidence.spectrum
 
     def watched(*arguments):
         followed.append(follow(*arguments))
@@ -23,12 +23,18 @@ def test_shaking_is_followed_once(direction, monkeypatch):
         gains.append(gain(*arguments))
         return gains[-1]
 
+    def listened(*arguments):
+        looked.append(look(*arguments))
+        return looked[-1]
+
     monkeypatch.setattr(settling, "follow", watched)
+    monkeypatch.setattr(tone_evidence, "spectrum", listened)
     monkeypatch.setattr(mixture, "gain_of_shaking", weighed)
     camera = rsl.Camera(640, 480, K, readout_time=0.02, scan_direction=direction)
     rsl.Localizer(camera).warm_up()
     assert any(found is not None for found in followed)
     assert max(gains) > 1.0
+    assert looked
 
 
 def test_a_matrix_is_no_camera_and_a_dictionary_no_prior():

@@ -30,6 +30,7 @@ from rs_localizer.estimation.evidence import (
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.spectrum import loudest
 
 # Probability of no field, the one assumed beforehand, above which none is looked for among
 # neighbours.
@@ -163,6 +164,7 @@ class Examined(NamedTuple):
     agreement: float  # of neighbouring rows, see :func:`neighbours_agree`
     # Correlation of each point's error with that of its neighbour in the image.
     shared: float
+    loudness: float  # of the loudest tone, see :func:`rs_localizer.estimation.spectrum.loudest`
     determined: float  # logarithm of the determinant of the information of the motion, px^2
 
 
@@ -194,14 +196,15 @@ def examine(
         columns, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
     )  # fmt: skip
     step, covariance = with_model_error(columns, sizes.noise, sizes.shake, sizes.field)
-    agreement, shared = 0.0, 0.0
+    agreement, shared, loudness = 0.0, 0.0, 0.0
     if neighbours:
         agreement = neighbours_agree(errors, measured_tau, rays, inliers)
+        loudness = loudest(errors, by_turn, measured_tau, inliers)
         # Where no field is seen, nor is what neighbours share; and most frames have none.
         if sizes.no_field < _NO_FIELD:
             shared = shared_errors(errors, rays, inliers)
     determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
-    return Examined(step, covariance, sizes, agreement, shared, determined)
+    return Examined(step, covariance, sizes, agreement, shared, loudness, determined)
 
 
 @kernel

@@ -2,7 +2,8 @@
 
 The best motion is one point of a posterior that need not look like a Gaussian about it:
 
-* the camera may shake, and map and lens may be a little off (:mod:`.model_error`);
+* the camera may shake (:mod:`.hearing`, :mod:`.shaking`), and map and lens may be a little off
+  (:mod:`.model_error`);
 * the points may hardly tell a slow camera from a resting one, and before a plane motions of
   very different speed fit alike, along a curved valley: the typical speed is an unknown of its own;
 * a plane may lean the other way (:mod:`rs_localizer.estimation.mirror`).
@@ -22,6 +23,8 @@ from rs_localizer.core.state import LINEAR, PARAMETERS, STATE_TRANSLATION, VELOC
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
+from rs_localizer.estimation.hearing import hear
+from rs_localizer.estimation.humming import Heard, averaged
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.mixture import CLEARLY_WORSE, DISTRUST, Inliers, volume_of, weighed
 from rs_localizer.estimation.model_error import Examined
@@ -100,12 +103,18 @@ def _settled(
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
     may_shake = assumed.rolling and not mirrored_fits
+    heard = hear(frame, best, examined, threshold) if may_shake else None
+    humming = _humming(best, sizes, heard) if heard and heard.certain else None
+    if heard and humming and heard.tonal and humming.agreement < AGREEMENT:
+        return humming
     seems_to_shake = may_shake and _seems_to_shake(frame, best, examined)
     certain = examined.agreement > _CERTAIN
     if seems_to_shake and (certain or not _rather_rests(frame, best, examined)):
         shaken = _followed(frame, best, sizes, threshold)
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
-            return shaken
+            return _either(heard, humming, shaken)
+    if humming:
+        return humming
     shared = examined.shared
     if may_shake and not seems_to_shake and examined.agreement > AGREEMENT:
         shared = max(shared, _correlation(examined.agreement, best.inliers))
@@ -126,8 +135,8 @@ def _settled(
     planar = other is not None
     turn_known = assumed.turn is not None
     if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
-        return weighed(frame, found, planar)
-    return found
+        found = weighed(frame, found, planar)
+    return averaged(heard, found) if heard else found
 
 
 def _seems_to_shake(frame: Inliers, best: Posterior, examined: Examined) -> bool:
@@ -183,6 +192,29 @@ def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -
         of_shake_sizes=sizes.of_shake_sizes,
         of_field_sizes=sizes.of_field_sizes,
     )
+
+
+def _humming(best: Posterior, sizes: Sizes, heard: Heard) -> Posterior:
+    """The posterior of a camera that tones shake."""
+    found = averaged(heard, best)
+    worth = _worth(_correlation(heard.agreement, found.inliers))
+    return replace(
+        found,
+        covariance=found.covariance / worth,
+        of_shake_sizes=sizes.of_shake_sizes,
+        of_field_sizes=sizes.of_field_sizes,
+    )
+
+
+def _either(heard: Heard | None, humming: Posterior | None, shaken: Posterior) -> Posterior:
+    """What tones and polynomials make of a shaking together: neither is known to be right."""
+    if heard is None or (humming is None and heard.agreement > AGREEMENT):
+        return shaken
+    if humming is None:
+        return averaged(heard, shaken)
+    if max(humming.agreement, shaken.agreement) > AGREEMENT:
+        return min(humming, shaken, key=lambda found: found.agreement)
+    return averaged(replace(heard, none=0.5, probabilities=0.5 * heard.probabilities), shaken)
 
 
 def _clearly_moving(found: Posterior, terms: PriorTerms, turn_known: bool) -> bool:

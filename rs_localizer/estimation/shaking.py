@@ -152,10 +152,18 @@ def _fit(
     behind = np.isinf(observations.squared_errors(state))
     errors[behind] = 1e150
     squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
-    # Points beyond the gate count, too: where rows swing out of it, they do so together.
-    gate = np.sqrt(squared[inliers & ~behind].max(initial=0.0))
-    near = squared < (_NEAR * gate) ** 2
-    lengths = np.sqrt(np.where(near, np.maximum(squared, 1e-300), 1.0))
-    clipped = errors * np.minimum(1.0, gate / lengths)[:, None]
-    agreement = neighbours_agree(clipped, observations.tau, observations.rays, near)
+    agreement = agreement_of(observations, errors, squared, inliers)
     return Shaken(state, coefficients, covariance, noise, agreement, squared, inliers, sizes)
+
+
+def agreement_of(
+    observations: Observations, errors: Array, squared_errors: Array, inliers: BoolArray
+) -> float:
+    """How much neighbouring rows agree (see :func:`neighbours_agree`) beside a shaking."""
+    # Points beyond the gate count, too: where rows swing out of it, they do so together.
+    seen = np.isfinite(squared_errors)
+    gate = np.sqrt(squared_errors[inliers & seen].max(initial=0.0))
+    near = squared_errors < (_NEAR * gate) ** 2
+    lengths = np.sqrt(np.where(near, np.maximum(squared_errors, 1e-300), 1.0))
+    clipped = errors * np.minimum(1.0, gate / lengths)[:, None]
+    return neighbours_agree(clipped, observations.tau, observations.rays, near)

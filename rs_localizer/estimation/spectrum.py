@@ -1,0 +1,146 @@
+"""Which tones may shake a camera: the marginal likelihood of each frequency.
+
+A periodogram by least squares (Lomb, "Least-squares frequency analysis of unequally spaced data",
+1976) of the errors that a motion leaves: beside each tone the motion is fitted anew, and the swings
+about all axes are Gaussian coefficients of unknown size (Bretthorst, "Bayesian spectrum analysis
+and parameter estimation", 1988).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.tones import MOST_CYCLES
+from rs_localizer.estimation.columns import Columns
+from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
+
+# What is slower, polynomials of low degree follow. A readout tells tones apart that differ by one.
+CYCLES = np.arange(1.0, MOST_CYCLES + 0.1, 0.25)
+"""Frequencies that are tried, in cycles per readout."""
+SWINGS = np.radians([1e-6, 0.01, 0.03, 0.1, 0.3, 1.0])
+"""Sizes that are tried, rad; the first is none."""
+_TONE = 6  # coefficients: of cosine and sine, about three axes
+# Rows of such a part of the readout are taken together: the fastest tone turns by 30 degrees in it.
+_BINS = 96
+_ANGLES = 2.0 * math.pi * np.outer(CYCLES, (np.arange(_BINS) + 0.5) / _BINS - 0.5)
+_WAVES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_LITTLE = 1e-300
+
+
+@kernel
+def _bin(tau: float) -> int:
+    return min(max(int((tau + 0.5) * _BINS), 0), _BINS - 1)
+
+
+@kernel
+def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> float:
+    """Power of the loudest tone among errors: of each, without one, chi-squared of six.
+
+    A first look that takes microseconds, because it leaves the motion as it is.
+
+    Args:
+        errors, by_turn, tau: of the points, see
+            :func:`rs_localizer.estimation.residuals.linearized`.
+        chosen: (n,) the points that count.
+    """
+    heard, known = np.zeros((_BINS, 3)), np.zeros(3)
+    squared, count = 0.0, 0
+    for i in range(len(errors)):
+        if chosen[i]:
+            place = _bin(tau[i])
+            for axis in range(3):
+                first, second = by_turn[i, 0, axis], by_turn[i, 1, axis]
+                heard[place, axis] += first * errors[i, 0] + second * errors[i, 1]
+                known[axis] += first * first + second * second
+            squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
+            count += 1
+    if not squared > 0.0:
+        return 0.0
+    most = 0.0
+    for m in range(len(CYCLES)):
+        power = 0.0
+        for wave in range(2):
+            x, y, z = 0.0, 0.0, 0.0
+            for place in range(_BINS):
+                along = _WAVES[wave, m, place]
+                x += along * heard[place, 0]
+                y += along * heard[place, 1]
+                z += along * heard[place, 2]
+            power += x * x / max(known[0], _LITTLE) + y * y / max(known[1], _LITTLE)
+            power += z * z / max(known[2], _LITTLE)
+        most = max(most, power)
+    # The squares of a wave are a half in the mean; squared errors are those of two coordinates.
+    loud: float = 2.0 * most / (0.5 * squared / count)
+    return loud
+
+
+@kernel
+def spectrum(
+    errors: Array, columns: Array, by_turn: Array, tau: Array, chosen: BoolArray,
+    known: Columns, freedom: float, noise: float,
+) -> Array:  # fmt: skip
+    """Logarithm of the marginal likelihood (m,s) of tones of all frequencies and sizes.
+
+    Args:
+        errors, by_turn, tau: of the points.
+        columns: (n,2,p) derivatives of the errors by all that is fitted beside the tone.
+        chosen: (n,) the points that count.
+        known: products of these columns, with the prior.
+        freedom: degrees of freedom of the errors beside the motion.
+        noise: px, a first estimate.
+    """
+    # What turns at a row have in common with these columns, turns and errors there.
+    base = columns.shape[2]
+    shared = np.zeros((_BINS, 3, base + 4))
+    for i in range(len(errors)):
+        if chosen[i]:
+            at = shared[_bin(tau[i])]
+            for axis in range(3):
+                for line in range(2):
+                    turn = by_turn[i, line, axis]
+                    for k in range(base):
+                        at[axis, k] += turn * columns[i, line, k]
+                    for other in range(3):
+                        at[axis, base + other] += turn * by_turn[i, line, other]
+                    at[axis, base + 3] += turn * errors[i, line]
+    size = base + _TONE
+    products, right = np.zeros((size, size)), np.zeros(size)
+    products[:base, :base] = known.products
+    right[:base] = known.with_errors
+    evidence = np.empty((len(CYCLES), len(SWINGS)))
+    for m in range(len(CYCLES)):
+        _with_tone(shared, m, base, products, right)
+        left = project_out(products, right, known.squared_errors, _TONE)
+        evidence[m], _ = evidence_of_sizes(left, SWINGS, freedom, noise)
+    return evidence
+
+
+@kernel
+def _with_tone(shared: Array, tone: int, base: int, products: Array, right: Array) -> None:
+    """Fill in the rows and columns of a tone behind the others."""
+    for k in range(base, len(right)):
+        right[k] = 0.0
+        products[k] = 0.0
+    for place in range(_BINS):
+        at = shared[place]
+        if at[0, base] == 0.0:
+            continue
+        for wave in range(2):
+            along = _WAVES[wave, tone, place]
+            first = base + 3 * wave
+            for axis in range(3):
+                row, there = products[first + axis], at[axis]
+                right[first + axis] -= along * there[base + 3]
+                for k in range(base):
+                    row[k] += along * there[k]
+                for other in range(2):
+                    both = along * _WAVES[other, tone, place]
+                    for k in range(3):
+                        row[base + 3 * other + k] += both * there[base + k]
+    for k in range(base, len(right)):
+        for j in range(base):
+            products[j, k] = products[k, j]
