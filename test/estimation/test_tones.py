@@ -91,7 +91,7 @@ def test_wrong_matches_stay_outside():
     assert found.inliers[:40].sum() <= 3
 
 
-def test_a_second_tone_is_heard_beside_the_first():
+def test_a_second_tone_is_found_beside_the_first():
     def both(tau):
         return (waves(tau, 3.0, SWING) + waves(tau, 6.5, 0.4 * SWING[::-1]))[:, :3]
 
