@@ -69,6 +69,11 @@ def refusal(
             f"{found} inliers do not determine the motion: smallest eigenvalue of the scaled "
             f"information {posterior.smallest_eigenvalue:.1e}",
         )
+    if not (np.all(np.isfinite(state)) and np.all(np.isfinite(posterior.covariance))):
+        return Failure(
+            Reason.DEGENERATE,
+            f"{found} inliers leave the motion so open that it cannot be computed",
+        )
     most = _MOST_NOISE if rolling else _MOST_NOISE_GLOBAL_SHUTTER
     if posterior.noise > most * threshold:
         return Failure(

@@ -128,6 +128,11 @@ class Inliers:
         evidence = self.worth * (examined.sizes.evidence + volume)
         if self.assumed.turn is not None:
             evidence += self.assumed.turn.evidence(speed)
+        if not (math.isfinite(evidence) and examined.finite):
+            # It has left what can be computed: the camera would stand behind the points.
+            return Mode(
+                start, np.zeros_like(examined.covariance), -math.inf, 0.0, math.inf, speed, 0.0
+            )
         return Mode(
             state,
             along_arcs(self.inflation / self.worth * examined.covariance, state[9:12]),
@@ -151,6 +156,8 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     if planar:
         modes = _in_pieces(frame, modes)
     evidence = np.array([mode.evidence for mode in modes])
+    if not np.any(evidence > -math.inf):
+        return replace(found, smallest_eigenvalue=0.0)
     at_rest = np.array([mode.speed == 0.0 for mode in modes])
     possible = _normalized(np.array([mode.support for mode in modes]))
     counting = _normalized(evidence + frame.odds * at_rest)
@@ -163,7 +170,7 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     for k in np.flatnonzero(possible > _NO_PART):
         covariance += possible[k] * told_from(modes[k].covariance, offsets[k, TURN])
     # Shaking that was not seen may be there all the same, unless the camera rests.
-    joint = (1.0 - possible @ at_rest) * found.covariance
+    joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
     joint[:PARAMETERS, PARAMETERS:] = 0.0
     joint[PARAMETERS:, :PARAMETERS] = 0.0

@@ -11,6 +11,7 @@ is averaged.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -166,6 +167,11 @@ class Examined(NamedTuple):
     shared: float
     loudness: float  # of the loudest tone, see :func:`rs_localizer.estimation.spectrum.loudest`
     determined: float  # logarithm of the determinant of the information of the motion, px^2
+
+    @property
+    def finite(self) -> bool:
+        """Whether the points are enough for what was asked of them: else covariances are none."""
+        return math.isfinite(self.step.sum() + np.trace(self.covariance))
 
 
 @kernel

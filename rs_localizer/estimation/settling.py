@@ -101,6 +101,8 @@ def _settled(
                 return best
             frame = Inliers(observations, best, terms, assumed)
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
+    if not examined.finite:
+        return replace(best, smallest_eigenvalue=0.0)
     sizes = examined.sizes
     may_shake = assumed.rolling and not mirrored_fits
     tones = find_tones(frame, best, examined, threshold) if may_shake else None

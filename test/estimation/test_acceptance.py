@@ -61,6 +61,14 @@ def test_points_that_do_not_determine_the_motion(good):
     assert reason(observations, flat) is Reason.DEGENERATE
 
 
+@pytest.mark.parametrize("part", ["state", "covariance"])
+def test_what_cannot_be_computed_is_no_motion(good, part):
+    observations, posterior = good
+    lost = getattr(posterior, part).copy()
+    lost.flat[-1] = np.nan
+    assert reason(observations, replace(posterior, **{part: lost})) is Reason.DEGENERATE
+
+
 @pytest.mark.parametrize(
     ("rolling", "noise", "expected"),
     [

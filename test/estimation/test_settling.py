@@ -1,5 +1,6 @@
 """All that the points leave possible: rest and motion, shaking, and wrong maps."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.assumptions import assumptions
+from rs_localizer.estimation.mixture import Inliers, weighed
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import held_terms
@@ -202,3 +204,17 @@ def test_a_bent_board_at_rest_does_not_turn():
         turning += turns(settle(observations, state, PRIOR, 2.0, ASSUMED))
     assert fooled > 10  # the best motion alone
     assert turning <= 2
+
+
+def test_a_motion_that_leaves_all_points_behind_counts_for_nothing():
+    observations, truth = frame(3, 0.0, 0.5)
+    best = maximum_a_posteriori(observations, truth, PRIOR, 2.0)
+    inside = Inliers(observations, best, PRIOR, ASSUMED)
+    away = truth.copy()
+    away[11] = -40.0
+    lost = inside.mode(away, PRIOR, 1.0)
+    assert lost.evidence == -np.inf
+    assert np.all(np.isfinite(lost.covariance))
+    assert inside.mode(truth, PRIOR, 1.0).evidence > -np.inf
+    # Where nothing else is left, nothing is determined.
+    assert not weighed(inside, replace(best, state=away), planar=False).determined
