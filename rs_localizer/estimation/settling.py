@@ -23,8 +23,6 @@ from rs_localizer.core.state import LINEAR, PARAMETERS, STATE_TRANSLATION, VELOC
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
-from rs_localizer.estimation.hearing import hear
-from rs_localizer.estimation.humming import Heard, averaged
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.mixture import CLEARLY_WORSE, DISTRUST, Inliers, volume_of, weighed
 from rs_localizer.estimation.model_error import Examined
@@ -33,6 +31,8 @@ from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, follow
+from rs_localizer.estimation.tone_mixture import ToneMixture, averaged
+from rs_localizer.estimation.tone_search import find_tones
 
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part.
@@ -103,18 +103,18 @@ def _settled(
     examined = frame.examined(best.state, terms, _SHAKE_DEGREE if assumed.rolling else 0)
     sizes = examined.sizes
     may_shake = assumed.rolling and not mirrored_fits
-    heard = hear(frame, best, examined, threshold) if may_shake else None
-    humming = _humming(best, sizes, heard) if heard and heard.certain else None
-    if heard and humming and heard.tonal and humming.agreement < AGREEMENT:
-        return humming
+    tones = find_tones(frame, best, examined, threshold) if may_shake else None
+    toned = _toned(best, sizes, tones) if tones and tones.certain else None
+    if tones and toned and tones.tonal and toned.agreement < AGREEMENT:
+        return toned
     seems_to_shake = may_shake and _seems_to_shake(frame, best, examined)
     certain = examined.agreement > _CERTAIN
     if seems_to_shake and (certain or not _rather_rests(frame, best, examined)):
         shaken = _followed(frame, best, sizes, threshold)
         if shaken and (sizes.no_shake < _SHAKING or shaken.noise < best.noise):
-            return _either(heard, humming, shaken)
-    if humming:
-        return humming
+            return _either(tones, toned, shaken)
+    if toned:
+        return toned
     shared = examined.shared
     if may_shake and not seems_to_shake and examined.agreement > AGREEMENT:
         shared = max(shared, _correlation(examined.agreement, best.inliers))
@@ -136,7 +136,7 @@ def _settled(
     turn_known = assumed.turn is not None
     if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
         found = weighed(frame, found, planar)
-    return averaged(heard, found) if heard else found
+    return averaged(tones, found) if tones else found
 
 
 def _seems_to_shake(frame: Inliers, best: Posterior, examined: Examined) -> bool:
@@ -194,10 +194,10 @@ def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -
     )
 
 
-def _humming(best: Posterior, sizes: Sizes, heard: Heard) -> Posterior:
+def _toned(best: Posterior, sizes: Sizes, tones: ToneMixture) -> Posterior:
     """The posterior of a camera that tones shake."""
-    found = averaged(heard, best)
-    worth = _worth(_correlation(heard.agreement, found.inliers))
+    found = averaged(tones, best)
+    worth = _worth(_correlation(tones.agreement, found.inliers))
     return replace(
         found,
         covariance=found.covariance / worth,
@@ -206,15 +206,15 @@ def _humming(best: Posterior, sizes: Sizes, heard: Heard) -> Posterior:
     )
 
 
-def _either(heard: Heard | None, humming: Posterior | None, shaken: Posterior) -> Posterior:
+def _either(tones: ToneMixture | None, toned: Posterior | None, shaken: Posterior) -> Posterior:
     """What tones and polynomials make of a shaking together: neither is known to be right."""
-    if heard is None or (humming is None and heard.agreement > AGREEMENT):
+    if tones is None or (toned is None and tones.agreement > AGREEMENT):
         return shaken
-    if humming is None:
-        return averaged(heard, shaken)
-    if max(humming.agreement, shaken.agreement) > AGREEMENT:
-        return min(humming, shaken, key=lambda found: found.agreement)
-    return averaged(replace(heard, none=0.5, probabilities=0.5 * heard.probabilities), shaken)
+    if toned is None:
+        return averaged(tones, shaken)
+    if max(toned.agreement, shaken.agreement) > AGREEMENT:
+        return min(toned, shaken, key=lambda found: found.agreement)
+    return averaged(replace(tones, none=0.5, probabilities=0.5 * tones.probabilities), shaken)
 
 
 def _clearly_moving(found: Posterior, terms: PriorTerms, turn_known: bool) -> bool:

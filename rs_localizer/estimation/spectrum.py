@@ -48,14 +48,14 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
             :func:`rs_localizer.estimation.residuals.linearized`.
         chosen: (n,) the points that count.
     """
-    heard, known = np.zeros((_BINS, 3)), np.zeros(3)
+    sums, known = np.zeros((_BINS, 3)), np.zeros(3)
     squared, count = 0.0, 0
     for i in range(len(errors)):
         if chosen[i]:
             place = _bin(tau[i])
             for axis in range(3):
                 first, second = by_turn[i, 0, axis], by_turn[i, 1, axis]
-                heard[place, axis] += first * errors[i, 0] + second * errors[i, 1]
+                sums[place, axis] += first * errors[i, 0] + second * errors[i, 1]
                 known[axis] += first * first + second * second
             squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
             count += 1
@@ -68,9 +68,9 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
             x, y, z = 0.0, 0.0, 0.0
             for place in range(_BINS):
                 along = _WAVES[wave, m, place]
-                x += along * heard[place, 0]
-                y += along * heard[place, 1]
-                z += along * heard[place, 2]
+                x += along * sums[place, 0]
+                y += along * sums[place, 1]
+                z += along * sums[place, 2]
             power += x * x / max(known[0], _LITTLE) + y * y / max(known[1], _LITTLE)
             power += z * z / max(known[2], _LITTLE)
         most = max(most, power)

@@ -1,4 +1,4 @@
-"""Tones that shake a camera: heard, followed, and not heard where there are none."""
+"""Tones that shake a camera: found, followed, and not found where there are none."""
 
 import numpy as np
 import pytest
@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.columns import Columns
-from rs_localizer.estimation.hearing import hear
-from rs_localizer.estimation.humming import averaged
 from rs_localizer.estimation.mixture import Inliers
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.settling import settle
 from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, spectrum
+from rs_localizer.estimation.tone_mixture import averaged
+from rs_localizer.estimation.tone_search import find_tones
 from rs_localizer.estimation.tones import Tones, fitted, seen_at
 from rs_localizer.lab.experiments.honesty.vibration import Condition, measure
 
@@ -48,10 +48,10 @@ def shaken(seed, cycles=4.0, swings=SWING, noise=0.2, wrong=0, count=80):
     return observations, state
 
 
-def heard(observations, start):
+def mixture_of(observations, start):
     best = maximum_a_posteriori(observations, start, PRIOR, THRESHOLD)
     inliers = Inliers(observations, best, PRIOR, ASSUMED)
-    return hear(inliers, best, inliers.examined(best.state, PRIOR, 6), THRESHOLD)
+    return find_tones(inliers, best, inliers.examined(best.state, PRIOR, 6), THRESHOLD)
 
 
 def angle_off(found, state, cycles, swings, tau):
@@ -73,7 +73,7 @@ def angle_off(found, state, cycles, swings, tau):
 @pytest.mark.parametrize("cycles", [2.2, 6.0])
 def test_a_tone_is_followed_through_all_rows(cycles):
     observations, state = shaken(3, cycles)
-    found = heard(observations, state)
+    found = mixture_of(observations, state)
     assert found.certain
     assert found.best.tones.cycles == pytest.approx([cycles], abs=0.03)
     settled = settle(observations, state, PRIOR, THRESHOLD, ASSUMED)
@@ -86,17 +86,17 @@ def test_a_tone_is_followed_through_all_rows(cycles):
 
 def test_wrong_matches_stay_outside():
     observations, state = shaken(5, wrong=40, count=120)
-    found = heard(observations, state).best
+    found = mixture_of(observations, state).best
     assert found.inliers[40:].all()
     assert found.inliers[:40].sum() <= 3
 
 
-def test_a_second_tone_is_heard_beside_the_first():
+def test_a_second_tone_is_found_beside_the_first():
     def both(tau):
         return (waves(tau, 3.0, SWING) + waves(tau, 6.5, 0.4 * SWING[::-1]))[:, :3]
 
     observations, state = frame(4, 0.02, 0.1, 100, swing=both)
-    found = heard(observations, state)
+    found = mixture_of(observations, state)
     assert np.sort(found.best.tones.cycles) == pytest.approx([3.0, 6.5], abs=0.05)
 
 
@@ -105,7 +105,7 @@ def test_the_region_holds_the_pose():
     squared = []
     for seed in range(10):
         observations, state = shaken(seed, noise=0.5)
-        found = averaged(heard(observations, state), settle_none(observations, state))
+        found = averaged(mixture_of(observations, state), settle_none(observations, state))
         step = np.zeros(18)
         step[:3], step[6:9] = SWING[0], 2.0 * np.pi * 4.0 * SWING[1]
         error = step_between(found.state, apply_step(state, step))[:12]
@@ -119,7 +119,7 @@ def settle_none(observations, state):
 
 
 def test_noise_is_hardly_ever_a_tone():
-    found = [heard(*frame(seed, 0.02, 0.5, 80)) for seed in range(40)]
+    found = [mixture_of(*frame(seed, 0.02, 0.5, 80)) for seed in range(40)]
     assert sum(one is not None for one in found) <= 3
     assert not any(one.certain for one in found if one)
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.estimation.humming import CERTAIN, Heard
 from rs_localizer.estimation.mixture import Inliers
 from rs_localizer.estimation.model_error import Examined
 from rs_localizer.estimation.posterior import Posterior
@@ -27,6 +26,7 @@ from rs_localizer.estimation.tone_evidence import (
     odds_of,
     spectrum_of,
 )
+from rs_localizer.estimation.tone_mixture import CERTAIN, ToneMixture
 from rs_localizer.estimation.tones import FEWEST, Fit, Tones, fitted, seen_at
 
 # Power of the loudest tone that noise exceeds in two or three frames of a hundred.
@@ -57,7 +57,9 @@ class _Near:
     strangers: bool  # whether some are no inliers
 
 
-def hear(frame: Inliers, best: Posterior, examined: Examined, threshold: float) -> Heard | None:
+def find_tones(
+    frame: Inliers, best: Posterior, examined: Examined, threshold: float
+) -> ToneMixture | None:
     """The tones that may shake the camera, if they are not improbable.
 
     Args:
@@ -83,7 +85,7 @@ def hear(frame: Inliers, best: Posterior, examined: Examined, threshold: float) 
         # Points far off count for more than they should.
         odds = min(odds, float(found.max()) - evidence_of_none(frame, best, threshold))
     none = 1.0 / (1.0 + math.exp(min(odds, 500.0)))
-    return None if none > 1.0 - _IMPROBABLE else _heard(frame, fits, found, none, near, threshold)
+    return None if none > 1.0 - _IMPROBABLE else _mixture(frame, fits, found, none, near, threshold)
 
 
 def _first_look(
@@ -101,9 +103,9 @@ def _first_look(
     return evidence, odds - max(field, float(slow))
 
 
-def _heard(
+def _mixture(
     frame: Inliers, fits: list[Fit], found: Array, none: float, near: _Near, threshold: float
-) -> Heard:
+) -> ToneMixture:
     """The alternatives, of this evidence; or the best one and others beside it."""
     best = fits[int(np.argmax(found))]
     if none < 1.0 - CERTAIN:
@@ -116,7 +118,7 @@ def _heard(
     agreement = agreement_of(
         frame.observations, best.seen.errors, best.seen.squared_errors, best.inliers
     )
-    return Heard(fits, (1.0 - none) * weights / weights.sum(), none, agreement)
+    return ToneMixture(fits, (1.0 - none) * weights / weights.sum(), none, agreement)
 
 
 def _strangers(best: Posterior, threshold: float) -> bool:
@@ -161,7 +163,7 @@ def _with_peak(tones: Tones, evidence: Array, peak: int) -> Tones:
 
 
 def _with_others(frame: Inliers, fit: Fit, near: _Near, threshold: float) -> Fit:
-    """The tones and all others that are heard beside them."""
+    """The tones and all others that are found beside them."""
     evidence = evidence_of(fit, threshold)
     while len(fit.tones.cycles) < _MOST_TONES:
         seen = fit.seen
@@ -169,9 +171,9 @@ def _with_others(frame: Inliers, fit: Fit, near: _Near, threshold: float) -> Fit
             break
         if loudest(seen.errors, seen.by_turn, seen.tau, fit.inliers) < _LOUD:
             break
-        heard = spectrum_of(frame, fit.tones, seen, fit.inliers, fit.noise)
-        peak = int(np.argmax(heard.max(axis=1)))
-        start = _with_peak(fit.tones, heard, peak)
+        louder = spectrum_of(frame, fit.tones, seen, fit.inliers, fit.noise)
+        peak = int(np.argmax(louder.max(axis=1)))
+        start = _with_peak(fit.tones, louder, peak)
         further = fitted(frame.observations, start, near.gate, frame.terms, threshold)
         if further is None:
             break

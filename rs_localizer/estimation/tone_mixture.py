@@ -20,7 +20,7 @@ _FEW_TONES = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
+class ToneMixture:
     """What may shake the camera."""
 
     fits: list[Fit]
@@ -53,22 +53,22 @@ class _Mode(NamedTuple):
     covariance: Array  # (18 + 3 k, 18 + 3 k)
 
 
-def averaged(heard: Heard, found: Posterior) -> Posterior:
+def averaged(mixture: ToneMixture, found: Posterior) -> Posterior:
     """The mean of all tones and, where these are not certain, of what was found without them."""
-    modes = [_mode(*one) for one in zip(heard.probabilities, heard.fits, strict=True)]
-    if not heard.certain:
-        modes.append(_Mode(heard.none, found.state, found.shake, found.covariance))
+    modes = [_mode(*one) for one in zip(mixture.probabilities, mixture.fits, strict=True)]
+    if not mixture.certain:
+        modes.append(_Mode(mixture.none, found.state, found.shake, found.covariance))
     state, shake, covariance = _mean(modes)
     mixed = replace(found, state=state, shake=shake, covariance=covariance)
-    if heard.none >= 0.5:
+    if mixture.none >= 0.5:
         return mixed
-    best = heard.best
+    best = mixture.best
     return replace(
         mixed,
         noise=best.noise,
         squared_errors=best.seen.squared_errors,
         inliers=best.inliers,
-        agreement=heard.agreement,
+        agreement=mixture.agreement,
         mirror=None,
     )
 
