@@ -10,9 +10,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import Columns
+from rs_localizer.estimation.refine import LEAST_NOISE
 
-# Of the noise, px^2: noise-free data leave rounding errors.
-_LEAST_VARIANCE = 1e-8
+_LEAST_VARIANCE = LEAST_NOISE * LEAST_NOISE
 # Where neither shaking nor field explains more than this (logarithm of the likelihood), there is
 # nothing that both could explain.
 _NOTHING_TO_SHARE = 1.0
@@ -92,9 +92,11 @@ def evidence_of_sizes(
                 pivot = 1.0 + max(ratio * diagonal[i] - coupled * coupled / pivot, 0.0)
                 volume += np.log(pivot)
             left = projected.squared_errors - ratio * along * along / pivot
-            left = max(left, _LEAST_VARIANCE * freedom)
-            variance = left / freedom
+            variance = max(left / freedom, _LEAST_VARIANCE)
         evidence[index] = -0.5 * (freedom * np.log(variance) + volume)
+        if left < freedom * _LEAST_VARIANCE:
+            # The squares no longer are as many variances as there are degrees of freedom.
+            evidence[index] += 0.5 * (freedom - left / _LEAST_VARIANCE)
         noises[index] = np.sqrt(variance)
     return evidence, noises
 

@@ -29,7 +29,7 @@ from rs_localizer.estimation.evidence import (
     sizes_of,
 )
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import inverted
+from rs_localizer.estimation.refine import LEAST_NOISE, inverted
 from rs_localizer.estimation.residuals import linearized
 from rs_localizer.estimation.spectrum import loudest
 
@@ -125,7 +125,8 @@ def neighbours_agree(errors: Array, tau: Array, rays: Array, inliers: BoolArray)
                 agreement += errors[previous, 0] * errors[i, 0] + errors[previous, 1] * errors[i, 1]
         previous = i
     # Each of the two products of a pair has the square of the mean square as its variance.
-    normalized: float = agreement / (0.5 * squared / count * np.sqrt(2.0 * max(pairs, 1)))
+    variance = max(0.5 * squared / count, LEAST_NOISE * LEAST_NOISE)
+    normalized: float = agreement / (variance * np.sqrt(2.0 * max(pairs, 1)))
     return normalized
 
 

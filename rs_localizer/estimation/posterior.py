@@ -13,7 +13,13 @@ from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.packing import weighted
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import EXPECTED_NOISE, inverted, refine, smallest_eigenvalue
+from rs_localizer.estimation.refine import (
+    EXPECTED_NOISE,
+    LEAST_NOISE,
+    inverted,
+    refine,
+    smallest_eigenvalue,
+)
 from rs_localizer.estimation.residuals import squared_errors
 
 # Inliers lie within this many standard deviations of the measured noise (99.8 % of Rayleigh
@@ -25,9 +31,6 @@ _ITERATIONS = 50
 # Gain of a last step, noise variances: while the inliers are chosen, and of a fit to those that
 # are, which may be on its way along the flat valley of a small plane.
 _ROUGH, _FINE = 1e-4, 1e-6
-# Positions of image points are never better than this, in pixels; it also keeps noise-free data
-# from claiming an infinite information.
-_LEAST_NOISE = 1e-4
 # A truncation that truncates nothing, px.
 _NO_SCALE = 1e6
 # Of the information matrix scaled to a unit diagonal.
@@ -110,7 +113,7 @@ def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float
         u = gate * gate / (2.0 * max(variance, 1e-12 * gate * gate))
         kept = 1.0 - u * math.exp(-u) / -math.expm1(-u)
         variance = min(mean / max(kept, 1e-3), gate * gate)
-    return max(math.sqrt(variance), _LEAST_NOISE)
+    return max(math.sqrt(variance), LEAST_NOISE)
 
 
 @kernel

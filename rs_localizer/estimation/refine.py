@@ -19,6 +19,12 @@ from rs_localizer.estimation.residuals import normal_equations
 EXPECTED_NOISE = 0.5
 """Standard deviation of the noise before it is measured, in inlier thresholds."""
 
+LEAST_NOISE = 0.01
+"""Standard deviation that noise is never below, px. No camera sees points better: surveyed targets
+are good to a hundredth of a pixel. Exact pixels of a simulator leave but what the motion model
+misses, which would be many standard deviations of rounding errors.
+"""
+
 # Damping, as a part of the diagonal, and how it changes (Nielsen, "Damping parameter in Marquardt's
 # method", 1999): along the curved valleys of planes it wastes the fewest steps.
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e8

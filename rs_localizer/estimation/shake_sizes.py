@@ -11,7 +11,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.model_error import RIDGE
-from rs_localizer.estimation.refine import half_inverse, inverted
+from rs_localizer.estimation.refine import LEAST_NOISE, half_inverse, inverted
 
 _SIZE_ROUNDS = 8
 _DOUBT = 2.0
@@ -61,7 +61,7 @@ def sizes_and_step(
         for k in range(PARAMETERS, count):
             freedom += variances[k] / sizes[(k - PARAMETERS) // 3]
         _share(found, least_size * least_size, sizes)
-        noise = np.sqrt(max(left, 1e-8 * equations) / max(freedom, 1.0))
+        noise = max(np.sqrt(max(left, 0.0) / max(freedom, 1.0)), LEAST_NOISE)
     # The sizes are estimates of few coefficients; the covariance allows for that.
     _weighed(products, with_errors, information, slope, held, noise, _DOUBT * sizes, matrix, right)
     covariance = inverted(matrix)

@@ -17,6 +17,7 @@ from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.tones import MOST_CYCLES
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
+from rs_localizer.estimation.refine import LEAST_NOISE
 
 # What is slower, polynomials of low degree follow. A readout tells tones apart that differ by one.
 CYCLES = np.arange(1.0, MOST_CYCLES + 0.1, 0.25)
@@ -74,7 +75,7 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
             power += z * z / max(known[2], _LITTLE)
         most = max(most, power)
     # The squares of a wave are a half in the mean; squared errors are those of two coordinates.
-    loud: float = 2.0 * most / (0.5 * squared / count)
+    loud: float = 2.0 * most / max(0.5 * squared / count, LEAST_NOISE * LEAST_NOISE)
     return loud
 
 

@@ -44,7 +44,9 @@ _ALIKE = 0.1  # cycles
 # where they swing out of the gate, tones find the points again.
 _SLOW = 1.75
 _MOST_TONES = 6  # and no more parameters than points
-_FURTHER = 3.0  # logarithm of the odds that one tone more has to gain
+# Beside a tone another one is nothing strange: power from which on it is looked for, and logarithms
+# of the odds that it has to gain to count alone, or at all.
+_BESIDE, _FURTHER, _DOUBTFUL = 8.0, 3.0, math.log((1.0 - CERTAIN) / CERTAIN)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,8 +112,9 @@ def _mixture(
     best = fits[int(np.argmax(found))]
     if none < 1.0 - CERTAIN:
         more = _with_others(frame, best, near, threshold)
-        if more is not best:
-            best, fits, found = more, [more], np.zeros(1)
+        if more[0] is not best or len(more) > 1:
+            best, fits = more[0], more
+            found = np.array([evidence_of(fit, threshold) for fit in fits])
         elif best.tones.cycles[0] < _SLOW and not near.strangers:
             none = 0.5
     weights = np.exp(found - found.max())
@@ -162,14 +165,14 @@ def _with_peak(tones: Tones, evidence: Array, peak: int) -> Tones:
     return tones.with_one(float(CYCLES[peak]), float(size))
 
 
-def _with_others(frame: Inliers, fit: Fit, near: _Near, threshold: float) -> Fit:
-    """The tones and all others that are found beside them."""
+def _with_others(frame: Inliers, fit: Fit, near: _Near, threshold: float) -> list[Fit]:
+    """The tones and all others that are found beside them; then with what may be one more."""
     evidence = evidence_of(fit, threshold)
     while len(fit.tones.cycles) < _MOST_TONES:
         seen = fit.seen
         if len(fit.covariance) + 7 > np.count_nonzero(fit.inliers):
             break
-        if loudest(seen.errors, seen.by_turn, seen.tau, fit.inliers) < _LOUD:
+        if loudest(seen.errors, seen.by_turn, seen.tau, fit.inliers) < _BESIDE:
             break
         louder = spectrum_of(frame, fit.tones, seen, fit.inliers, fit.noise)
         peak = int(np.argmax(louder.max(axis=1)))
@@ -179,6 +182,6 @@ def _with_others(frame: Inliers, fit: Fit, near: _Near, threshold: float) -> Fit
             break
         gained = evidence_of(further, threshold)
         if gained < evidence + _FURTHER:
-            break
+            return [fit, further] if gained > evidence + _DOUBTFUL else [fit]
         fit, evidence = further, gained
-    return fit
+    return [fit]

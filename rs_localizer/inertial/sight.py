@@ -14,6 +14,7 @@ from rs_localizer.core.state import ACCELERATIONS, PARAMETERS, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.observing import find_usable, packed
 from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.refine import LEAST_NOISE
 from rs_localizer.estimation.residuals import linearized
 
 # More points take longer than they are worth, fewer say nothing.
@@ -21,7 +22,6 @@ _MOST_POINTS, _LEAST_POINTS = 48, 12
 # What velocities and accelerations may be beside an estimate, rad and m per readout, and per
 # readout squared: as good as nothing, but planes leave some of them to chance.
 _LOOSE_VELOCITY, _LOOSE_ACCELERATION = 0.1, 0.05
-_LEAST_NOISE = 0.01  # px
 _TINY = 1e-12
 
 
@@ -63,7 +63,7 @@ def sight_of(
     )  # fmt: skip
     sound = np.isfinite(errors).all(axis=1)
     errors, by_motion, by_turn, tau = (part[sound] for part in (errors, by_motion, by_turn, tau))
-    noise = max(float(np.sqrt(np.mean(errors**2))), _LEAST_NOISE)
+    noise = max(float(np.sqrt(np.mean(errors**2))), LEAST_NOISE)
     free = by_motion.reshape(-1, PARAMETERS) / noise
     held = np.zeros(PARAMETERS)
     held[VELOCITIES], held[ACCELERATIONS] = 1.0 / _LOOSE_VELOCITY, 1.0 / _LOOSE_ACCELERATION

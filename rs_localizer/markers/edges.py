@@ -1,9 +1,10 @@
 """Corners of markers from the edges that meet in them, to a few hundredths of a pixel.
 
-Across each side of a black square the profile of the image is sampled; the middle of its rise is
-a point of the edge. A straight line through these points (a parabola for a long side, which lens
-and shutter bend) meets that of the next side in the corner. Unlike the search for a corner's own
-gradients this has no bias: blur rounds a corner off, but moves no edge.
+Across each side of a black square the profile of the image is sampled, as far as motion smears the
+edge (:mod:`rs_localizer.markers.profiles`). A straight line through the points of the edge (a
+parabola for a long side, which lens and shutter bend) meets that of the next side in the corner.
+Unlike the search for a corner's own gradients this has no bias: blur rounds a corner off, but moves
+no edge. Two rounds: the first finds how much the edges are blurred, and gets near.
 """
 
 from __future__ import annotations
@@ -15,78 +16,30 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.markers.profiles import BLACK, CUT, SEEN, VARIANCE, WHITE, edge_points
 
 # Most points along a side, of each round: the first only has to get near.
 _POINTS = (12, 32)
 # Half the length of a profile, in cells of the marker (it must stay within the black border and
-# the white rim) and in px (a start may be off by one, and blur needs room; more only adds noise).
+# the white rim) and in px (a start may be off by one; more only adds noise). Where most rises go
+# on beyond it, it is made longer, up to a whole cell.
 _HALF_CELLS = 0.6
-_HALF_LEAST, _HALF_MOST = 1.5, 3.5
-_STEP = 0.5  # px between the samples of a profile
-_MOST_SAMPLES = 2 * math.ceil(_HALF_MOST / _STEP) + 1
-# Parts of a side next to its ends are left out: blur mixes in the other side.
-_END_SHARE, _END_PIXELS = 0.1, 2.0
+_HALF_LEAST, _HALF_MOST, _LONGER = 1.5, 3.5, 1.5
+# What a sharp edge has from the pixels and from reading between them: variance (px^2) and width
+# from foot to top (px). A rise is whole if it is not wider than this share of a cell.
+_SHARP_VARIANCE, _SHARP_WIDTH, _WHOLE = 0.4, 2.0, 0.9
+# Of one that is not, this share of the way from black to white, to either side of its middle.
+_AROUND = 0.3
+# Parts of a side next to its ends are left out, where the next side is mixed in: as a share, and
+# in px across that side, beside half of what motion smears it; never more than so much.
+_END_SHARE, _END_PIXELS, _MOST_END_SHARE, _LEAST_SINE = 0.1, 2.0, 0.3, 0.1
 _LEAST_POINTS = 4
-_LEAST_RISE = 10.0  # gray levels from black to white
 _PARABOLA_FROM = 40.0  # px
 # Points this far from the curve (px, or in terms of the others' distance) belong to something
 # else that covers the side.
 _OUTLIER_LEAST, _OUTLIER_FACTOR = 0.35, 2.5
 # A corner that ends up farther from its start (in cells, and px) is none.
 _MOST_MOVE_CELLS, _MOST_MOVE_PIXELS = 0.7, 2.0
-
-
-@kernel
-def _outside(image: NDArray[np.uint8], x: float, y: float) -> bool:
-    height, width = image.shape
-    return not (0.0 <= x < width - 1.0 and 0.0 <= y < height - 1.0)
-
-
-@kernel
-def _edge_at(
-    image: NDArray[np.uint8],
-    x: float,
-    y: float,
-    nx: float,
-    ny: float,
-    half: float,
-    profile: Array,
-) -> float:
-    """How far along the normal, from black to white, the edge is from a point; NaN: none.
-
-    The centroid of the steepest unbroken rise: a pixel's light is its integral, which leaves the
-    centroid of the slope where it was, however sharp the edge. Any weight but the slope itself
-    draws an edge along a row of pixels to their middle or rim, by up to 0.15 px.
-    """
-    steps = math.ceil(half / _STEP)
-    reach = steps * _STEP
-    if _outside(image, x - reach * nx, y - reach * ny):
-        return math.nan
-    if _outside(image, x + reach * nx, y + reach * ny):
-        return math.nan
-    steepest, at, count = 0.0, 0, 2 * steps + 1
-    for k in range(count):
-        offset = k * _STEP - reach
-        u, v = x + offset * nx, y + offset * ny
-        column, row = int(u), int(v)
-        fx, fy = u - column, v - row
-        above = (1.0 - fx) * image[row, column] + fx * image[row, column + 1]
-        below = (1.0 - fx) * image[row + 1, column] + fx * image[row + 1, column + 1]
-        profile[k] = (1.0 - fy) * above + fy * below
-        if k > 0 and profile[k] - profile[k - 1] > steepest:
-            steepest, at = profile[k] - profile[k - 1], k
-    first, last = at, at
-    while first > 0 and profile[first - 1] < profile[first]:
-        first -= 1
-    while last + 1 < count and profile[last + 1] > profile[last]:
-        last += 1
-    rise = profile[last] - profile[first]
-    if rise < _LEAST_RISE:
-        return math.nan
-    moment = 0.0
-    for k in range(first + 1, last + 1):
-        moment += (profile[k] - profile[k - 1]) * ((k - 0.5) * _STEP - reach)
-    return float(moment / rise)
 
 
 @kernel
@@ -118,35 +71,90 @@ def _fit(s: Array, e: Array, used: NDArray[np.bool_], parabola: bool, c: Array) 
 
 
 @kernel
+def _depth(q: Array, at: int) -> float:
+    """The lesser distance (px) of the far corners from the side that corner ``at`` begins."""
+    a, b = q[at], q[(at + 1) % 4]
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    c, d = q[(at + 2) % 4], q[(at + 3) % 4]
+    far = min(dx * (c[1] - b[1]) - dy * (c[0] - b[0]), dx * (d[1] - a[1]) - dy * (d[0] - a[0]))
+    return float(far / math.sqrt(dx * dx + dy * dy))
+
+
+@kernel
+def _end(q: Array, before: int, at: int, width: float, length: float) -> float:
+    """The share of a side that the next one, which is smeared over a width, disturbs."""
+    after = (at + 1) % 4
+    ux, uy = q[at, 0] - q[before, 0], q[at, 1] - q[before, 1]
+    vx, vy = q[after, 0] - q[at, 0], q[after, 1] - q[at, 1]
+    sine = abs(ux * vy - uy * vx) / (math.hypot(ux, uy) * math.hypot(vx, vy))
+    share = (_END_PIXELS + 0.5 * width) / (max(sine, _LEAST_SINE) * length)
+    return float(max(_END_SHARE, min(share, _MOST_END_SHARE)))
+
+
+@kernel
+def _width(rises: Array) -> float:
+    """Over how many px motion smears an edge: an even smear has a twelfth of its square."""
+    return math.sqrt(12.0 * max(rises[VARIANCE] - _SHARP_VARIANCE, 0.0))
+
+
+@kernel
+def _levels(rises: Array, at: int, cell: float) -> tuple[float, float]:
+    """The level half way up the edge of a side, and how far around it to go, where its rises
+    (4,5) of the round before are not whole; else NaN.
+    """
+    none = (math.nan, math.nan)
+    for k in range(4):
+        if rises[k, SEEN] == 0.0:
+            return none
+    left, across, right = (at + 1) % 4, (at + 2) % 4, (at + 3) % 4
+    # The darkest side shows black. White may vary over the marker, but sides that face each other
+    # have as much of it as the other two, unless something dark beyond the rim takes from it.
+    black, white = rises[:, BLACK].min(), rises[:, WHITE]
+    own = white[at] + max(0.5 * (white[left] + white[right] - white[at] - white[across]), 0.0)
+    shown = (rises[at, WHITE] - rises[at, BLACK]) / (own - black)
+    if _width(rises[at]) / shown + _SHARP_WIDTH < _WHOLE * cell:
+        return none
+    return 0.5 * (black + own), _AROUND * (own - black)
+
+
+@kernel
 def _side(
     image: NDArray[np.uint8],
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
+    q: Array,
+    at: int,
     cells: int,
     most_points: int,
+    before: Array,
+    rises: Array,
     c: Array,
 ) -> bool:
-    """Fit the edge near the side from a to b: offsets c0 + c1 s + c2 s^2 outward, s in -1..1."""
-    dx, dy = bx - ax, by - ay
-    length = math.sqrt(dx * dx + dy * dy)
+    """Fit the edge near the side that corner ``at`` begins: offsets c0 + c1 s + c2 s^2 outward, s
+    in -1..1. ``before`` (4,5) are the rises of the last round, ``rises`` (5,) those of this one.
+    """
+    a, b, last = q[at], q[(at + 1) % 4], (at + 3) % 4
+    length = math.hypot(b[0] - a[0], b[1] - a[1])
     if not length > 1.0:
         return False
-    nx, ny = dy / length, -dx / length  # outward: corners go clockwise, and y is down
-    half = min(max(_HALF_CELLS * length / cells, _HALF_LEAST), _HALF_MOST)
-    margin = max(_END_SHARE, _END_PIXELS / length)
-    count = min(max(int(length * (1.0 - 2.0 * margin)), 0), most_points)
+    start = _end(q, last, at, _width(before[last]), length)
+    end = _end(q, at, (at + 1) % 4, _width(before[(at + 1) % 4]), length)
+    count = min(max(int(length * (1.0 - start - end)), 0), most_points)
     if count < _LEAST_POINTS:
         return False
-    s, e, profile = np.empty(count), np.empty(count), np.empty(_MOST_SAMPLES)
-    used = np.empty(count, np.bool_)
-    for k in range(count):
-        share = margin + (1.0 - 2.0 * margin) * k / (count - 1)
-        s[k] = 2.0 * share - 1.0
-        e[k] = _edge_at(image, ax + share * dx, ay + share * dy, nx, ny, half, profile)
-        used[k] = not math.isnan(e[k])
-    parabola = length >= _PARABOLA_FROM
+    s, e = np.linspace(2.0 * start - 1.0, 1.0 - 2.0 * end, count), np.empty(count)
+    cell = _depth(q, at) / cells
+    levels = _levels(before, at, cell)
+    half = min(max(_HALF_CELLS * cell, _HALF_LEAST), _HALF_MOST)
+    rises[:] = edge_points(image, a, b, half, levels, s, e)
+    while rises[CUT] * rises[SEEN] > count // 2 and half < cell:
+        half = min(_LONGER * half, cell)
+        rises[:] = edge_points(image, a, b, half, levels, s, e)
+    return _fit_twice(s, e, length >= _PARABOLA_FROM, c)
+
+
+@kernel
+def _fit_twice(s: Array, e: Array, parabola: bool, c: Array) -> bool:
+    """Fit the points that are no NaN, then those that are near the first fit."""
+    count, used = len(s), ~np.isnan(e)
     if _fit(s, e, used, parabola, c) < max(_LEAST_POINTS, count // 2):
         return False
     squares, n = 0.0, 0
@@ -204,12 +212,10 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
     moved = np.empty((4, 2))
     for m in range(len(quads)):
         q = quads[m].copy()
+        before, rises = np.zeros((4, 5)), np.zeros((4, 5))
         for most_points in _POINTS:
             for s in range(4):
-                e = (s + 1) % 4
-                good[s] = _side(
-                    image, q[s, 0], q[s, 1], q[e, 0], q[e, 1], cells[m], most_points, curves[s]
-                )
+                good[s] = _side(image, q, s, cells[m], most_points, before, rises[s], curves[s])
             for k in range(4):
                 found[m, k] = good[k] and good[(k + 3) % 4]
                 moved[k] = q[k]
@@ -217,6 +223,7 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
                     x, y = _corner(q, k, curves[(k + 3) % 4], curves[k])
                     moved[k, 0], moved[k, 1] = x, y
             q[:] = moved
+            before[:] = rises
         dx, dy = quads[m, 1, 0] - quads[m, 0, 0], quads[m, 1, 1] - quads[m, 0, 1]
         most = max(_MOST_MOVE_PIXELS, _MOST_MOVE_CELLS * math.sqrt(dx * dx + dy * dy) / cells[m])
         for k in range(4):
