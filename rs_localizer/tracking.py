@@ -129,12 +129,15 @@ class Tracker:
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
         covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
         covariance += swing
-        return Prior(
-            motion=motion,
-            covariance=covariance,
-            of_shake_sizes=track.experience.of_shake_sizes,
-            of_field_sizes=track.experience.of_field_sizes,
-        )
+        try:
+            return Prior(
+                motion=motion,
+                covariance=covariance,
+                of_shake_sizes=track.experience.of_shake_sizes,
+                of_field_sizes=track.experience.of_field_sizes,
+            )
+        except ValueError:  # rounding errors are all that is left of the covariance
+            return None
 
     def localize(
         self,

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -177,6 +179,24 @@ def test_failures_in_a_row_lose_the_track_and_single_ones_do_not():
         assert not tracker.localize(ns(0.033 * k), *nothing)
     assert tracker.prediction(ns(0.033 * 8)) is None
     assert tracker.localize(ns(0.033 * 8), *hand.frame(0.033 * 8, 100))
+
+
+def test_a_prediction_that_is_rounding_errors_is_none():
+    hand = Hand()
+    localizer = rsl.Localizer(CAMERA)
+    tracker = Tracker(localizer)
+    soon, shown = ns(0.0) + 1, hand.frame(0.0, 100)
+    assert tracker.localize(ns(0.0), *shown)
+    assert tracker.prediction(soon) is not None
+    # All parameters known as one: beside this the accelerations of a nanosecond add nothing.
+    find = localizer.find
+    as_one = np.full((18, 18), 1e-4)
+    localizer.find = lambda *given: replace(find(*given), joint_covariance=as_one)
+    tracker.reset()
+    assert tracker.localize(ns(0.0), *shown)
+    assert tracker.prediction(soon) is None
+    localizer.find = find
+    assert tracker.localize(soon, *shown)
 
 
 def test_a_global_shutter_has_nothing_to_track_with():

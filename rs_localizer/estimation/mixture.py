@@ -37,6 +37,7 @@ DISTRUST = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
+_LEAST_PROBABLE = 1e-200  # of which there still is a logarithm
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
 # Points nearer than this (m) would make any map useless.
@@ -240,7 +241,8 @@ def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
 
 
 def _more_probable(prior: Array, odds: Array) -> Array:
-    return _normalized(np.log(prior) + odds)
+    # Frames may be so sure together that the rest vanishes, but nothing is impossible.
+    return np.maximum(_normalized(np.log(prior) + odds), _LEAST_PROBABLE)
 
 
 def _normalized(evidence: Array) -> Array:

@@ -218,3 +218,18 @@ def test_a_motion_that_leaves_all_points_behind_counts_for_nothing():
     assert inside.mode(truth, PRIOR, 1.0).evidence > -np.inf
     # Where nothing else is left, nothing is determined.
     assert not weighed(inside, replace(best, state=away), planar=False).determined
+
+
+def test_however_sure_frames_are_nothing_becomes_impossible():
+    observations, truth = frame(3, 0.0, 0.5)
+    best = maximum_a_posteriori(observations, truth, PRIOR, 2.0)
+    sure = [np.where(np.arange(len(odds)) == 0, 0.0, -5000.0)
+            for odds in (ASSUMED.of_shake_sizes, ASSUMED.of_field_sizes)]  # fmt: skip
+    inside = Inliers(
+        observations, best, PRIOR,
+        replace(ASSUMED, of_shake_sizes=sure[0], of_field_sizes=sure[1]),
+    )  # fmt: skip
+    for prior in (inside.shake_prior, inside.field_prior):
+        assert np.all(np.isfinite(np.log(prior)))
+        assert prior.sum() == pytest.approx(1.0)
+        assert prior[0] > 0.999999
