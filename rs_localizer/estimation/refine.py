@@ -20,22 +20,17 @@ EXPECTED_NOISE = 0.5
 """Standard deviation of the noise before it is measured, in inlier thresholds."""
 
 LEAST_NOISE = 0.01
-"""Standard deviation that noise is never below, px. No camera sees points better: surveyed targets
-are good to a hundredth of a pixel. Exact pixels of a simulator leave but what the motion model
-misses, which would be many standard deviations of rounding errors.
-"""
+"""Standard deviation (px) that noise is never below, as no camera's is: rounding is no measure."""
 
-# Damping, as a part of the diagonal, and how it changes (Nielsen, "Damping parameter in Marquardt's
-# method", 1999): along the curved valleys of planes it wastes the fewest steps.
+# Damping, as a part of the diagonal, and how it changes (Nielsen, Damping parameter in Marquardt's
+# method, 1999).
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e8
 _GROWTH, _LEAST_KEPT = 2.0, 1.0 / 3.0
 _TINY = 1e-300
 # Pivots of a matrix of unit diagonal below this are rounding errors.
 _SINGULAR = 1e-15
-# More damping does not get along the flat valleys of planes that turn fast, less loses planes that
-# face the camera.
-_ANNEALING_DAMPING = 1e-4
-_ANNEALING_RATIO = 0.6
+# More damping halts in the flat valleys of fast planes, less loses planes that face the camera.
+_ANNEALING_DAMPING, _ANNEALING_RATIO = 1e-4, 0.6
 
 
 @kernel

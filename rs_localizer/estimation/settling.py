@@ -105,7 +105,9 @@ def _settled(
         return replace(best, smallest_eigenvalue=0.0)
     sizes = examined.sizes
     may_shake = assumed.rolling and not mirrored_fits
-    tones = find_tones(frame, best, examined, threshold) if may_shake else None
+    # A gyroscope sees tones; what it leaves of them tells the offset of its stamps.
+    may_be_tonal = may_shake and assumed.turn is None
+    tones = find_tones(frame, best, examined, threshold) if may_be_tonal else None
     toned = _toned(best, sizes, tones) if tones and tones.certain else None
     if tones and toned and tones.tonal and toned.agreement < AGREEMENT:
         return toned

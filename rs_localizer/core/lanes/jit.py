@@ -17,7 +17,7 @@ from typing import Any, Self, TypeVar, cast
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-from rs_localizer.core.lanes import old_caches, shipped
+from rs_localizer.core.lanes import shipped
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -106,6 +106,8 @@ class _Locator:
 
     def ensure_cache_path(self) -> None:
         self._directory.mkdir(parents=True, exist_ok=True)
+        from rs_localizer.core.lanes import old_caches  # for who compiles
+
         old_caches.remove_others(self._directory.parent)
 
     def get_cache_path(self) -> str:
@@ -167,6 +169,8 @@ class _Cache(FunctionCache):
         try:
             found = super().load_overload(signature, target)
             if found is not None:
+                from rs_localizer.core.lanes import old_caches
+
                 old_caches.mark(Path(self._cache_path).parent)
             return found
         except (*_DAMAGE, pickle.UnpicklingError) as error:
