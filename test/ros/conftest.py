@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import random
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,15 +30,30 @@ TIMEOUT = 60.0  # s, of a machine that is busy
 RUN = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def domain() -> None:
-    """Each file its own: DDS believes for a while that nodes which another one killed still listen.
+_unused = random.SystemRandom().sample(range(1, 101), 100)  # above 101 ports are taken by others
 
-    The processes of pytest-xdist take the odd and the even numbers.
-    """
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    number = 2 * random.SystemRandom().randint(1, 50) - worker % 2
-    os.environ["ROS_DOMAIN_ID"] = str(number)
+
+@contextlib.contextmanager
+def _free_domain() -> Iterator[int]:
+    """A domain that no process of pytest-xdist and no other run on this machine uses meanwhile."""
+    while True:
+        number = _unused.pop()
+        path = Path(tempfile.gettempdir()) / f"rs_localizer_test_domain_{number}"
+        with contextlib.ExitStack() as held:
+            try:
+                fcntl.flock(held.enter_context(path.open("w")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield number
+            return
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain() -> Iterator[None]:
+    """Each file its own: DDS goes on for a while to believe in nodes that another one killed."""
+    with _free_domain() as number:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        yield
 
 
 class NodeProcess:
