@@ -149,7 +149,7 @@ class Localizer:
         if failure is not None:
             return failure
         observed = Observed(
-            packed(self.camera, points, pixels, usable),
+            packed(self.camera, points, usable),
             usable.indices,
             len(points),
             usable.centre,
