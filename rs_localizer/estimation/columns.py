@@ -28,8 +28,8 @@ _TERM_SIZES = np.array(
         for i in range(degree + 1)
     ]
 ) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(_FIELD_DEGREE_SIZES)))
-# Columns are multiplied in tiles of so many, whose sums fit registers; so many points at a time stay
-# in the fast caches.
+# Columns are multiplied in tiles of so many, whose sums fit registers; so many points at a time
+# stay in the fast caches.
 _TILE, _CHUNK = 4, 256
 _tile_products = traced_products(_TILE)
 

@@ -7,14 +7,11 @@ PAMI 2006). A minimum that was found says nothing of the other one, so it is loo
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.state import STATE_TRANSLATION, rotation_of
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
@@ -27,20 +24,40 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
 
     None if the points (n,3) that count are no plane, or face the camera.
     """
+    found, other = _mirrored(points, inliers, state)
+    return other if found else None
+
+
+@kernel
+def _mirrored(points: Array, inliers: BoolArray, state: Array) -> tuple[bool, Array]:
     plane, centre, axis_of_plane = _plane(points, inliers)
     if not plane:
-        return None
-    rotation, translation = rotation_of(state), state[STATE_TRANSLATION]
-    seen = rotation @ centre + translation
-    sight = seen / np.linalg.norm(seen)
-    normal = rotation @ axis_of_plane
-    axis = np.cross(sight, normal * np.sign(sight @ normal))
-    lean = math.asin(min(float(np.linalg.norm(axis)), 1.0))
+        return False, state
+    seen, normal = state[9:12].copy(), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            seen[i] += state[3 * i + k] * centre[k]
+            normal[i] += state[3 * i + k] * axis_of_plane[k]
+    sight = seen / np.sqrt(np.sum(seen * seen))
+    normal *= np.sign(np.sum(sight * normal))
+    axis = np.empty(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        axis[i] = sight[j] * normal[k] - sight[k] * normal[j]
+    length = np.sqrt(np.sum(axis * axis))
+    lean = np.arcsin(min(length, 1.0))
     if lean < _LEAST_LEAN:
-        return None
-    flip = so3.exp(-2.0 * lean * axis / np.linalg.norm(axis))
-    turned = flip @ (translation - seen) + seen
-    return np.concatenate([(flip @ rotation).ravel(), turned, state[STATE_TRANSLATION.stop :]])
+        return False, state
+    flip = so3.exp(-2.0 * lean / length * axis)
+    other = state.copy()
+    for i in range(3):
+        other[9 + i] = seen[i]
+        for k in range(3):
+            other[9 + i] += flip[i, k] * (state[9 + k] - seen[k])
+            other[3 * i + k] = 0.0
+            for m in range(3):
+                other[3 * i + k] += flip[i, m] * state[3 * m + k]
+    return True, other
 
 
 @kernel

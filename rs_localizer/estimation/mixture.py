@@ -14,16 +14,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import PARAMETERS, TURN, at_rest, depths, step_between
+from rs_localizer.core.state import PARAMETERS, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
-from rs_localizer.estimation.curvature import along_arcs, told_from
+from rs_localizer.estimation.averaging import (
+    averaged,
+    known_volume,
+    longest_axis,
+    more_probable,
+    normalized,
+)
+from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.face_on import OVERLAP, windows
+from rs_localizer.estimation.medians import median_depth
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.packing import weighted
 from rs_localizer.estimation.posterior import Mirror, Posterior, fit
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside, slower_terms
-from rs_localizer.estimation.refine import apply_step
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
@@ -37,9 +45,6 @@ DISTRUST = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
-_LEAST_PROBABLE = 1e-200  # of which there still is a logarithm
-# Probabilities that have no part in the covariance.
-_NO_PART = 1e-5
 # Points nearer than this (m) would make any map useless.
 _NEAREST = 1e-6
 # Logarithm of the odds of a typical speed beside a better one, beyond which none is tried.
@@ -78,22 +83,22 @@ class Inliers:
     ) -> None:
         self.observations, self.terms, self.assumed = observations, terms, assumed
         self.inliers, self.noise, self.inflation = best.inliers, best.noise, best.inflation
-        before = depths(best.state, observations.points)[best.inliers]
-        count = len(before)
-        depth = float(np.partition(before, count // 2)[count // 2]) if count else 1.0
+        self._data = weighted(observations.packed, best.inliers)
+        count = int(np.count_nonzero(best.inliers))
+        depth = median_depth(best.state, observations.points, best.inliers) if count else 1.0
         self.field_sizes = assumed.field_sizes(max(depth, _NEAREST))
         self.freedom = max(2.0 * count - 6.0, 1.0)
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
         self.odds = math.log(_ODDS_AGAINST_MOTION)  # logarithm
-        self.shake_prior = _more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
-        self.field_prior = _more_probable(FIELD_PRIOR, assumed.of_field_sizes)
+        self.shake_prior = more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
+        self.field_prior = more_probable(FIELD_PRIOR, assumed.of_field_sizes)
 
     def fitted(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
         """State (24,) and cost of the best motion near a state."""
         for _ in range(_FITS):
-            start, _, cost, converged = fit(
-                self.observations, start, self.inliers, terms, self.noise
+            start, cost, converged = fit(
+                self._data, start, self.observations.row_time_gradient, terms, self.noise
             )
             if converged:
                 break
@@ -147,8 +152,7 @@ class Inliers:
 
 def volume_of(terms: PriorTerms, examined: Examined) -> float:
     """The part of the evidence that speaks for few possibilities of the motion."""
-    known = np.diag(terms.informations[0])
-    return float(0.5 * (np.log(known[known > 0.0]).sum() - examined.determined))
+    return 0.5 * (known_volume(terms.informations[0]) - examined.determined)
 
 
 def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
@@ -160,16 +164,14 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     if not np.any(evidence > -math.inf):
         return replace(found, smallest_eigenvalue=0.0)
     at_rest = np.array([mode.speed == 0.0 for mode in modes])
-    possible = _normalized(np.array([mode.support for mode in modes]))
-    counting = _normalized(evidence + frame.odds * at_rest)
+    possible = normalized(np.array([mode.support for mode in modes]))
+    counting = normalized(evidence + frame.odds * at_rest)
     best = int(np.argmax(counting))
-    steps = np.array([step_between(modes[best].state, mode.state) for mode in modes])
-    mean = counting @ steps
-    state = apply_step(modes[best].state, mean)
-    offsets = steps - mean
-    covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
-    for k in np.flatnonzero(possible > _NO_PART):
-        covariance += possible[k] * told_from(modes[k].covariance, offsets[k, TURN])
+    state, covariance, steps = averaged(
+        np.array([mode.state for mode in modes]),
+        np.array([mode.covariance for mode in modes]),
+        best, counting, possible,
+    )  # fmt: skip
     # Shaking that was not seen may be there all the same, unless the camera rests.
     joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
@@ -240,17 +242,6 @@ def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
     return pieces
 
 
-def _more_probable(prior: Array, odds: Array) -> Array:
-    # Frames may be so sure together that the rest vanishes, but nothing is impossible.
-    return np.maximum(_normalized(np.log(prior) + odds), _LEAST_PROBABLE)
-
-
-def _normalized(evidence: Array) -> Array:
-    weights = np.exp(evidence - evidence.max())
-    normalized: Array = weights / weights.sum()
-    return normalized
-
-
 def _mirror(modes: list[Mode], evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
     """The farthest pose that is not out of the question: neither unlikely nor of a bad fit."""
     costs = np.array([mode.cost for mode in modes])
@@ -261,5 +252,5 @@ def _mirror(modes: list[Mode], evidence: Array, steps: Array, covariance: Array)
     if turns[far] == 0.0:
         return None
     # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
-    deviation = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    deviation = longest_axis(covariance)
     return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))

@@ -25,6 +25,7 @@ from rs_localizer.estimation.columns import Columns, columns_of, with_prior
 from rs_localizer.estimation.evidence import (
     Sizes,
     evidence_of_sizes,
+    log_determinant,
     project_out,
     sizes_of,
 )
@@ -72,25 +73,22 @@ def with_model_error(
     for k in range(kept):
         matrix[k, k] *= RIDGE
     inverse = inverted(matrix)
-    step = np.empty(kept)
-    covariance = np.empty((kept, kept))
-    for i in range(kept):
-        total = 0.0
-        for k in range(kept):
-            total += inverse[i, k] * columns.with_errors[k]
-        step[i] = total
-        for j in range(kept):
-            covariance[i, j] = noise * noise * inverse[i, j]
+    step, covariance = np.zeros(kept), noise * noise * inverse
+    # Along the rows, one below the other: so that the registers are full.
+    for k in range(kept):
+        for i in range(kept):
+            step[i] += inverse[k, i] * columns.with_errors[k]
+    pulled = np.empty(kept)
     for column in range(kept, size):
-        pulled = np.empty(kept)
+        pulled[:] = 0.0
+        for k in range(kept):
+            factor, row = field_size * columns.products[column, k], inverse[k]
+            for i in range(kept):
+                pulled[i] += factor * row[i]
         for i in range(kept):
-            total = 0.0
-            for k in range(kept):
-                total += inverse[i, k] * columns.products[k, column]
-            pulled[i] = total * field_size
-        for i in range(kept):
+            factor, into = pulled[i], covariance[i]
             for j in range(kept):
-                covariance[i, j] += pulled[i] * pulled[j]
+                into[j] += factor * pulled[j]
     return step, covariance
 
 
@@ -210,7 +208,7 @@ def examine(
         # Where no field is seen, nor is what neighbours share; and most frames have none.
         if sizes.no_field < _NO_FIELD:
             shared = shared_errors(errors, rays, inliers)
-    determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
+    determined = log_determinant(columns.products[:PARAMETERS, :PARAMETERS])
     return Examined(step, covariance, sizes, agreement, shared, loudness, determined)
 
 

@@ -195,7 +195,9 @@ def traced_sums(inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Num
             source_data, target_data = (_data(context, builder, signature, args, i) for i in (0, 2))
             place = 0
             for body, count in bodies:
-                _sum_over(builder, [(source_data, inputs)], args[1], body, count, target_data, place)
+                _sum_over(
+                    builder, [(source_data, inputs)], args[1], body, count, target_data, place
+                )
                 place += count
             return context.get_dummy_value()
 
