@@ -15,6 +15,8 @@ from rs_localizer.estimation.refine import apply_step
 _LEAST_PROBABLE = 1e-200  # of which there still is a logarithm
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
+# Squared distance, in variances, of what is the same.
+_ALIKE = 1e-4
 
 
 @kernel
@@ -39,6 +41,20 @@ def averaged(
         if possible[k] > _NO_PART:
             covariance += possible[k] * told_from(covariances[k], offset[TURN])
     return apply_step(states[best], mean), covariance, steps
+
+
+@kernel
+def alike(state: Array, other: Array, covariance: Array) -> bool:
+    """Whether two states are nothing but steps that a fit left out apart, beside a covariance."""
+    step = step_between(state, other)
+    for part in range(0, PARAMETERS, 3):
+        squared, spread = 0.0, 0.0
+        for k in range(part, part + 3):
+            squared += step[k] * step[k]
+            spread += covariance[k, k]
+        if not squared <= _ALIKE * spread:
+            return False
+    return True
 
 
 @kernel

@@ -17,6 +17,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import PARAMETERS, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
 from rs_localizer.estimation.averaging import (
+    alike,
     averaged,
     known_volume,
     longest_axis,
@@ -51,6 +52,8 @@ _NEAREST = 1e-6
 _FAR_LESS_PROBABLE = 7.0
 # Likewise, beyond which a typical speed hardly counts in the covariance.
 _HARDLY_COUNTS = 3.0
+# Likewise, beyond which a mirrored pose at rest is not there at any speed.
+_OUT_OF_QUESTION = 20.0
 # A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
 CLEARLY_WORSE = 9.2
 # The covariance speaks for poses within so many standard deviations of the orientation.
@@ -91,6 +94,8 @@ class Inliers:
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
         self.odds = math.log(_ODDS_AGAINST_MOTION)  # logarithm
+        # Cost (noise variances) of the best motion if the mirrored pose leads back to it.
+        self.only_cost = -math.inf
         self.shake_prior = more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
         self.field_prior = more_probable(FIELD_PRIOR, assumed.of_field_sizes)
 
@@ -128,7 +133,13 @@ class Inliers:
 
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> Mode:
         """The Gaussian about the best motion of a typical speed."""
-        state, cost = self.fitted(start, terms)
+        return self.gaussian(self.fitted(start, terms), terms, speed, start)
+
+    def gaussian(
+        self, fitted: tuple[Array, float], terms: PriorTerms, speed: float, start: Array
+    ) -> Mode:
+        """The same about a motion that has been fitted from there, of this cost."""
+        state, cost = fitted
         examined = self.examined(state, terms, 0, neighbours=False)
         volume = volume_of(terms, examined)
         evidence = self.worth * (examined.sizes.evidence + volume)
@@ -193,21 +204,44 @@ def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
     may_rest = frame.assumed.may_rest
     modes: list[Mode] = []
     near = at_rest(found.state) if may_rest else found.state
-    other = mirrored(frame.observations.points, frame.inliers, near) if planar else None
+    points = frame.observations.points
+    other, one = mirrored(points, frame.inliers, near) if planar else None, False
     for speed in _SPEEDS if may_rest else (1.0,):
         chosen = _terms_at(frame, speed)
-        modes.append(frame.mode(near, chosen, speed))
-        near = modes[-1].state
+        mode = frame.mode(near, chosen, speed)
+        modes.append(mode)
+        near = mode.state
         if planar and other is None:
-            other = mirrored(frame.observations.points, frame.inliers, near)
+            other = mirrored(points, frame.inliers, near)
         if other is not None:
-            modes.append(frame.mode(other, chosen, speed))
-            other = modes[-1].state
+            twin = mode if one else _twin(frame, mode, other, chosen)
+            modes.append(twin)
+            other, one = twin.state, twin is mode or _out_of_question(frame, mode, twin)
         if max(mode.evidence for mode in modes if mode.speed == speed) < (
             max(mode.evidence for mode in modes) - _FAR_LESS_PROBABLE
         ):
             break  # what moves faster explains even less
     return modes
+
+
+def _twin(frame: Inliers, mode: Mode, other: Array, terms: PriorTerms) -> Mode:
+    """The Gaussian that a mirrored start (24,) leads to; the mode itself where they meet."""
+    fitted = frame.fitted(other, terms)
+    if alike(mode.state, fitted[0], mode.covariance):
+        return mode
+    return frame.gaussian(fitted, terms, mode.speed, other)
+
+
+def _out_of_question(frame: Inliers, mode: Mode, twin: Mode) -> bool:
+    """Whether a mirrored pose is so far off that it need not be followed to where it ends.
+
+    At full speed there is none but the best one, and this mode explains the points nearly as well.
+    """
+    return (
+        mode.cost < frame.only_cost + 2.0 * _OUT_OF_QUESTION
+        and twin.cost > mode.cost + 2.0 * _OUT_OF_QUESTION
+        and twin.evidence < mode.evidence - _OUT_OF_QUESTION
+    )
 
 
 def _terms_at(frame: Inliers, speed: float) -> PriorTerms:

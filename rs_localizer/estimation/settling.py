@@ -21,6 +21,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import LINEAR, PARAMETERS, STATE_TRANSLATION, VELOCITIES, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
+from rs_localizer.estimation.averaging import alike
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.mirror import mirrored
@@ -93,8 +94,11 @@ def _settled(
     mirrored_fits = False
     if other is not None:
         state, cost = frame.fitted(other, terms)
-        better = frame.fitted(best.state, terms)[1] - cost
+        found, better = frame.fitted(best.state, terms)
+        better -= cost
         mirrored_fits = abs(better) < CLEARLY_WORSE * best.noise**2
+        if alike(found, state, best.covariance):
+            frame.only_cost = cost / best.noise**2
         if better > best.noise**2:
             best = maximum_a_posteriori(observations, state, terms, threshold)
             if not best.determined:
