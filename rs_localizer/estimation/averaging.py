@@ -10,6 +10,8 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import PARAMETERS, TURN, step_between
 from rs_localizer.estimation.curvature import told_from
+from rs_localizer.estimation.model_error import Examined
+from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import apply_step
 
 _LEAST_PROBABLE = 1e-200  # of which there still is a logarithm
@@ -70,8 +72,13 @@ def normalized(evidence: Array) -> Array:
     return normalized
 
 
+def volume_of(terms: PriorTerms, examined: Examined) -> float:
+    """The part of the evidence that speaks for few possibilities of the motion."""
+    return 0.5 * (_known(terms.informations[0]) - examined.determined)
+
+
 @kernel
-def known_volume(information: Array) -> float:
+def _known(information: Array) -> float:
     """Logarithm of the determinant of what a prior knows, of no two parameters together."""
     total = 0.0
     for k in range(len(information)):

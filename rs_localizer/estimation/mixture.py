@@ -19,20 +19,22 @@ from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_
 from rs_localizer.estimation.averaging import (
     alike,
     averaged,
-    known_volume,
     longest_axis,
     more_probable,
     normalized,
+    volume_of,
 )
+from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.face_on import OVERLAP, windows
+from rs_localizer.estimation.linear import foreseen
 from rs_localizer.estimation.medians import median_depth
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.packing import weighted
 from rs_localizer.estimation.posterior import Mirror, Posterior, fit
-from rs_localizer.estimation.prior_terms import PriorTerms, held_beside, slower_terms
+from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
@@ -89,7 +91,10 @@ class Inliers:
         self._data = weighted(observations.packed, best.inliers)
         count = int(np.count_nonzero(best.inliers))
         depth = median_depth(best.state, observations.points, best.inliers) if count else 1.0
-        self.field_sizes = assumed.field_sizes(max(depth, _NEAREST))
+        self._depth = max(depth, _NEAREST)
+        self.field_sizes = assumed.field_sizes(self._depth)
+        # Where the points are linearized, and their columns, if these foresee other speeds.
+        self.linear: tuple[Array, Columns] | None = None
         self.freedom = max(2.0 * count - 6.0, 1.0)
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
@@ -133,14 +138,27 @@ class Inliers:
 
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> Mode:
         """The Gaussian about the best motion of a typical speed."""
+        if self.linear is not None:
+            near, state, cost, examined = foreseen(
+                *self.linear, terms, self.freedom, self.noise, SHAKE_SIZES, self.shake_prior,
+                self.field_sizes, self.field_prior, self.assumed.focal_length, self._depth,
+            )  # fmt: skip
+            if near:
+                return self._gaussian((state, cost), examined, terms, speed, start)
         return self.gaussian(self.fitted(start, terms), terms, speed, start)
 
     def gaussian(
         self, fitted: tuple[Array, float], terms: PriorTerms, speed: float, start: Array
     ) -> Mode:
         """The same about a motion that has been fitted from there, of this cost."""
+        examined = self.examined(fitted[0], terms, 0, neighbours=False)
+        return self._gaussian(fitted, examined, terms, speed, start)
+
+    def _gaussian(
+        self, fitted: tuple[Array, float], examined: Examined, terms: PriorTerms, speed: float,
+        start: Array,
+    ) -> Mode:  # fmt: skip
         state, cost = fitted
-        examined = self.examined(state, terms, 0, neighbours=False)
         volume = volume_of(terms, examined)
         evidence = self.worth * (examined.sizes.evidence + volume)
         if self.assumed.turn is not None:
@@ -159,11 +177,6 @@ class Inliers:
             speed,
             examined.sizes.field,
         )
-
-
-def volume_of(terms: PriorTerms, examined: Examined) -> float:
-    """The part of the evidence that speaks for few possibilities of the motion."""
-    return 0.5 * (known_volume(terms.informations[0]) - examined.determined)
 
 
 def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
@@ -201,13 +214,13 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
 
 def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
     """A Gaussian for each speed and, before a plane, for either way that it may lean."""
-    may_rest = frame.assumed.may_rest
+    may_rest, turn_known = frame.assumed.may_rest, frame.assumed.turn is not None
     modes: list[Mode] = []
     near = at_rest(found.state) if may_rest else found.state
     points = frame.observations.points
     other, one = mirrored(points, frame.inliers, near) if planar else None, False
     for speed in _SPEEDS if may_rest else (1.0,):
-        chosen = _terms_at(frame, speed)
+        chosen = terms_at(frame.terms, speed, turn_known)
         mode = frame.mode(near, chosen, speed)
         modes.append(mode)
         near = mode.state
@@ -244,13 +257,6 @@ def _out_of_question(frame: Inliers, mode: Mode, twin: Mode) -> bool:
     )
 
 
-def _terms_at(frame: Inliers, speed: float) -> PriorTerms:
-    turn_known = frame.assumed.turn is not None
-    if speed == 0.0:
-        return held_beside(frame.terms, turn_known)
-    return frame.terms if speed == 1.0 else slower_terms(frame.terms, speed, turn_known)
-
-
 def _in_pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
     """The modes, and in place of those of planes that nearly face the camera pieces of them."""
     supports = {mode.speed: -math.inf for mode in modes}
@@ -266,7 +272,7 @@ def _in_pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
 
 def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
     best = min(modes, key=lambda mode: mode.cost)
-    terms, pieces = _terms_at(frame, best.speed), list[Mode]()
+    terms, pieces = terms_at(frame.terms, best.speed, frame.assumed.turn is not None), list[Mode]()
     points = frame.observations.points
     for window in windows(points, frame.inliers, best.state, best.covariance):
         piece = frame.mode(window.state, window.times(terms), best.speed)

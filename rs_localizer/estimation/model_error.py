@@ -11,7 +11,6 @@ is averaged.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -166,11 +165,10 @@ class Examined(NamedTuple):
     shared: float
     loudness: float  # of the loudest tone, see :func:`rs_localizer.estimation.spectrum.loudest`
     determined: float  # logarithm of the determinant of the information of the motion, px^2
-
-    @property
-    def finite(self) -> bool:
-        """Whether the points are enough for what was asked of them: else covariances are none."""
-        return math.isfinite(self.step.sum() + np.trace(self.covariance))
+    cost: float  # of the points and the prior after the step, px^2
+    # Whether the points are enough for what was asked of them: else covariances are none.
+    finite: bool
+    columns: Columns  # without the prior
 
 
 @kernel
@@ -196,20 +194,41 @@ def examine(
     still = np.zeros((count, 6))
     errors, by_motion, by_turn, tau = linearized(data, count, state, gradient, still)
     columns = columns_of(errors, by_motion, by_turn, tau, rays, inliers, degrees, True)
-    columns = with_prior(columns, prior, state, noise)
-    sizes = sizes_of(
-        columns, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
+    found = judged(
+        columns, prior, state, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
+    )
+    if not neighbours:
+        return found
+    # Where no field is seen, nor is what neighbours share; and most frames have none.
+    seen = found.sizes.no_field < _NO_FIELD
+    return Examined(
+        found.step, found.covariance, found.sizes,
+        neighbours_agree(errors, measured_tau, rays, inliers),
+        shared_errors(errors, rays, inliers) if seen else 0.0,
+        loudest(errors, by_turn, measured_tau, inliers),
+        found.determined, found.cost, found.finite, columns,
     )  # fmt: skip
-    step, covariance = with_model_error(columns, sizes.noise, sizes.shake, sizes.field)
-    agreement, shared, loudness = 0.0, 0.0, 0.0
-    if neighbours:
-        agreement = neighbours_agree(errors, measured_tau, rays, inliers)
-        loudness = loudest(errors, by_turn, measured_tau, inliers)
-        # Where no field is seen, nor is what neighbours share; and most frames have none.
-        if sizes.no_field < _NO_FIELD:
-            shared = shared_errors(errors, rays, inliers)
-    determined = log_determinant(columns.products[:PARAMETERS, :PARAMETERS])
-    return Examined(step, covariance, sizes, agreement, shared, loudness, determined)
+
+
+@kernel
+def judged(
+    columns: Columns, prior: PriorTerms, state: Array, freedom: float, noise: float,
+    shake_sizes: Array, shake_prior: Array, field_sizes: Array, field_prior: Array,
+) -> Examined:  # fmt: skip
+    """What the columns of a motion make of it under a prior, but for what neighbours share."""
+    known = with_prior(columns, prior, state, noise)
+    sizes = sizes_of(
+        known, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
+    )  # fmt: skip
+    step, covariance = with_model_error(known, sizes.noise, sizes.shake, sizes.field)
+    determined = log_determinant(known.products[:PARAMETERS, :PARAMETERS])
+    cost, total = known.squared_errors, 0.0
+    for k in range(len(step)):
+        cost -= step[k] * known.with_errors[k]
+        total += step[k] + covariance[k, k]
+    return Examined(
+        step, covariance, sizes, 0.0, 0.0, 0.0, determined, cost, bool(np.isfinite(total)), columns
+    )
 
 
 @kernel
