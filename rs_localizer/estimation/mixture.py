@@ -19,7 +19,6 @@ from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_
 from rs_localizer.estimation.averaging import (
     alike,
     averaged,
-    longest_axis,
     more_probable,
     normalized,
     volume_of,
@@ -29,17 +28,19 @@ from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.face_on import OVERLAP, windows
 from rs_localizer.estimation.linear import foreseen
 from rs_localizer.estimation.medians import median_depth
-from rs_localizer.estimation.mirror import mirrored
+from rs_localizer.estimation.mirror import farthest, mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.packing import weighted
-from rs_localizer.estimation.posterior import Mirror, Posterior, fit
+from rs_localizer.estimation.packing import thin, weighted
+from rs_localizer.estimation.posterior import Posterior, fit
 from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
 # Along the flat valleys of small planes a fit may end before its steps do.
 _FITS = 4
+# So many points lead a fit to where all of them end it.
+_ENOUGH = 48
 # Odds by which motion must explain the points better than rest, to count in the estimate. Where a
 # map or a lens is seen to be wrong, what looks like motion mostly is more of that, and the odds
 # grow by the second factor. The covariance allows for motion at even odds.
@@ -56,10 +57,6 @@ _FAR_LESS_PROBABLE = 7.0
 _HARDLY_COUNTS = 3.0
 # Likewise, beyond which a mirrored pose at rest is not there at any speed.
 _OUT_OF_QUESTION = 20.0
-# A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
-CLEARLY_WORSE = 9.2
-# The covariance speaks for poses within so many standard deviations of the orientation.
-_COVERED = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +110,17 @@ class Inliers:
             if converged:
                 break
         return start, cost
+
+    def fitted_from_afar(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
+        """The same from a start that may lead along a valley: a part of the points goes first."""
+        chosen = np.flatnonzero(self.inliers)
+        part = chosen[:: len(chosen) // _ENOUGH] if len(chosen) >= 2 * _ENOUGH else chosen
+        if len(part) < len(chosen):
+            start, _, _ = fit(
+                thin(self._data, part), start, self.observations.row_time_gradient, terms,
+                self.noise * math.sqrt(len(part) / len(chosen)),
+            )  # fmt: skip
+        return self.fitted(start, terms)
 
     def examined(
         self, state: Array, terms: PriorTerms, degree: int, neighbours: bool = True
@@ -196,6 +204,7 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
         np.array([mode.covariance for mode in modes]),
         best, counting, possible,
     )  # fmt: skip
+    costs = np.array([mode.cost for mode in modes])
     # Shaking that was not seen may be there all the same, unless the camera rests.
     joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
@@ -208,7 +217,7 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
         shake=np.zeros_like(found.shake),  # it was that beside another motion
         squared_errors=frame.observations.squared_errors(state),
         model_error=float(possible @ [mode.field for mode in modes]),
-        mirror=_mirror(modes, evidence, steps, covariance) if planar else None,
+        mirror=farthest(costs, evidence, steps, covariance) if planar else None,
     )
 
 
@@ -239,7 +248,7 @@ def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
 
 def _twin(frame: Inliers, mode: Mode, other: Array, terms: PriorTerms) -> Mode:
     """The Gaussian that a mirrored start (24,) leads to; the mode itself where they meet."""
-    fitted = frame.fitted(other, terms)
+    fitted = frame.fitted_from_afar(other, terms)
     if alike(mode.state, fitted[0], mode.covariance):
         return mode
     return frame.gaussian(fitted, terms, mode.speed, other)
@@ -280,17 +289,3 @@ def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
         if piece.evidence < max(one.evidence for one in pieces) - _FAR_LESS_PROBABLE:
             break
     return pieces
-
-
-def _mirror(modes: list[Mode], evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
-    """The farthest pose that is not out of the question: neither unlikely nor of a bad fit."""
-    costs = np.array([mode.cost for mode in modes])
-    best = int(np.argmax(evidence))
-    worse = np.maximum(2.0 * (evidence[best] - evidence), costs - costs[best])
-    turns = np.where(worse < CLEARLY_WORSE, np.linalg.norm(steps[:, :3], axis=1), 0.0)
-    far = int(np.argmax(turns))
-    if turns[far] == 0.0:
-        return None
-    # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
-    deviation = longest_axis(covariance)
-    return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))

@@ -24,8 +24,8 @@ from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
 from rs_localizer.estimation.averaging import alike, volume_of
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
-from rs_localizer.estimation.mirror import mirrored
-from rs_localizer.estimation.mixture import CLEARLY_WORSE, DISTRUST, Inliers, weighed
+from rs_localizer.estimation.mirror import CLEARLY_WORSE, mirrored
+from rs_localizer.estimation.mixture import DISTRUST, Inliers, weighed
 from rs_localizer.estimation.model_error import Examined
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
@@ -93,7 +93,7 @@ def _settled(
     other = mirrored(observations.points, best.inliers, best.state)
     mirrored_fits = False
     if other is not None:
-        state, cost = frame.fitted(other, terms)
+        state, cost = frame.fitted_from_afar(other, terms)
         again, better = frame.fitted(best.state, terms)
         better -= cost
         mirrored_fits = abs(better) < CLEARLY_WORSE * best.noise**2
