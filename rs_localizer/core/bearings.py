@@ -33,10 +33,18 @@ def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
         return camera.rays_and_jacobian(pixels)
     lens = np.zeros(_COEFFICIENTS)
     lens[: len(D)] = D[:_COEFFICIENTS]
-    rays, by_ray, lost = _bearings(pixels, *camera.pinhole, lens)
+    rays, by_ray, lost = _bearings(pixels, *_pinhole(camera), lens)
     if lost.any():
         rays[lost], by_ray[lost] = camera.rays_and_jacobian(pixels[lost])
     return rays, by_ray
+
+
+def _pinhole(camera: Camera) -> tuple[Array, Array]:
+    """Focal lengths (2,) and centre (2,) of the image, in delivered pixels."""
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    x, y = camera.binning
+    left, top = (0, 0) if camera.roi is None else (camera.roi.x_offset, camera.roi.y_offset)
+    return np.array([fx / x, fy / y]), np.array([(cx - left) / x, (cy - top) / y])
 
 
 def _step(values: list[Lanes]) -> Vector:

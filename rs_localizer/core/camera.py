@@ -214,13 +214,6 @@ class Camera:
         K, binning = self.K, self.binning
         return math.sqrt(K[0, 0] / binning[0] * K[1, 1] / binning[1])
 
-    @property
-    def pinhole(self) -> tuple[Array, Array]:
-        """Focal lengths (2,) and centre (2,) of the image, in delivered pixels."""
-        binning = np.array(self.binning, dtype=np.float64)
-        focal = np.array([self.K[0, 0], self.K[1, 1]])
-        return focal / binning, (self.K[:2, 2] - self._offset()) / binning
-
     def rays(self, pixels: Array) -> Array:
         """Undistorted bearings (n,2), ``x/z, y/z``, of raw pixels (n,2).
 

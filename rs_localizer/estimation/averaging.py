@@ -30,10 +30,14 @@ def averaged(
     And the steps (k,18) from the best one to all.
     """
     count = len(states)
-    steps, mean = np.empty((count, PARAMETERS)), np.zeros(PARAMETERS)
+    steps, mean = np.empty((count, PARAMETERS)), np.empty(PARAMETERS)
     for k in range(count):
         steps[k] = step_between(states[best], states[k])
-        mean += counting[k] * steps[k]
+    for i in range(PARAMETERS):
+        total = 0.0
+        for k in range(count):
+            total += counting[k] * steps[k, i]
+        mean[i] = total
     covariance = np.zeros((PARAMETERS, PARAMETERS))
     for k in range(count):
         offset = steps[k] - mean

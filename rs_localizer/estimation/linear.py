@@ -72,6 +72,7 @@ def _still(state: Array, columns: Columns) -> tuple[Columns, Array]:
         moved = 0.0
         for k in range(PARAMETERS):
             moved += row[k] * back[k]
+        for k in range(PARAMETERS):
             products[i, k] = row[k]
         for k in range(PARAMETERS, size):
             products[i, k] = row[k + shake]

@@ -193,12 +193,9 @@ def traced_sums(inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Num
     def sums(typingctx: Any, source: Any, blocks: Any, target: Any) -> Any:
         def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             source_data, target_data = (_data(context, builder, signature, args, i) for i in (0, 2))
-            place = 0
             for body, count in bodies:
-                _sum_over(
-                    builder, [(source_data, inputs)], args[1], body, count, target_data, place
-                )
-                place += count
+                _sum_over(builder, [(source_data, inputs)], args[1], body, count, target_data)
+                target_data = builder.gep(target_data, [ir.Constant(ir.IntType(64), count)])
             return context.get_dummy_value()
 
         return types.void(source, blocks, target), compile_call
@@ -226,7 +223,7 @@ def traced_products(columns: int) -> Any:
         def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             first, second, data = (_data(context, builder, signature, args, i) for i in (0, 1, 3))
             sources = [(first, columns), (second, columns)]
-            _sum_over(builder, sources, args[2], products, columns * columns, data, 0)
+            _sum_over(builder, sources, args[2], products, columns * columns, data)
             return context.get_dummy_value()
 
         return types.void(source, other, blocks, target), compile_call
@@ -241,7 +238,7 @@ def _data(context: Any, builder: Any, signature: Any, args: Any, argument: int) 
 
 def _sum_over(
     builder: Any, sources: Sequence[tuple[Any, int]], blocks: Any,
-    body: Callable[[list[Lanes]], Sequence[Number]], count: int, target: Any, place: int,
+    body: Callable[[list[Lanes]], Sequence[Number]], count: int, target: Any,
 ) -> None:  # fmt: skip
     """Sum the terms of a body over all lanes of the first blocks of sources of so many values."""
     totals = [_alloca_once(builder, _VECTOR) for _ in range(count)]
@@ -260,7 +257,7 @@ def _sum_over(
             builder.store(_operand(so_far + term), total)
     for index, total in enumerate(totals):
         scalar = _across_lanes(builder, builder.load(total))
-        element = builder.gep(target, [ir.Constant(ir.IntType(64), place + index)])
+        element = builder.gep(target, [ir.Constant(ir.IntType(64), index)])
         builder.store(scalar, element)
 
 
