@@ -25,6 +25,7 @@ from rs_localizer.core.state import (
 )
 from rs_localizer.estimation.refine import half_inverse
 from rs_localizer.inertial import turning
+from rs_localizer.inertial.clipping import clipped_product
 from rs_localizer.inertial.settings import (
     BIAS_DEVIATION,
     JITTER,
@@ -40,7 +41,6 @@ _GIVEN_OFFSET_DEVIATION = 1e-4
 _MOST_BIAS = 5.0
 # Of the information that a frame adds at most, so that rounding leaves some variance.
 _MOST_GAIN = 0.9999
-_ROUNDING = 1e-9  # of eigenvalues of what is scaled to 1
 
 RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 """Of a step: what the gyroscope leaves to the points."""
@@ -284,8 +284,5 @@ def _gain(before: Array, after: Array, with_parameters: Array) -> tuple[Array, A
             inverse[i, j] *= scale[j]
     half = inverse @ with_parameters
     left = inverse @ after @ inverse.T
-    if not half_inverse((1.0 + _ROUNDING) * np.eye(size) - left)[2]:
-        values, vectors = np.linalg.eigh(left)
-        left = (vectors * np.minimum(values, 1.0)) @ vectors.T
-    kept = _MOST_GAIN * left @ half + (1.0 - _MOST_GAIN) * half
+    kept = _MOST_GAIN * clipped_product(left, 1.0, half) + (1.0 - _MOST_GAIN) * half
     return half.T @ inverse, half.T @ (half - kept), before @ (inverse.T @ kept)
