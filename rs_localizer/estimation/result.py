@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rs_localizer.core.state import (
@@ -17,6 +19,8 @@ from rs_localizer.estimation.delay import delay_of
 from rs_localizer.estimation.observing import Observed
 from rs_localizer.estimation.posterior import Posterior
 
+_NO_DELAY = (0.0, math.inf)
+
 
 def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: int) -> Estimate:
     """The estimate of an accepted posterior, in the map frame and for all given points.
@@ -31,12 +35,17 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
     residuals[observed.usable] = np.sqrt(posterior.squared_errors)
     inliers = np.zeros(observed.count, dtype=np.bool_)
     inliers[observed.usable] = posterior.inliers
-    found = Estimate(
+    rate, change = state[STATE_ANGULAR], state[STATE_ANGULAR_ACCELERATION]
+    delay = _NO_DELAY
+    if turn is not None:
+        rate, change = rate + turn.rate, change + turn.change
+        delay = delay_of(observed.observations, posterior, turn)
+    return Estimate(
         rotation=rotation,
         translation=state[STATE_TRANSLATION] - rotation @ observed.centre,
-        angular_velocity=state[STATE_ANGULAR],
+        angular_velocity=rate,
         linear_velocity=state[STATE_LINEAR],
-        angular_acceleration=state[STATE_ANGULAR_ACCELERATION],
+        angular_acceleration=change,
         linear_acceleration=state[STATE_LINEAR_ACCELERATION],
         inliers=inliers,
         residuals=residuals,
@@ -47,7 +56,6 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         of_field_sizes=posterior.of_field_sizes,
         global_shutter_inliers=still,
         iterations=samples,
+        turn=turn,
+        delay=delay,
     )
-    if turn is None:
-        return found
-    return found.turned(turn, delay_of(observed.observations, posterior, turn))

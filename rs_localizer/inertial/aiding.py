@@ -25,9 +25,9 @@ from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
-SEEN = np.r_[TURN, ANGULAR]
-"""Of a step: what a gyroscope contradicts."""
-_SEEN_BLOCK = np.ix_(SEEN, SEEN)
+# Of a step: what a gyroscope contradicts.
+_SEEN = np.r_[TURN, ANGULAR]
+_FIRST = np.arange(3)
 # Points that fit with the gyroscope, beyond those that fit without it, that speak for it although
 # it contradicts what the camera sees.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
@@ -96,7 +96,7 @@ class GyroscopeAid:
         span_of(times, 0, 1)
         warm_up()
         within.known.at(0.0)
-        contradicts(np.zeros(3), np.eye(3))
+        contradicts(np.zeros(3), np.eye(3), _FIRST)
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         identity = np.eye(PARAMETERS)
         predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
@@ -283,5 +283,5 @@ def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
 
 def _contradicts(foreseen: Foreseen, step: Array) -> bool:
     if foreseen.predicted is None:
-        return contradicts(step[ANGULAR], foreseen.turn.error[:3, :3].copy())
-    return contradicts(step[SEEN], foreseen.predicted.covariance[_SEEN_BLOCK])
+        return contradicts(step[ANGULAR], foreseen.turn.error, _FIRST)
+    return contradicts(step, foreseen.predicted.covariance, _SEEN)

@@ -143,7 +143,7 @@ class ReadingBuffer:
     def _oldest(self) -> int:
         """The row of the first reading that is remembered."""
         stamps = self._stamps[self._first : self._last]
-        return self._first + int(np.searchsorted(stamps, stamps[-1] - MEMORY_NS))
+        return self._first + int(stamps.searchsorted(stamps[-1] - MEMORY_NS))
 
     def lag(self, stamp_ns: int) -> int:
         """By how many ns the newest reading is older than this moment; without one, its stamp."""
@@ -207,10 +207,10 @@ class ReadingBuffer:
             stops = np.concatenate([np.flatnonzero(ends), np.flatnonzero(ends) + 1])
             begin = max([begin, *stops[stops <= span.first].tolist()])
             end = min([end, *stops[stops >= span.last].tolist()])
-        forces = values[begin:end, 3:6]
-        lacking = math.isnan(forces.sum())
         rates = np.ascontiguousarray(values[begin:end, :3])
-        return Readings(stamps[begin:end], rates, None if lacking else np.ascontiguousarray(forces))
+        forces = np.ascontiguousarray(values[begin:end, 3:6])
+        lacking = math.isnan(np.add.reduce(forces, axis=None))
+        return Readings(stamps[begin:end], rates, None if lacking else forces)
 
 
 def _outside(stamps: IntArray, start_ns: int, end_ns: int) -> Lacking | None:

@@ -64,7 +64,7 @@ class GyroscopeWatch:
     def hear(self, samples: ImuSamples) -> None:
         """Keep the samples that are new."""
         newest = int(self._samples[-1][0][-1]) if self._samples else -(2**63)
-        first = int(np.searchsorted(samples.times_ns, newest, "right"))
+        first = int(samples.times_ns.searchsorted(newest, "right"))
         if first < len(samples):
             self._samples.append((samples.times_ns[first:], samples.angular_velocity[first:]))
         while self._samples and self._samples[0][0][-1] < samples.times_ns[-1] - _MEMORY_NS:
@@ -157,11 +157,16 @@ class GyroscopeWatch:
 
 
 @kernel
-def contradicts(step: Array, covariance: Array) -> bool:
-    """Whether a frame moved rotation and turn rate (k,) by more than their prediction allows."""
-    information = inverted(covariance)
+def contradicts(step: Array, covariance: Array, places: IntArray) -> bool:
+    """Whether a frame moved what stands at these places by more than its covariance allows."""
+    count = len(places)
+    block = np.empty((count, count))
+    for i in range(count):
+        for j in range(count):
+            block[i, j] = covariance[places[i], places[j]]
+    information = inverted(block)
     distance = 0.0
-    for i in range(len(step)):
-        for j in range(len(step)):
-            distance += step[i] * information[i, j] * step[j]
+    for i in range(count):
+        for j in range(count):
+            distance += step[places[i]] * information[i, j] * step[places[j]]
     return not distance <= _MOST_SURPRISE
