@@ -92,6 +92,8 @@ class Tracker:
         # A readout time that is far off makes wrong velocities per readout of those from frame to
         # frame: then each image speaks for itself, and the frames before give a first guess.
         self.trusts_readout_time = True
+        # Then, logarithm of the odds for a global shutter, beside those of any.
+        self.of_rest = 0.0
         self._track: _Track | None = None
         readout_time = localizer.camera.readout_time
         self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
@@ -166,7 +168,8 @@ class Tracker:
             if prior is None:
                 prior = self.prediction(time_ns)
                 if prior is not None and not self.trusts_readout_time:
-                    prior = replace(prior, covariance=_UNKNOWN)
+                    rest = self.of_rest if turn is None else 0.0
+                    prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
                 prior = prior if turn is None else _beside(prior, turn)
             return self.localizer.find(points, pixels, scores, prior, share, turn), prior
 

@@ -85,7 +85,7 @@ class Inliers:
         self.freedom = max(2.0 * count - 6.0, 1.0)
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
-        self.odds = math.log(_ODDS_AGAINST_MOTION)  # logarithm
+        self.odds = math.log(_ODDS_AGAINST_MOTION) + assumed.of_rest  # logarithm
         self.shake_prior = _more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
         self.field_prior = _more_probable(FIELD_PRIOR, assumed.of_field_sizes)
 

@@ -209,11 +209,17 @@ class FrameLocalizer:
         given = (cloud.points, cloud.pixels, cloud.scores)
         if method.follower is None:
             self.imu.without_tracker(method.config)
-            result = (method.experienced or method.localizer).localize(*given)
+            still = Prior(of_rest=self.readout_watch.of_rest)
+            result = (
+                method.localizer.localize(*given, still)
+                if method.experienced is None
+                else method.experienced.localize(*given)
+            )
         else:
             time_ns = method.middle_row_ns(cloud.stamp_ns)
             if method.tracker is not None:
                 method.tracker.trusts_readout_time = not self.readout_watch.far_off
+            method.follower.of_rest = self.readout_watch.of_rest
             result = self.imu.track(
                 method.follower, method.config, time_ns, frame, self.transforms, given
             )
