@@ -92,6 +92,8 @@ class Tracker:
         # A readout time that is far off makes wrong velocities per readout of those from frame to
         # frame: then each image speaks for itself, and the frames before give a first guess.
         self.trusts_readout_time = True
+        # s; velocities per readout say that much less of how far the camera goes.
+        self.readout_time_deviation = 0.0
         # Then, logarithm of the odds for a global shutter, beside those of any.
         self.of_rest = 0.0
         self._track: _Track | None = None
@@ -131,6 +133,10 @@ class Tracker:
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
         covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
         covariance += swing
+        if self.readout_time_deviation > 0.0:
+            share = self.readout_time_deviation / readout_time
+            way = share * dt / readout_time * np.r_[motion.angular_velocity, motion.linear_velocity]
+            covariance[:6, :6] += np.outer(way, way)
         try:
             return Prior(
                 motion=motion,

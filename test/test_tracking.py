@@ -258,3 +258,15 @@ def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
         differences.append([np.linalg.norm(x - alone) for x in (found.angular_velocity, believed)])
     by_doubt, by_trust = np.median(differences[1:], axis=0)
     assert by_doubt < 0.2 * by_trust
+
+
+def test_where_the_readout_time_is_in_doubt_so_is_how_far_the_camera_goes():
+    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA))
+    tracker.localize(ns(0.0), *hand.frame(0.0, 150, noise=0.3))
+    sure = tracker.prediction(ns(0.04))
+    tracker.readout_time_deviation = 0.2 * CAMERA.readout_time
+    unsure = tracker.prediction(ns(0.04))
+    added = unsure.covariance - sure.covariance
+    turn = 0.2 * 0.04 / CAMERA.readout_time * sure.motion.angular_velocity
+    np.testing.assert_allclose(added[:3, :3], np.outer(turn, turn), atol=1e-12)
+    assert not added[6:].any()

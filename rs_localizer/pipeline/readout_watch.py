@@ -60,6 +60,7 @@ class ReadoutWatch:
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
         self.fault = ""  # how that contradicts the setting, in one sentence
+        self.error = 0.0  # s, how far it says that the setting is off; 0: not
         # Whether the setting is wrong by so much that what the camera does from frame to frame
         # says nothing of what it does within them: a global shutter, or a reversed one. Once it
         # was, doubts are not enough.
@@ -82,7 +83,7 @@ class ReadoutWatch:
         self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
         self._said.clear()
-        self.measured, self.fault = None, ""
+        self.measured, self.fault, self.error = None, "", 0.0
         self.far_off = self.global_shutter = False
 
     def add(
@@ -126,6 +127,8 @@ class ReadoutWatch:
     def _judge(self, config: NodeConfig, found: MeasuredReadout) -> None:
         wrong = _wrong(config, found)
         self.fault = "" if wrong is None else _sentence(wrong, config, found)
+        off = math.hypot(found.readout_time - config.readout_time, found.deviation)
+        self.error = 0.0 if wrong is None else off
         may_be = _may_be_none(config, found)
         self.far_off = may_be and (self.far_off or wrong is not None)
         self.global_shutter = self.far_off and (

@@ -74,6 +74,15 @@ def test_a_wrong_readout_time_is_said_once(factor: float, tracking: bool) -> Non
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation < 0.1 * READOUT
     assert frames.readout_watch.fault
     assert not frames.readout_watch.far_off
+    # As long as it is wrong, what is published is as uncertain as that.
+    error = frames.readout_watch.error
+    assert error == pytest.approx(0.2 * READOUT, rel=0.2)
+    last = frames.localize(clouds()[-1])
+    assert last
+    assert last.twist is not None
+    speed = np.concatenate([last.twist.linear, last.twist.angular])
+    known = np.linalg.solve(last.twist.covariance, speed) @ speed
+    assert known < (factor * READOUT / error) ** 2
 
 
 def test_the_right_one_is_confirmed() -> None:
