@@ -12,15 +12,18 @@ iterated update). A gyroscope takes the place of the motion model's rotation whe
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.assumptions import SHAKE_SIZES
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
     FADING,
@@ -46,10 +49,16 @@ _MOST_FAILURES = 5
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
 # How fast surprises change the accelerations that are expected (exponent), and how much at most.
-_LEARNING = 0.2
+_LEARNING = 0.5
 _MOST_JOLTS = 1e4
+# Logarithm of the odds for shaking within frames, for each of the jolts' between them.
+_SHAKEN = 3.0
+_ANY_SHAKING = np.r_[0.0, np.ones(len(SHAKE_SIZES) - 1)]
 # What a gyroscope knows.
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
+# Parts of a step.
+_OF_TURN = np.r_[TURN, ANGULAR, ANGULAR_ACCELERATION]
+_OF_WAY = _OF_TURN + 3
 # Of a motion that is but a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least angular acceleration there is, rad/s^2: turns are told by a gyroscope.
@@ -64,7 +73,7 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     experience: Experience  # with shaking, map and lens
-    jolts: float  # how many times the configured accelerations, squared
+    jolts: Array  # (2,) how many times the configured accelerations, squared: angular, linear
     failures: int = 0  # frames without a pose since then
 
 
@@ -131,7 +140,7 @@ class Tracker:
         if track.estimate.turn is not None:
             motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
-        covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
+        covariance += acceleration_covariance(_jolted(acceleration, track.jolts), dt, readout_time)
         covariance += swing
         if self.readout_time_deviation > 0.0:
             share = self.readout_time_deviation / readout_time
@@ -141,7 +150,7 @@ class Tracker:
             return Prior(
                 motion=motion,
                 covariance=covariance,
-                of_shake_sizes=track.experience.of_shake_sizes,
+                of_shake_sizes=track.experience.of_shake_sizes + _shaken(track.jolts),
                 of_field_sizes=track.experience.of_field_sizes,
             )
         except ValueError:  # rounding errors are all that is left of the covariance
@@ -205,7 +214,8 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
-        added += track.jolts * acceleration_covariance(self._beside_turn, dt, readout_time)
+        jolted = replace(self._beside_turn, linear=_jolted(self._beside_turn, track.jolts).linear)
+        added += acceleration_covariance(jolted, dt, readout_time)
         return Before(
             track.time_ns,
             motion,
@@ -235,7 +245,7 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
     """The track and its newest frame."""
     share = float(np.mean(found.inliers))
     if track is None or prior is None or prior.motion is None:
-        return _Track(found, time_ns, share, Experience.of(found), 1.0)
+        return _Track(found, time_ns, share, Experience.of(found), np.ones(2))
     if found.tracked:
         share = (1.0 - _NEWEST) * track.share + _NEWEST * share
     surprise = _surprise(prior, found)
@@ -244,17 +254,37 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
         time_ns,
         share,
         track.experience.and_of(found),
-        float(np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS)),
+        np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS),
     )
 
 
-def _surprise(prior: Prior, found: Estimate) -> float:
-    """How many times farther than predicted the motion has changed, squared."""
+def _surprise(prior: Prior, found: Estimate) -> Array:
+    """How many times farther than predicted the motion has changed, squared: turn and way (2,)."""
     assert prior.motion is not None
     assert prior.covariance is not None
     if np.isinf(prior.covariance.diagonal()).any():
-        return 1.0  # a first guess surprises nobody
+        return np.ones(2)  # a first guess surprises nobody
     motion, origin = found.beside_turn(), np.zeros(3)
     step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
-    joint = np.ascontiguousarray(found.joint_covariance)
-    return surprise_of(step, np.ascontiguousarray(prior.covariance), joint)
+    return np.array(
+        [
+            surprise_of(
+                step[of], prior.covariance[np.ix_(of, of)], found.joint_covariance[np.ix_(of, of)]
+            )
+            for of in (_OF_TURN, _OF_WAY)
+        ]
+    )
+
+
+def _shaken(jolts: Array) -> Array:
+    """Logarithm of the odds (k,) for shaking of any size but the least.
+
+    A camera whose turns keep surprising changes them faster than frames follow each other, and so
+    within them.
+    """
+    return _SHAKEN * math.log(jolts[0]) * _ANY_SHAKING
+
+
+def _jolted(acceleration: Acceleration, jolts: Array) -> Acceleration:
+    angular, linear = np.sqrt(jolts).tolist()
+    return Acceleration(angular * acceleration.angular, linear * acceleration.linear)

@@ -14,7 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import PARAMETERS, TURN, at_rest, depths, step_between
+from rs_localizer.core.state import (
+    PARAMETERS,
+    STATE_TRANSLATION,
+    TURN,
+    at_rest,
+    depths,
+    step_between,
+)
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
 from rs_localizer.estimation.curvature import along_arcs, told_from
 from rs_localizer.estimation.face_on import OVERLAP, windows
@@ -40,6 +47,9 @@ _GENEROSITY = 0.5
 _LEAST_PROBABLE = 1e-200  # of which there still is a logarithm
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
+# Steps between two modes that are one, in standard deviations, and the probability of one beside
+# which there is no other.
+_ALIKE, _ALONE = 0.1, 0.99
 # Points nearer than this (m) would make any map useless.
 _NEAREST = 1e-6
 # Logarithm of the odds of a typical speed beside a better one, beyond which none is tried.
@@ -164,6 +174,13 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     counting = _normalized(evidence + frame.odds * at_rest)
     best = int(np.argmax(counting))
     steps = np.array([step_between(modes[best].state, mode.state) for mode in modes])
+    deviations = np.sqrt(modes[best].covariance.diagonal())
+    alike = np.all(np.abs(steps) <= _ALIKE * deviations, axis=1)
+    if not frame.assumed.may_rest and possible @ alike > _ALONE:
+        # Nothing but what was found, with its shaking.
+        covariance = along_arcs(found.covariance, found.state[STATE_TRANSLATION])
+        mirror = _mirror(modes, evidence, steps, covariance) if planar else None
+        return replace(found, covariance=covariance, mirror=mirror)
     mean = counting @ steps
     state = apply_step(modes[best].state, mean)
     offsets = steps - mean

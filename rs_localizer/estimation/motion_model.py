@@ -200,18 +200,19 @@ def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
     """How many times farther than predicted a motion has changed, squared; 1 is as predicted.
 
     The squared step from the prediction to the estimate, in standard deviations of the prediction,
-    is expected to be what the points decide of the parameters. Errors of map and lens make a step
-    larger, and its covariance larger than the prediction's: by at least that much.
+    is expected to be what the points decide of the parameters, whichever n are looked at. Errors of
+    map and lens make a step larger, and its covariance larger than the prediction's: by at least
+    that much.
 
     Args:
-        step: (18,).
-        covariance: (18,18) of the prediction.
-        posterior: (18 + k,18 + k) of the estimate, and of what it has beside the motion.
+        step: (n,).
+        covariance: (n,n) of the prediction.
+        posterior: (n,n) of the estimate.
     """
     information = inverted(covariance)
-    squared, expected = 0.0, float(PARAMETERS)
-    for i in range(PARAMETERS):
-        for j in range(PARAMETERS):
+    squared, expected = 0.0, float(len(step))
+    for i in range(len(step)):
+        for j in range(len(step)):
             squared += step[i] * information[i, j] * step[j]
             expected -= information[i, j] * posterior[i, j]
     return squared / max(abs(expected), 1.0)
@@ -224,4 +225,4 @@ def warm_up() -> None:
     predict(still, identity, 1.0, 1.0)
     acceleration_covariance(Acceleration(1.0, 1.0), 1.0, 1.0)
     _unshaken(numbers_of(still), np.zeros((0, 3)), identity, *shake_in_the_middle(0))
-    surprise_of(np.zeros(PARAMETERS), identity, identity)
+    surprise_of(np.zeros(PARAMETERS // 2), np.eye(PARAMETERS // 2), np.eye(PARAMETERS // 2))
