@@ -282,7 +282,8 @@ def _shaken(jolts: Array) -> Array:
     A camera whose turns keep surprising changes them faster than frames follow each other, and so
     within them.
     """
-    return _SHAKEN * math.log(jolts[0]) * _ANY_SHAKING
+    odds: Array = _SHAKEN * math.log(jolts[0]) * _ANY_SHAKING
+    return odds
 
 
 def _jolted(acceleration: Acceleration, jolts: Array) -> Acceleration:
