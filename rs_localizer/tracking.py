@@ -23,7 +23,6 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.assumptions import SHAKE_SIZES
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
     FADING,
@@ -53,7 +52,6 @@ _LEARNING = 0.5
 _MOST_JOLTS = 1e4
 # Logarithm of the odds for shaking within frames, for each of the jolts' between them.
 _SHAKEN = 3.0
-_ANY_SHAKING = np.r_[0.0, np.ones(len(SHAKE_SIZES) - 1)]
 # What a gyroscope knows.
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 # Parts of a step.
@@ -150,7 +148,7 @@ class Tracker:
             return Prior(
                 motion=motion,
                 covariance=covariance,
-                of_shake_sizes=track.experience.of_shake_sizes + _shaken(track.jolts),
+                of_shake_sizes=_shaken(track.experience.of_shake_sizes, track.jolts),
                 of_field_sizes=track.experience.of_field_sizes,
             )
         except ValueError:  # rounding errors are all that is left of the covariance
@@ -276,13 +274,14 @@ def _surprise(prior: Prior, found: Estimate) -> Array:
     )
 
 
-def _shaken(jolts: Array) -> Array:
-    """Logarithm of the odds (k,) for shaking of any size but the least.
+def _shaken(of_sizes: Array, jolts: Array) -> Array:
+    """Logarithms of the odds of sizes (k,) of shaking, with what the turns between frames say.
 
     A camera whose turns keep surprising changes them faster than frames follow each other, and so
-    within them.
+    within them: by any size but the least.
     """
-    odds: Array = _SHAKEN * math.log(jolts[0]) * _ANY_SHAKING
+    odds = of_sizes + _SHAKEN * math.log(jolts[0])
+    odds[:1] = of_sizes[:1]
     return odds
 
 

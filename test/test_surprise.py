@@ -122,8 +122,9 @@ def test_turns_and_moves_surprise_apart(of, raised):
 
 
 def test_turns_that_surprise_speak_for_shaking_of_any_size():
-    assert not _shaken(np.array([1.0, 50.0])).any()
-    odds = _shaken(np.array([5.0, 1.0]))
+    before = np.array([0.0, -1.0, -20.0])
+    np.testing.assert_array_equal(_shaken(before, np.array([1.0, 50.0])), before)
+    odds = _shaken(before, np.array([5.0, 1.0])) - before
     assert odds[0] == 0.0
     assert np.all(odds[1:] > np.log(100.0))
 
