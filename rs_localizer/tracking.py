@@ -21,14 +21,14 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
+from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
     predict,
-    surprise_of,
+    surprises_of,
     unshaken,
     with_mean_turn,
 )
@@ -54,9 +54,6 @@ _MOST_JOLTS = 1e4
 _SHAKEN = 3.0
 # What a gyroscope knows.
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
-# Parts of a step.
-_OF_TURN = np.r_[TURN, ANGULAR, ANGULAR_ACCELERATION]
-_OF_WAY = _OF_TURN + 3
 # Of a motion that is but a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least angular acceleration there is, rad/s^2: turns are told by a gyroscope.
@@ -264,14 +261,9 @@ def _surprise(prior: Prior, found: Estimate) -> Array:
         return np.ones(2)  # a first guess surprises nobody
     motion, origin = found.beside_turn(), np.zeros(3)
     step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
-    return np.array(
-        [
-            surprise_of(
-                step[of], prior.covariance[np.ix_(of, of)], found.joint_covariance[np.ix_(of, of)]
-            )
-            for of in (_OF_TURN, _OF_WAY)
-        ]
-    )
+    joint = np.ascontiguousarray(found.joint_covariance)
+    surprises: Array = surprises_of(step, np.ascontiguousarray(prior.covariance), joint)
+    return surprises
 
 
 def _shaken(of_sizes: Array, jolts: Array) -> Array:
