@@ -86,6 +86,8 @@ class Inliers:
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
         self.odds = math.log(_ODDS_AGAINST_MOTION)  # logarithm
+        # What tones that hide in the noise add to the covariance of a camera that moves.
+        self.unheard: Array | None = None
         self.shake_prior = _more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
         self.field_prior = _more_probable(FIELD_PRIOR, assumed.of_field_sizes)
 
@@ -171,7 +173,10 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     for k in np.flatnonzero(possible > _NO_PART):
         covariance += possible[k] * told_from(modes[k].covariance, offsets[k, TURN])
     # Shaking that was not seen may be there all the same, unless the camera rests.
-    joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
+    moving = max(1.0 - possible @ at_rest, 0.0)
+    if frame.unheard is not None:
+        covariance += moving * frame.unheard
+    joint = moving * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
     joint[:PARAMETERS, PARAMETERS:] = 0.0
     joint[PARAMETERS:, :PARAMETERS] = 0.0
