@@ -124,13 +124,14 @@ def find_tones(frame: Inliers, best: Posterior, examined: Examined, threshold: f
     return Heard(_mixture(frame, fits, found, _probability(-odds), near, threshold), None)
 
 
-def _unheard(seen: Seen, best: Posterior, evidence: Array, odds: float) -> Array:
-    """What tones of this evidence (m,s) that hide in the noise add to the covariance (18,18)."""
+def _unheard(seen: Seen, best: Posterior, evidence: Array, odds: float) -> Array | None:
+    """What tones of this evidence (m,s) that hide in the noise add to the covariance (18,18);
+    None where that cannot be computed."""
     added: Array = spread_by_tones(
         seen.errors, seen.columns, seen.by_turn, seen.tau, best.inliers, best.covariance,
         best.noise, evidence,
     )  # fmt: skip
-    return _probability(odds + _EVEN) * added
+    return _probability(odds + _EVEN) * added if np.all(np.isfinite(added)) else None
 
 
 def _probability(odds: float) -> float:
