@@ -47,6 +47,7 @@ _STRANGERS, _PART = 4, 0.1
 FEW = 40
 """Inliers, below which tones are hard to hear."""
 _LOUD_OF_FEW = 9.0
+_FEWEST_INLIERS = 6  # of a motion near which tones are looked for
 _SWING = float(SWINGS[4])  # of tones that a spectrum does not show
 _WIDE = 3.5  # times the median error, of the points among which tones are looked for
 _IMPROBABLE = math.log(0.3)  # odds
@@ -97,7 +98,10 @@ def find_tones(frame: Inliers, best: Posterior, examined: Examined, threshold: f
         examined: what it leaves of the image.
         threshold: px, of inliers.
     """
-    few = bool(np.count_nonzero(best.inliers) < FEW)
+    inliers = np.count_nonzero(best.inliers)
+    if inliers < _FEWEST_INLIERS:
+        return _SILENCE
+    few = bool(inliers < FEW)
     near = _near(best, few, threshold)
     if examined.loudness < (_LOUD_OF_FEW if few else _LOUD) and not near.strangers:
         return _SILENCE
