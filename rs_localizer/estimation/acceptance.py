@@ -90,6 +90,18 @@ def refusal(
             f"standard deviations, {posterior.noise:.2g} px): the camera vibrates faster than its "
             "rows can tell, or the scan direction is another one",
         )
+    if posterior.strangers:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"{posterior.strangers} points lie just beyond the gate of {found} inliers: the camera "
+            "vibrates, and these are too few to tell how",
+        )
+    if posterior.exhausted:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"the camera vibrates at several frequencies, and {found} inliers are too few to tell "
+            "whether these are all",
+        )
     if rolling and posterior.model_error > _MOST_MODEL_ERROR * threshold:
         return Failure(
             Reason.MODEL_ERROR,

@@ -100,6 +100,8 @@ class Inliers:
         self.odds = math.log(_ODDS_AGAINST_MOTION) + assumed.of_rest  # logarithm
         # Cost (noise variances) of the best motion if the mirrored pose leads back to it.
         self.only_cost = -math.inf
+        # What tones that hide in the noise add to the covariance of a camera that moves.
+        self.unheard: Array | None = None
         self.shake_prior = more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
         self.field_prior = more_probable(FIELD_PRIOR, assumed.of_field_sizes)
 
@@ -211,10 +213,15 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     if not frame.assumed.may_rest and possible @ same > _ALONE:
         # Nothing but what was found, with its shaking.
         covariance = along_arcs(found.covariance, found.state[9:12])
+        if frame.unheard is not None:
+            covariance[:PARAMETERS, :PARAMETERS] += frame.unheard
         mirror = farthest(costs, evidence, steps, covariance) if planar else None
         return replace(found, covariance=covariance, mirror=mirror)
     # Shaking that was not seen may be there all the same, unless the camera rests.
-    joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
+    moving = max(1.0 - possible @ at_rest, 0.0)
+    if frame.unheard is not None:
+        covariance += moving * frame.unheard
+    joint = moving * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
     joint[:PARAMETERS, PARAMETERS:] = 0.0
     joint[PARAMETERS:, :PARAMETERS] = 0.0

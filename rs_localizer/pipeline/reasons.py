@@ -53,8 +53,8 @@ REASONS: dict[str, Meaning] = {
         "come nearer, look from an angle, use a larger board or markers on several walls",
     ),
     Reason.MODEL_ERROR: Meaning(
-        "the errors of neighbouring points agree: vibration faster than the rows can tell, or a "
-        "map or calibration that is too far off for any pose",
+        "the errors of neighbouring points agree, or few points shake out of the gate: vibration "
+        "that the rows cannot tell, or a map or calibration that is too far off for any pose",
         f"a stiffer mounting, the calibration, the map; {_TURNED}",
     ),
     Reason.UNCERTAIN: Meaning(

@@ -91,6 +91,12 @@ def test_errors_that_neighbouring_rows_share(good):
     assert reason(observations, replace(shaking, noise=0.09)) is None
 
 
+def test_points_that_inliers_swing_by(good):
+    observations, posterior = good
+    assert reason(observations, replace(posterior, strangers=4)) is Reason.MODEL_ERROR
+    assert reason(observations, replace(posterior, exhausted=True)) is Reason.MODEL_ERROR
+
+
 def test_errors_that_are_smooth_over_the_image(good):
     observations, posterior = good
     assert reason(observations, replace(posterior, model_error=0.79)) is None

@@ -51,7 +51,7 @@ def shaken(seed, cycles=4.0, swings=SWING, noise=0.2, wrong=0, count=80):
 def mixture_of(observations, start):
     best = maximum_a_posteriori(observations, start, PRIOR, THRESHOLD)
     inliers = Inliers(observations, best, PRIOR, ASSUMED)
-    return find_tones(inliers, best, inliers.examined(best.state, PRIOR, 6), THRESHOLD)
+    return find_tones(inliers, best, inliers.examined(best.state, PRIOR, 6), THRESHOLD).mixture
 
 
 def angle_off(found, state, cycles, swings, tau):
@@ -204,7 +204,7 @@ def test_loudness_is_that_of_chance_without_a_tone():
 
 
 def test_few_points_cannot_tell():
-    observations, state = shaken(2, count=18)
+    observations, state = shaken(2, count=11)
     tones = Tones.none(state).with_one(4.0, 0.003)
     assert fitted(observations, tones, 20.0, PRIOR, THRESHOLD) is None
 
