@@ -27,6 +27,16 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
 
     None if the points (n,3) that count are no plane, or face the camera.
     """
+    return _leaning_less(points, inliers, state, 2.0)
+
+
+def facing(points: Array, inliers: BoolArray, state: Array) -> Array | None:
+    """The state (24,) half-way to the mirrored one, whose plane faces the camera; None as there."""
+    return _leaning_less(points, inliers, state, 1.0)
+
+
+def _leaning_less(points: Array, inliers: BoolArray, state: Array, leans: float) -> Array | None:
+    """The state whose view of the plane leans by so many times its lean less."""
     plane, centre, axis_of_plane = _plane(points, inliers)
     if not plane:
         return None
@@ -38,9 +48,9 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
     lean = math.asin(min(float(np.linalg.norm(axis)), 1.0))
     if lean < _LEAST_LEAN:
         return None
-    flip = so3.exp(-2.0 * lean * axis / np.linalg.norm(axis))
-    turned = flip @ (translation - seen) + seen
-    return np.concatenate([(flip @ rotation).ravel(), turned, state[STATE_TRANSLATION.stop :]])
+    turn = so3.exp(-leans * lean * axis / np.linalg.norm(axis))
+    turned = turn @ (translation - seen) + seen
+    return np.concatenate([(turn @ rotation).ravel(), turned, state[STATE_TRANSLATION.stop :]])
 
 
 @kernel
