@@ -11,7 +11,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, depths
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.estimation.posterior import Mirror, Posterior
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5
@@ -31,6 +31,8 @@ _LEAST_PACE = 0.25
 # How far away (rad) a mirrored pose that fits as well may be: what the covariance speaks for may be
 # farther away than what it does not.
 _MOST_MIRRORED_TURN, _MOST_COVERED_TURN = 0.2, 0.35
+# And the one that faces the plane, half-way to it.
+_MOST_FACING_TURN = 0.14
 
 
 def refusal(
@@ -116,17 +118,22 @@ def refusal(
             f"the camera would move by {travel:.3g} m per readout in front of points "
             f"{depth:.3g} m away",
         )
-    mirror = posterior.mirror
+    mirror, facing = posterior.mirror, posterior.facing
     if mirror is not None and mirror.turn > (
         _MOST_COVERED_TURN if mirror.covered else _MOST_MIRRORED_TURN
     ):
-        return Failure(
-            Reason.MIRRORED,
-            f"the points lie on a plane, and the pose mirrored on it, "
-            f"{math.degrees(mirror.turn):.0f} deg away, fits only {mirror.evidence:.1f} "
-            "sigma^2 worse",
-        )
+        return _not_ruled_out(mirror, "the pose mirrored on it")
+    if facing is not None and facing.turn > _MOST_FACING_TURN:
+        return _not_ruled_out(facing, "the pose that faces it")
     return None
+
+
+def _not_ruled_out(other: Mirror, name: str) -> Failure:
+    return Failure(
+        Reason.MIRRORED,
+        f"the points lie on a plane, and {name}, {math.degrees(other.turn):.0f} deg away, fits "
+        f"only {other.evidence:.1f} sigma^2 worse",
+    )
 
 
 def uncertain(estimate: Estimate, most: float) -> Failure | None:

@@ -17,7 +17,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import PARAMETERS, TURN, at_rest, depths, step_between
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
 from rs_localizer.estimation.curvature import along_arcs, told_from
-from rs_localizer.estimation.face_on import OVERLAP, windows
+from rs_localizer.estimation.face_on import OVERLAP, RULED_OUT, held_facing, reaching, windows
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
@@ -170,6 +170,9 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
     for k in np.flatnonzero(possible > _NO_PART):
         covariance += possible[k] * told_from(modes[k].covariance, offsets[k, TURN])
+    faces = _facing(frame, modes, state, covariance) if planar else None
+    if faces is not None:
+        covariance = reaching(covariance, faces.step, faces.evidence)
     # Shaking that was not seen may be there all the same, unless the camera rests.
     joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
@@ -183,7 +186,26 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
         squared_errors=frame.observations.squared_errors(state),
         model_error=float(possible @ [mode.field for mode in modes]),
         mirror=_mirror(modes, evidence, steps, covariance) if planar else None,
+        facing=faces,
     )
+
+
+def _facing(frame: Inliers, modes: list[Mode], state: Array, covariance: Array) -> Mirror | None:
+    """The pose of a plane that faces the camera, from a state, unless it is ruled out."""
+    window = held_facing(frame.observations.points, frame.inliers, state, covariance)
+    if window is None:
+        return None
+    most, found = max(mode.evidence for mode in modes), None
+    fastest = {mode.speed: mode for mode in sorted(modes, key=lambda mode: mode.evidence)}
+    for mode in fastest.values():
+        unlikely = 2.0 * (most - mode.evidence)
+        if unlikely < RULED_OUT:
+            terms = window.times(_terms_at(frame, mode.speed))
+            there, cost = frame.fitted(window.state, terms)
+            worse = unlikely + max(cost / frame.noise**2 - mode.cost, 0.0)
+            if worse < (found.evidence if found else RULED_OUT):
+                found = Mirror(step_between(state, there), worse, covered=True)
+    return found
 
 
 def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:

@@ -130,6 +130,15 @@ def test_a_mirrored_pose_that_fits_as_well(good, turn, covered, expected):
     assert reason(observations, doubtful) is expected
 
 
+@pytest.mark.parametrize(("turn", "expected"), [(0.13, None), (0.15, Reason.MIRRORED)])
+def test_a_plane_that_may_face_the_camera(good, turn, expected):
+    observations, posterior = good
+    step = np.zeros(18)
+    step[1] = turn
+    doubtful = replace(posterior, facing=Mirror(step, 9.0, covered=True))
+    assert reason(observations, doubtful) is expected
+
+
 def test_an_orientation_that_is_hardly_known(scene):
     camera, _, points, _, measured = scene.frame(noise=0.3, count=40)
     found = Localizer(camera).localize(points, measured)
