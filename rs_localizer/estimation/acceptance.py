@@ -31,8 +31,6 @@ _LEAST_PACE = 0.25
 # How far away (rad) a mirrored pose that fits as well may be: what the covariance speaks for may be
 # farther away than what it does not.
 _MOST_MIRRORED_TURN, _MOST_COVERED_TURN = 0.2, 0.35
-# And the one that faces the plane, half-way to it.
-_MOST_FACING_TURN = 0.14
 
 
 def refusal(
@@ -123,7 +121,7 @@ def refusal(
         _MOST_COVERED_TURN if mirror.covered else _MOST_MIRRORED_TURN
     ):
         return _not_ruled_out(mirror, "the pose mirrored on it")
-    if facing is not None and facing.turn > _MOST_FACING_TURN:
+    if facing is not None and not facing.covered:
         return _not_ruled_out(facing, "the pose that faces it")
     return None
 

@@ -35,6 +35,10 @@ OVERLAP = math.log(_WIDTH * math.sqrt(2.0 * math.pi))
 
 # Variances by which the pose that faces the camera must fit worse to be ruled out (once in 20,000).
 RULED_OUT = 20.0
+DENIED = 2.0
+"""So many times more squared deviations than the fit has: a Gaussian denies that pose."""
+NEARBY = 0.14
+"""So near (rad) the pose that faces the camera is no other one."""
 # Squared deviations within which the covariance speaks for it; what is known better than this (rad)
 # leaves no doubt.
 _WITHIN, _LEAST_SPREAD_OF_DOUBT = 1.0, 0.015
@@ -106,6 +110,12 @@ def held_facing(
     return Window(towards, information)
 
 
+def squared_deviations(covariance: Array, step: Array) -> float:
+    """Of the pose of a step (n,), by a covariance (n,n)."""
+    pose = slice(0, 6)
+    return float(step[pose] @ np.linalg.solve(covariance[pose, pose], step[pose]))
+
+
 def reaching(covariance: Array, step: Array, squares: float) -> Array:
     """The least wider covariance (n,n) of which a step is so many squared deviations, or less.
 
@@ -113,9 +123,7 @@ def reaching(covariance: Array, step: Array, squares: float) -> Array:
     square of the lean is told, to the same deviation at any lean, so that the plane faces the
     camera at half as many deviations as that Gaussian has it. Only the pose is looked at.
     """
-    pose = slice(0, 6)
-    squared = float(step[pose] @ np.linalg.solve(covariance[pose, pose], step[pose]))
-    allowed = max(squares, 1.0)
-    if not squared > allowed:
+    squared = squared_deviations(covariance, step)
+    if not squared > squares:
         return covariance
-    return covariance + (1.0 / allowed - 1.0 / squared) * np.outer(step, step)
+    return covariance + (1.0 / squares - 1.0 / squared) * np.outer(step, step)

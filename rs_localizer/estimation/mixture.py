@@ -17,7 +17,16 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import PARAMETERS, TURN, at_rest, depths, step_between
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
 from rs_localizer.estimation.curvature import along_arcs, told_from
-from rs_localizer.estimation.face_on import OVERLAP, RULED_OUT, held_facing, reaching, windows
+from rs_localizer.estimation.face_on import (
+    DENIED,
+    NEARBY,
+    OVERLAP,
+    RULED_OUT,
+    held_facing,
+    reaching,
+    squared_deviations,
+    windows,
+)
 from rs_localizer.estimation.mirror import mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
@@ -196,15 +205,18 @@ def _facing(frame: Inliers, modes: list[Mode], state: Array, covariance: Array) 
     if window is None:
         return None
     most, found = max(mode.evidence for mode in modes), None
+    near = float(np.linalg.norm(step_between(state, window.state)[TURN])) < NEARBY
     fastest = {mode.speed: mode for mode in sorted(modes, key=lambda mode: mode.evidence)}
     for mode in fastest.values():
         unlikely = 2.0 * (most - mode.evidence)
         if unlikely < RULED_OUT:
             terms = window.times(_terms_at(frame, mode.speed))
             there, cost = frame.fitted(window.state, terms)
-            worse = unlikely + max(cost / frame.noise**2 - mode.cost, 0.0)
-            if worse < (found.evidence if found else RULED_OUT):
-                found = Mirror(step_between(state, there), worse, covered=True)
+            worse = max(cost / frame.noise**2 - mode.cost, 1.0)
+            apart = squared_deviations(mode.covariance, step_between(mode.state, there))
+            denied = apart > DENIED * worse
+            if denied and unlikely + worse < (found.evidence if found else RULED_OUT):
+                found = Mirror(step_between(state, there), unlikely + worse, covered=near)
     return found
 
 
