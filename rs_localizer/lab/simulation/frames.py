@@ -179,9 +179,11 @@ def _visible(
     poses_at = true_poses_at(camera, motion, middle_ns)
     size = np.array(camera.size)
     rotations, translations = poses_at(np.zeros(1))
-    rough = camera.project(map_points @ rotations[0].T + translations)
+    local = map_points @ rotations[0].T + translations
+    ahead = np.flatnonzero(local[:, 2] > 0.0)
+    rough = camera.project(local[ahead])
     near_view = np.all(np.abs(rough - 0.5 * size) < (0.5 + _VIEW_MARGIN) * size, axis=1)
-    candidates = rng.permutation(np.flatnonzero(near_view))
+    candidates = rng.permutation(ahead[near_view])
     border = min(_BORDER_SIGMAS * settings.noise, 0.25 * float(size.min()))
     ids = np.zeros(0, dtype=np.int64)
     pixels = np.zeros((0, 2))

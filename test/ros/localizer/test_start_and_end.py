@@ -164,7 +164,9 @@ def test_what_it_says_at_start(start_node: Start, tmp_path: Path) -> None:
     node.wait_for_log("active with solver")
     lines = [line.partition("]: ")[2] for line in node.log.splitlines()]
     compiling = lines.index("compiling kernels (once on this machine, up to a minute)")
-    assert re.fullmatch(r"kernels are ready after \d+\.\d s", lines[compiling + 1])
+    ready = re.compile(r"kernels are ready after \d+\.\d s")
+    # On a busy machine the node says in between what it waits for.
+    assert len([line for line in lines[compiling:] if ready.fullmatch(line)]) == 1
     ignored = "a parameter is ignored: {} is not a setting; did you mean {}?"
     assert [line for line in lines if "ignored" in line] == [
         ignored.format("'min_inlier'", "'min_inliers'"),
