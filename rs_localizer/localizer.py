@@ -153,7 +153,7 @@ class Localizer:
         if failure is not None:
             return failure
         observed = Observed(
-            packed(self.camera, points, pixels, usable),
+            packed(self.camera, points, usable),
             usable.indices,
             len(points),
             usable.centre,
@@ -205,7 +205,9 @@ class Localizer:
     def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.
         may_rest = self._assumed.may_rest and len(terms.informations) == 1
-        assumed = replace(observed.assumed, may_rest=may_rest)
+        assumed = observed.assumed
+        if may_rest != assumed.may_rest:
+            assumed = replace(assumed, may_rest=may_rest)
         threshold = self.config.inlier_threshold
         return settle(observed.observations, best.state, terms, threshold, assumed)
 

@@ -46,12 +46,6 @@ def at_rest(state: Array) -> Array:
     return np.concatenate([state[:_POSE_SIZE], np.zeros(STATE_SIZE - _POSE_SIZE)])
 
 
-def depths(state: Array, points: Array) -> Array:
-    """How far before the camera at the middle row points (n,3) are, in m."""
-    found: Array = points @ state[6:9] + state[11]
-    return found
-
-
 @kernel
 def step_between(state: Array, other: Array) -> Array:
     """The step (18,) that leads from one state to another."""

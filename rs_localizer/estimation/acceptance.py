@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, depths
+from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.medians import median_depth, median_of
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, Posterior
 
@@ -96,7 +96,7 @@ def refusal(
             f"errors of {posterior.model_error:.2g} px are smooth over the image: the calibration "
             "or the map is too far off for any pose",
         )
-    pace = _median(observations.row_paces(state), posterior.inliers)
+    pace = median_of(observations.row_paces(state), posterior.inliers)
     if pace < _LEAST_PACE:
         return Failure(
             Reason.IMPLAUSIBLE,
@@ -108,7 +108,7 @@ def refusal(
             Reason.IMPLAUSIBLE,
             f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
         )
-    depth = _median(depths(state, observations.points), posterior.inliers)
+    depth = median_depth(state, observations.points, posterior.inliers)
     travel = float(np.linalg.norm(state[STATE_LINEAR]))
     if travel > depth:
         return Failure(
@@ -140,6 +140,9 @@ def uncertain(estimate: Estimate, most: float) -> Failure | None:
     Args:
         most: largest standard deviation of the orientation, rad.
     """
+    turn = estimate.joint_covariance
+    if float(turn[0, 0] + turn[1, 1] + turn[2, 2]) <= most * most:
+        return None  # about all axes together
     deviation = estimate.orientation_deviation
     if deviation <= most:
         return None
@@ -148,9 +151,3 @@ def uncertain(estimate: Estimate, most: float) -> Failure | None:
         f"the points tell the orientation to {math.degrees(deviation):.1f} deg (one standard "
         f"deviation), {math.degrees(most):.1f} deg are accepted",
     )
-
-
-def _median(values: Array, chosen: BoolArray) -> float:
-    of = values[chosen]
-    middle = len(of) // 2
-    return float(np.partition(of, middle)[middle])

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.simd import LANES, traced_products
 from rs_localizer.core.shake import FIRST_DEGREE, legendre, shake_basis
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.prior_kernels import add_prior
@@ -27,6 +28,10 @@ _TERM_SIZES = np.array(
         for i in range(degree + 1)
     ]
 ) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(_FIELD_DEGREE_SIZES)))
+# Columns are multiplied in tiles of so many, whose sums fit registers; so many points at a time
+# stay in the fast caches.
+_TILE, _CHUNK = 4, 256
+_tile_products = traced_products(_TILE)
 
 
 class Columns(NamedTuple):
@@ -57,51 +62,118 @@ def columns_of(
         degrees: of the polynomials of the shaking; 0: none.
         field: whether to add the columns of the field.
     """
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for i in range(len(rays)):
-        if inliers[i]:
-            for k in range(2):
-                low[k], high[k] = min(low[k], rays[i, k]), max(high[k], rays[i, k])
+    chosen = np.flatnonzero(inliers)
     polynomials = max(degrees - FIRST_DEGREE + 1, 0)
     shake = 3 * polynomials
-    size = PARAMETERS + shake + (2 * _FIELD_TERMS if field else 0)
-    products, with_errors, squared = np.zeros((size, size)), np.zeros(size), 0.0
-    # Of the errors in the one direction and in the other, which have the shaking's turn in common,
-    # but not the field.
-    first, second = np.zeros(size), np.zeros(size)
+    # Those of motion and shaking, and the errors as the last one; their products with themselves,
+    # with the field's terms in either direction, and those of the terms.
+    last, terms = PARAMETERS + shake, _FIELD_TERMS if field else 0
+    wide, high = -(-(last + 1) // _TILE) * _TILE, -(-terms // _TILE) * _TILE
+    products, first, second = np.zeros((wide, wide)), np.zeros((high, wide)), np.zeros((high, wide))
+    of_terms = np.zeros((high, high))
+    blocks = -(-min(len(chosen), _CHUNK) // LANES)
+    dense = np.zeros((wide // _TILE, 2 * blocks, _TILE * LANES))
+    smooth = np.zeros((high // _TILE, blocks, _TILE * LANES))
+    for start in range(0, len(chosen), _CHUNK):
+        part = chosen[start : start + _CHUNK]
+        if start > 0:
+            dense[:], smooth[:] = 0.0, 0.0
+        _fill_dense(dense, errors, by_motion, by_turn, tau, part, degrees)
+        _add_products(dense, dense, True, products)
+        if field:
+            _fill_smooth(smooth, rays, chosen, part)
+            _add_products(smooth, dense[:, :blocks], False, first)
+            _add_products(smooth, dense[:, blocks:], False, second)
+            _add_products(smooth, smooth, True, of_terms)
+    return _assembled(products, first, second, of_terms, shake, terms)
+
+
+@kernel
+def _fill_dense(
+    dense: Array, errors: Array, by_motion: Array, by_turn: Array, tau: Array, chosen: IntArray,
+    degrees: int,
+) -> None:  # fmt: skip
+    """Columns of motion, shaking and errors of the chosen points, in tiles and lanes.
+
+    The second half of the blocks is of the errors in the other direction.
+    """
+    polynomials = max(degrees - FIRST_DEGREE + 1, 0)
     values, rates = np.empty(polynomials), np.empty(polynomials)
-    terms, x, y = np.empty(_FIELD_TERMS), np.empty(_FIELD_DEGREE + 1), np.empty(_FIELD_DEGREE + 1)
-    for i in range(len(errors)):
-        if not inliers[i]:
-            continue
+    half = dense.shape[1] // 2
+    for place in range(len(chosen)):
+        i = chosen[place]
         if polynomials > 0:
             shake_basis(tau[i], degrees, values, rates)
-        if field:
-            legendre((2.0 * rays[i, 0] - low[0] - high[0]) / max(high[0] - low[0], 1e-12), x)
-            legendre((2.0 * rays[i, 1] - low[1] - high[1]) / max(high[1] - low[1], 1e-12), y)
-            _field_terms(x, y, terms)
-            for k in range(_FIELD_TERMS):
-                first[PARAMETERS + shake + k] = terms[k]
-                second[PARAMETERS + shake + _FIELD_TERMS + k] = terms[k]
-        for k in range(PARAMETERS):
-            first[k], second[k] = by_motion[i, 0, k], by_motion[i, 1, k]
-        for k in range(polynomials):
-            for axis in range(3):
-                place = PARAMETERS + 3 * k + axis
-                first[place] = values[k] * by_turn[i, 0, axis]
-                second[place] = values[k] * by_turn[i, 1, axis]
-        one, other = errors[i, 0], errors[i, 1]
-        squared += one * one + other * other
-        for k in range(size):
-            here, there = first[k], second[k]
-            with_errors[k] -= here * one + there * other
-            row = products[k]
-            for m in range(k + 1):
-                row[m] += here * first[m] + there * second[m]
-    for k in range(size):
-        for m in range(k):
-            products[m, k] = products[k, m]
-    return Columns(products, with_errors, squared, shake)
+        lane = place % LANES
+        for row in range(2):
+            block = row * half + place // LANES
+            for k in range(PARAMETERS):
+                dense[k // _TILE, block, k % _TILE * LANES + lane] = by_motion[i, row, k]
+            column = PARAMETERS
+            for k in range(polynomials):
+                for axis in range(3):
+                    value = values[k] * by_turn[i, row, axis]
+                    dense[column // _TILE, block, column % _TILE * LANES + lane] = value
+                    column += 1
+            dense[column // _TILE, block, column % _TILE * LANES + lane] = errors[i, row]
+
+
+@kernel
+def _fill_smooth(smooth: Array, rays: Array, inliers: IntArray, chosen: IntArray) -> None:
+    """The field's terms of the chosen points among the inliers, in tiles and lanes."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for i in inliers:
+        for k in range(2):
+            low[k], high[k] = min(low[k], rays[i, k]), max(high[k], rays[i, k])
+    scale = (2.0 / max(high[0] - low[0], 1e-12), 2.0 / max(high[1] - low[1], 1e-12))
+    middle = (0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]))
+    terms, x, y = np.empty(_FIELD_TERMS), np.empty(_FIELD_DEGREE + 1), np.empty(_FIELD_DEGREE + 1)
+    for place in range(len(chosen)):
+        i = chosen[place]
+        legendre(scale[0] * (rays[i, 0] - middle[0]), x)
+        legendre(scale[1] * (rays[i, 1] - middle[1]), y)
+        _field_terms(x, y, terms)
+        block, lane = place // LANES, place % LANES
+        for k in range(_FIELD_TERMS):
+            smooth[k // _TILE, block, k % _TILE * LANES + lane] = terms[k]
+
+
+@kernel
+def _add_products(columns: Array, others: Array, triangle: bool, products: Array) -> None:
+    """Add the products of all columns with others; of a triangle those below the diagonal."""
+    sums = np.empty(_TILE * _TILE)
+    for a in range(len(columns)):
+        for b in range(a + 1 if triangle else len(others)):
+            _tile_products(columns[a], others[b], columns.shape[1], sums)
+            for i in range(_TILE):
+                for j in range(_TILE):
+                    products[a * _TILE + i, b * _TILE + j] += sums[i * _TILE + j]
+
+
+@kernel
+def _assembled(
+    products: Array, first: Array, second: Array, of_terms: Array, shake: int, terms: int
+) -> Columns:
+    """All products: terms of one direction have none with those of the other."""
+    last = PARAMETERS + shake
+    size = last + 2 * terms
+    whole, with_errors = np.zeros((size, size)), np.empty(size)
+    for k in range(last):
+        with_errors[k] = -products[last, k]
+        for m in range(k + 1):
+            whole[k, m] = products[k, m]
+            whole[m, k] = products[k, m]
+    for k in range(terms):
+        one, other = last + k, last + terms + k
+        with_errors[one], with_errors[other] = -first[k, last], -second[k, last]
+        for m in range(last):
+            whole[one, m], whole[m, one] = first[k, m], first[k, m]
+            whole[other, m], whole[m, other] = second[k, m], second[k, m]
+        for m in range(k + 1):
+            for shift in (last, last + terms):
+                whole[shift + k, shift + m] = of_terms[k, m]
+                whole[shift + m, shift + k] = of_terms[k, m]
+    return Columns(whole, with_errors, products[last, last], shake)
 
 
 @kernel

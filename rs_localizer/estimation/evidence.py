@@ -16,6 +16,7 @@ _LEAST_VARIANCE = LEAST_NOISE * LEAST_NOISE
 # Where neither shaking nor field explains more than this (logarithm of the likelihood), there is
 # nothing that both could explain.
 _NOTHING_TO_SHARE = 1.0
+_TURNS = 3  # in which size and noise settle
 
 
 class Projected(NamedTuple):
@@ -67,6 +68,25 @@ def project_out(products: Array, with_errors: Array, squared_errors: float, kept
 
 
 @kernel
+def log_determinant(matrix: Array) -> float:
+    """Of a symmetric positive definite matrix, by Cholesky."""
+    size = len(matrix)
+    factor, total = np.empty((size, size)), 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            left = matrix[i, j]
+            for k in range(j):
+                left -= factor[i, k] * factor[j, k]
+            if i == j:
+                left = max(left, 1e-15 * matrix[i, i])  # what nothing determines
+                total += np.log(left)
+                factor[i, i] = np.sqrt(left)
+            else:
+                factor[i, j] = left / factor[j, j]
+    return total
+
+
+@kernel
 def evidence_of_sizes(
     projected: Projected, sizes: Array, freedom: float, noise: float
 ) -> tuple[Array, Array]:
@@ -83,14 +103,15 @@ def evidence_of_sizes(
     for index in range(len(sizes)):
         variance = noise * noise
         left, volume = projected.squared_errors, 0.0
-        for _ in range(3):
+        for turn in range(_TURNS):
             ratio = sizes[index] ** 2 / variance
             # Pivots of I + ratio * products, from the last one to the one that the errors meet.
             pivot, volume = 1.0, 0.0
             for i in range(len(diagonal) - 1, -1, -1):
                 coupled = ratio * beside[i]
                 pivot = 1.0 + max(ratio * diagonal[i] - coupled * coupled / pivot, 0.0)
-                volume += np.log(pivot)
+                if turn == _TURNS - 1:
+                    volume += np.log(pivot)
             left = projected.squared_errors - ratio * along * along / pivot
             variance = max(left / freedom, _LEAST_VARIANCE)
         evidence[index] = -0.5 * (freedom * np.log(variance) + volume)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Failure
 
@@ -47,16 +48,6 @@ def checked(
     return points, pixels, scores
 
 
-def median_point(points: Array, chosen: BoolArray) -> Array:
-    """Median (3,) of each coordinate over some of the points (n,3); zero if there are none."""
-    of = points[chosen]
-    if len(of) == 0:
-        return np.zeros(3)
-    middle = len(of) // 2
-    median: Array = np.partition(of, middle, axis=0)[middle]  # np.median takes three times as long
-    return median
-
-
 def distinct(points: Array, pixels: Array, chosen: IntArray) -> IntArray:
     """The chosen correspondences without those that repeat another one: a copy says nothing new."""
     # Equal pixels have equal keys; nearly always there are none, and one sort says so.
@@ -68,13 +59,27 @@ def distinct(points: Array, pixels: Array, chosen: IntArray) -> IntArray:
     return chosen[np.sort(first)]
 
 
-def near_image(camera: Camera, pixels: Array) -> BoolArray:
+@kernel
+def near_image(pixels: Array, width: float, height: float) -> BoolArray:
     """Which pixels (n,2) lie in the image, or as far outside as noise may have put them."""
-    size = np.array(camera.size)
-    margin = _MARGIN * size
-    inside = (pixels > -margin) & (pixels < size + margin)
-    near: BoolArray = inside[:, 0] & inside[:, 1]  # along a short axis NumPy takes its time
+    near = np.empty(len(pixels), dtype=np.bool_)
+    across, down = _MARGIN * width, _MARGIN * height
+    for i in range(len(pixels)):
+        x, y = pixels[i, 0], pixels[i, 1]
+        near[i] = -across < x < width + across and -down < y < height + down
     return near
+
+
+@kernel
+def _extent(pixels: Array, chosen: IntArray) -> float:
+    """Width or height of what the chosen pixels fill, whichever is the larger."""
+    largest = 0.0
+    for axis in range(2):
+        low, high = np.inf, -np.inf
+        for i in chosen:
+            low, high = min(low, pixels[i, axis]), max(high, pixels[i, axis])
+        largest = max(largest, high - low)
+    return largest
 
 
 def unfit(
@@ -96,7 +101,7 @@ def unfit(
             Reason.TOO_FEW_POINTS,
             f"{len(usable)} usable points of {len(pixels)}, {needed} are needed{hint}",
         )
-    extent = float(np.ptp(pixels[usable], axis=0).max())
+    extent = _extent(pixels, usable)
     if extent < _LEAST_EXTENT:
         return Failure(
             Reason.DEGENERATE,

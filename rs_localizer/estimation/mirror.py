@@ -7,19 +7,22 @@ PAMI 2006). A minimum that was found says nothing of the other one, so it is loo
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.state import STATE_TRANSLATION, rotation_of
+from rs_localizer.estimation.averaging import longest_axis
+from rs_localizer.estimation.posterior import Mirror
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
 _PLANE = 0.1
 # What leans by less (rad) has no mirrored pose of its own.
 _LEAST_LEAN = 0.01
+# A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
+CLEARLY_WORSE = 9.2
+# The covariance speaks for poses within so many standard deviations of the orientation.
+_COVERED = 4.0
 
 
 def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
@@ -27,30 +30,49 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
 
     None if the points (n,3) that count are no plane, or face the camera.
     """
-    return _leaning_less(points, inliers, state, 2.0)
+    found, other = _leaning_less(points, inliers, state, 2.0)
+    return other if found else None
 
 
 def facing(points: Array, inliers: BoolArray, state: Array) -> Array | None:
     """The state (24,) half-way to the mirrored one, whose plane faces the camera; None as there."""
-    return _leaning_less(points, inliers, state, 1.0)
+    found, other = _leaning_less(points, inliers, state, 1.0)
+    return other if found else None
 
 
-def _leaning_less(points: Array, inliers: BoolArray, state: Array, leans: float) -> Array | None:
-    """The state whose view of the plane leans by so many times its lean less."""
+@kernel
+def _leaning_less(
+    points: Array, inliers: BoolArray, state: Array, leans: float
+) -> tuple[bool, Array]:
+    """Whether there is a state whose view of the plane leans by so many times its lean less."""
     plane, centre, axis_of_plane = _plane(points, inliers)
     if not plane:
-        return None
-    rotation, translation = rotation_of(state), state[STATE_TRANSLATION]
-    seen = rotation @ centre + translation
-    sight = seen / np.linalg.norm(seen)
-    normal = rotation @ axis_of_plane
-    axis = np.cross(sight, normal * np.sign(sight @ normal))
-    lean = math.asin(min(float(np.linalg.norm(axis)), 1.0))
+        return False, state
+    seen, normal = state[9:12].copy(), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            seen[i] += state[3 * i + k] * centre[k]
+            normal[i] += state[3 * i + k] * axis_of_plane[k]
+    sight = seen / np.sqrt(np.sum(seen * seen))
+    normal *= np.sign(np.sum(sight * normal))
+    axis = np.empty(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        axis[i] = sight[j] * normal[k] - sight[k] * normal[j]
+    length = np.sqrt(np.sum(axis * axis))
+    lean = np.arcsin(min(length, 1.0))
     if lean < _LEAST_LEAN:
-        return None
-    turn = so3.exp(-leans * lean * axis / np.linalg.norm(axis))
-    turned = turn @ (translation - seen) + seen
-    return np.concatenate([(turn @ rotation).ravel(), turned, state[STATE_TRANSLATION.stop :]])
+        return False, state
+    flip = so3.exp(-leans * lean / length * axis)
+    other = state.copy()
+    for i in range(3):
+        other[9 + i] = seen[i]
+        for k in range(3):
+            other[9 + i] += flip[i, k] * (state[9 + k] - seen[k])
+            other[3 * i + k] = 0.0
+            for m in range(3):
+                other[3 * i + k] += flip[i, m] * state[3 * m + k]
+    return True, other
 
 
 @kernel
@@ -75,3 +97,21 @@ def _plane(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
             spread[k, j] = spread[j, k]
     extents, axes = np.linalg.eigh(spread)
     return extents[0] < _PLANE**2 * extents[1], centre, axes[:, 0].copy()
+
+
+def farthest(costs: Array, evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
+    """The farthest pose that is not out of the question: neither unlikely nor of a bad fit.
+
+    Args:
+        costs, evidence: (k,) of the modes, noise variances and logarithms.
+        steps: (k,18) to them from the estimate, whose covariance (18,18) speaks for what is near.
+    """
+    best = int(np.argmax(evidence))
+    worse = np.maximum(2.0 * (evidence[best] - evidence), costs - costs[best])
+    turns = np.where(worse < CLEARLY_WORSE, np.linalg.norm(steps[:, :3], axis=1), 0.0)
+    far = int(np.argmax(turns))
+    if turns[far] == 0.0:
+        return None
+    # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
+    deviation = longest_axis(covariance)
+    return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))

@@ -14,30 +14,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import PARAMETERS, TURN, at_rest, depths, step_between
+from rs_localizer.core.state import PARAMETERS, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
-from rs_localizer.estimation.curvature import along_arcs, told_from
-from rs_localizer.estimation.face_on import (
-    DENIED,
-    NEARBY,
-    OVERLAP,
-    RULED_OUT,
-    held_facing,
-    reaching,
-    squared_deviations,
-    windows,
+from rs_localizer.estimation.averaging import (
+    alike,
+    averaged,
+    more_probable,
+    normalized,
+    volume_of,
 )
-from rs_localizer.estimation.mirror import mirrored
+from rs_localizer.estimation.columns import Columns
+from rs_localizer.estimation.curvature import along_arcs
+from rs_localizer.estimation.doubt import may_face
+from rs_localizer.estimation.face_on import OVERLAP, reaching, windows
+from rs_localizer.estimation.linear import foreseen
+from rs_localizer.estimation.medians import median_depth
+from rs_localizer.estimation.mirror import farthest, mirrored
 from rs_localizer.estimation.model_error import Examined, examine, gain_of_shaking
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.posterior import Mirror, Posterior, fit
-from rs_localizer.estimation.prior_terms import PriorTerms, held_beside, slower_terms
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.packing import thin, weighted
+from rs_localizer.estimation.posterior import Posterior, fit
+from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
 
 # Typical speeds to try, as parts of the configured one; 0 is a camera at rest.
 _SPEEDS = (0.0, 0.03, 0.1, 0.3, 1.0)
 # Along the flat valleys of small planes a fit may end before its steps do.
 _FITS = 4
+# So many points lead a fit to where all of them end it.
+_ENOUGH = 48
 # Odds by which motion must explain the points better than rest, to count in the estimate. Where a
 # map or a lens is seen to be wrong, what looks like motion mostly is more of that, and the odds
 # grow by the second factor. The covariance allows for motion at even odds.
@@ -46,19 +50,14 @@ DISTRUST = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
-_LEAST_PROBABLE = 1e-200  # of which there still is a logarithm
-# Probabilities that have no part in the covariance.
-_NO_PART = 1e-5
 # Points nearer than this (m) would make any map useless.
 _NEAREST = 1e-6
 # Logarithm of the odds of a typical speed beside a better one, beyond which none is tried.
 _FAR_LESS_PROBABLE = 7.0
 # Likewise, beyond which a typical speed hardly counts in the covariance.
 _HARDLY_COUNTS = 3.0
-# A pose that fits worse by this many noise variances is out of the question: odds of 100 to 1.
-CLEARLY_WORSE = 9.2
-# The covariance speaks for poses within so many standard deviations of the orientation.
-_COVERED = 4.0
+# Likewise, beyond which a mirrored pose at rest is not there at any speed.
+_OUT_OF_QUESTION = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,26 +86,42 @@ class Inliers:
     ) -> None:
         self.observations, self.terms, self.assumed = observations, terms, assumed
         self.inliers, self.noise, self.inflation = best.inliers, best.noise, best.inflation
-        before = depths(best.state, observations.points)[best.inliers]
-        count = len(before)
-        depth = float(np.partition(before, count // 2)[count // 2]) if count else 1.0
-        self.field_sizes = assumed.field_sizes(max(depth, _NEAREST))
+        self._data = weighted(observations.packed, best.inliers)
+        count = int(np.count_nonzero(best.inliers))
+        depth = median_depth(best.state, observations.points, best.inliers) if count else 1.0
+        self._depth = max(depth, _NEAREST)
+        self.field_sizes = assumed.field_sizes(self._depth)
+        # Where the points are linearized, and their columns, if these foresee other speeds.
+        self.linear: tuple[Array, Columns] | None = None
         self.freedom = max(2.0 * count - 6.0, 1.0)
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
         self.odds = math.log(_ODDS_AGAINST_MOTION)  # logarithm
-        self.shake_prior = _more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
-        self.field_prior = _more_probable(FIELD_PRIOR, assumed.of_field_sizes)
+        # Cost (noise variances) of the best motion if the mirrored pose leads back to it.
+        self.only_cost = -math.inf
+        self.shake_prior = more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
+        self.field_prior = more_probable(FIELD_PRIOR, assumed.of_field_sizes)
 
     def fitted(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
         """State (24,) and cost of the best motion near a state."""
         for _ in range(_FITS):
-            start, _, cost, converged = fit(
-                self.observations, start, self.inliers, terms, self.noise
+            start, cost, converged = fit(
+                self._data, start, self.observations.row_time_gradient, terms, self.noise
             )
             if converged:
                 break
         return start, cost
+
+    def fitted_from_afar(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
+        """The same from a start that may lead along a valley: a part of the points goes first."""
+        chosen = np.flatnonzero(self.inliers)
+        part = chosen[:: len(chosen) // _ENOUGH] if len(chosen) >= 2 * _ENOUGH else chosen
+        if len(part) < len(chosen):
+            start, _, _ = fit(
+                thin(self._data, part), start, self.observations.row_time_gradient, terms,
+                self.noise * math.sqrt(len(part) / len(chosen)),
+            )  # fmt: skip
+        return self.fitted(start, terms)
 
     def examined(
         self, state: Array, terms: PriorTerms, degree: int, neighbours: bool = True
@@ -132,8 +147,27 @@ class Inliers:
 
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> Mode:
         """The Gaussian about the best motion of a typical speed."""
-        state, cost = self.fitted(start, terms)
-        examined = self.examined(state, terms, 0, neighbours=False)
+        if self.linear is not None:
+            near, state, cost, examined = foreseen(
+                *self.linear, terms, self.freedom, self.noise, SHAKE_SIZES, self.shake_prior,
+                self.field_sizes, self.field_prior, self.assumed.focal_length, self._depth,
+            )  # fmt: skip
+            if near:
+                return self._gaussian((state, cost), examined, terms, speed, start)
+        return self.gaussian(self.fitted(start, terms), terms, speed, start)
+
+    def gaussian(
+        self, fitted: tuple[Array, float], terms: PriorTerms, speed: float, start: Array
+    ) -> Mode:
+        """The same about a motion that has been fitted from there, of this cost."""
+        examined = self.examined(fitted[0], terms, 0, neighbours=False)
+        return self._gaussian(fitted, examined, terms, speed, start)
+
+    def _gaussian(
+        self, fitted: tuple[Array, float], examined: Examined, terms: PriorTerms, speed: float,
+        start: Array,
+    ) -> Mode:  # fmt: skip
+        state, cost = fitted
         volume = volume_of(terms, examined)
         evidence = self.worth * (examined.sizes.evidence + volume)
         if self.assumed.turn is not None:
@@ -154,12 +188,6 @@ class Inliers:
         )
 
 
-def volume_of(terms: PriorTerms, examined: Examined) -> float:
-    """The part of the evidence that speaks for few possibilities of the motion."""
-    known = np.diag(terms.informations[0])
-    return float(0.5 * (np.log(known[known > 0.0]).sum() - examined.determined))
-
-
 def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     """The average of all combinations, and the mirrored pose if it cannot be ruled out."""
     modes = _modes(frame, found, planar)
@@ -169,19 +197,18 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     if not np.any(evidence > -math.inf):
         return replace(found, smallest_eigenvalue=0.0)
     at_rest = np.array([mode.speed == 0.0 for mode in modes])
-    possible = _normalized(np.array([mode.support for mode in modes]))
-    counting = _normalized(evidence + frame.odds * at_rest)
+    possible = normalized(np.array([mode.support for mode in modes]))
+    counting = normalized(evidence + frame.odds * at_rest)
     best = int(np.argmax(counting))
-    steps = np.array([step_between(modes[best].state, mode.state) for mode in modes])
-    mean = counting @ steps
-    state = apply_step(modes[best].state, mean)
-    offsets = steps - mean
-    covariance = np.einsum("k,ki,kj->ij", possible, offsets, offsets)
-    for k in np.flatnonzero(possible > _NO_PART):
-        covariance += possible[k] * told_from(modes[k].covariance, offsets[k, TURN])
-    faces = _facing(frame, modes, state, covariance) if planar else None
+    state, covariance, steps = averaged(
+        np.array([mode.state for mode in modes]),
+        np.array([mode.covariance for mode in modes]),
+        best, counting, possible,
+    )  # fmt: skip
+    faces = may_face(frame, modes, state, covariance) if planar else None
     if faces is not None:
         covariance = reaching(covariance, faces.step, faces.evidence)
+    costs = np.array([mode.cost for mode in modes])
     # Shaking that was not seen may be there all the same, unless the camera rests.
     joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance
@@ -194,47 +221,29 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
         shake=np.zeros_like(found.shake),  # it was that beside another motion
         squared_errors=frame.observations.squared_errors(state),
         model_error=float(possible @ [mode.field for mode in modes]),
-        mirror=_mirror(modes, evidence, steps, covariance) if planar else None,
+        mirror=farthest(costs, evidence, steps, covariance) if planar else None,
         facing=faces,
     )
 
 
-def _facing(frame: Inliers, modes: list[Mode], state: Array, covariance: Array) -> Mirror | None:
-    """The pose of a plane that faces the camera, from a state, unless it is ruled out."""
-    window = held_facing(frame.observations.points, frame.inliers, state, covariance)
-    if window is None:
-        return None
-    most, found = max(mode.evidence for mode in modes), None
-    near = float(np.linalg.norm(step_between(state, window.state)[TURN])) < NEARBY
-    fastest = {mode.speed: mode for mode in sorted(modes, key=lambda mode: mode.evidence)}
-    for mode in fastest.values():
-        unlikely = 2.0 * (most - mode.evidence)
-        if unlikely < RULED_OUT:
-            terms = window.times(_terms_at(frame, mode.speed))
-            there, cost = frame.fitted(window.state, terms)
-            worse = max(cost / frame.noise**2 - mode.cost, 1.0)
-            apart = squared_deviations(mode.covariance, step_between(mode.state, there))
-            denied = apart > DENIED * worse
-            if denied and unlikely + worse < (found.evidence if found else RULED_OUT):
-                found = Mirror(step_between(state, there), unlikely + worse, covered=near)
-    return found
-
-
 def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
     """A Gaussian for each speed and, before a plane, for either way that it may lean."""
-    may_rest = frame.assumed.may_rest
+    may_rest, turn_known = frame.assumed.may_rest, frame.assumed.turn is not None
     modes: list[Mode] = []
     near = at_rest(found.state) if may_rest else found.state
-    other = mirrored(frame.observations.points, frame.inliers, near) if planar else None
+    points = frame.observations.points
+    other, one = mirrored(points, frame.inliers, near) if planar else None, False
     for speed in _SPEEDS if may_rest else (1.0,):
-        chosen = _terms_at(frame, speed)
-        modes.append(frame.mode(near, chosen, speed))
-        near = modes[-1].state
+        chosen = terms_at(frame.terms, speed, turn_known)
+        mode = frame.mode(near, chosen, speed)
+        modes.append(mode)
+        near = mode.state
         if planar and other is None:
-            other = mirrored(frame.observations.points, frame.inliers, near)
+            other = mirrored(points, frame.inliers, near)
         if other is not None:
-            modes.append(frame.mode(other, chosen, speed))
-            other = modes[-1].state
+            twin = mode if one else _twin(frame, mode, other, chosen)
+            modes.append(twin)
+            other, one = twin.state, twin is mode or _out_of_question(frame, mode, twin)
         if max(mode.evidence for mode in modes if mode.speed == speed) < (
             max(mode.evidence for mode in modes) - _FAR_LESS_PROBABLE
         ):
@@ -242,11 +251,24 @@ def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
     return modes
 
 
-def _terms_at(frame: Inliers, speed: float) -> PriorTerms:
-    turn_known = frame.assumed.turn is not None
-    if speed == 0.0:
-        return held_beside(frame.terms, turn_known)
-    return frame.terms if speed == 1.0 else slower_terms(frame.terms, speed, turn_known)
+def _twin(frame: Inliers, mode: Mode, other: Array, terms: PriorTerms) -> Mode:
+    """The Gaussian that a mirrored start (24,) leads to; the mode itself where they meet."""
+    fitted = frame.fitted_from_afar(other, terms)
+    if alike(mode.state, fitted[0], mode.covariance):
+        return mode
+    return frame.gaussian(fitted, terms, mode.speed, other)
+
+
+def _out_of_question(frame: Inliers, mode: Mode, twin: Mode) -> bool:
+    """Whether a mirrored pose is so far off that it need not be followed to where it ends.
+
+    At full speed there is none but the best one, and this mode explains the points nearly as well.
+    """
+    return (
+        mode.cost < frame.only_cost + 2.0 * _OUT_OF_QUESTION
+        and twin.cost > mode.cost + 2.0 * _OUT_OF_QUESTION
+        and twin.evidence < mode.evidence - _OUT_OF_QUESTION
+    )
 
 
 def _in_pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
@@ -264,7 +286,7 @@ def _in_pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
 
 def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
     best = min(modes, key=lambda mode: mode.cost)
-    terms, pieces = _terms_at(frame, best.speed), list[Mode]()
+    terms, pieces = terms_at(frame.terms, best.speed, frame.assumed.turn is not None), list[Mode]()
     points = frame.observations.points
     for window in windows(points, frame.inliers, best.state, best.covariance):
         piece = frame.mode(window.state, window.times(terms), best.speed)
@@ -272,28 +294,3 @@ def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
         if piece.evidence < max(one.evidence for one in pieces) - _FAR_LESS_PROBABLE:
             break
     return pieces
-
-
-def _more_probable(prior: Array, odds: Array) -> Array:
-    # Frames may be so sure together that the rest vanishes, but nothing is impossible.
-    return np.maximum(_normalized(np.log(prior) + odds), _LEAST_PROBABLE)
-
-
-def _normalized(evidence: Array) -> Array:
-    weights = np.exp(evidence - evidence.max())
-    normalized: Array = weights / weights.sum()
-    return normalized
-
-
-def _mirror(modes: list[Mode], evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
-    """The farthest pose that is not out of the question: neither unlikely nor of a bad fit."""
-    costs = np.array([mode.cost for mode in modes])
-    best = int(np.argmax(evidence))
-    worse = np.maximum(2.0 * (evidence[best] - evidence), costs - costs[best])
-    turns = np.where(worse < CLEARLY_WORSE, np.linalg.norm(steps[:, :3], axis=1), 0.0)
-    far = int(np.argmax(turns))
-    if turns[far] == 0.0:
-        return None
-    # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
-    deviation = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-    return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))

@@ -11,7 +11,6 @@ is averaged.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from rs_localizer.estimation.columns import Columns, columns_of, with_prior
 from rs_localizer.estimation.evidence import (
     Sizes,
     evidence_of_sizes,
+    log_determinant,
     project_out,
     sizes_of,
 )
@@ -72,25 +72,22 @@ def with_model_error(
     for k in range(kept):
         matrix[k, k] *= RIDGE
     inverse = inverted(matrix)
-    step = np.empty(kept)
-    covariance = np.empty((kept, kept))
-    for i in range(kept):
-        total = 0.0
-        for k in range(kept):
-            total += inverse[i, k] * columns.with_errors[k]
-        step[i] = total
-        for j in range(kept):
-            covariance[i, j] = noise * noise * inverse[i, j]
+    step, covariance = np.zeros(kept), noise * noise * inverse
+    # Along the rows, one below the other: so that the registers are full.
+    for k in range(kept):
+        for i in range(kept):
+            step[i] += inverse[k, i] * columns.with_errors[k]
+    pulled = np.empty(kept)
     for column in range(kept, size):
-        pulled = np.empty(kept)
+        pulled[:] = 0.0
+        for k in range(kept):
+            factor, row = field_size * columns.products[column, k], inverse[k]
+            for i in range(kept):
+                pulled[i] += factor * row[i]
         for i in range(kept):
-            total = 0.0
-            for k in range(kept):
-                total += inverse[i, k] * columns.products[k, column]
-            pulled[i] = total * field_size
-        for i in range(kept):
+            factor, into = pulled[i], covariance[i]
             for j in range(kept):
-                covariance[i, j] += pulled[i] * pulled[j]
+                into[j] += factor * pulled[j]
     return step, covariance
 
 
@@ -168,11 +165,10 @@ class Examined(NamedTuple):
     shared: float
     loudness: float  # of the loudest tone, see :func:`rs_localizer.estimation.spectrum.loudest`
     determined: float  # logarithm of the determinant of the information of the motion, px^2
-
-    @property
-    def finite(self) -> bool:
-        """Whether the points are enough for what was asked of them: else covariances are none."""
-        return math.isfinite(self.step.sum() + np.trace(self.covariance))
+    cost: float  # of the points and the prior after the step, px^2
+    # Whether the points are enough for what was asked of them: else covariances are none.
+    finite: bool
+    columns: Columns  # without the prior
 
 
 @kernel
@@ -198,20 +194,41 @@ def examine(
     still = np.zeros((count, 6))
     errors, by_motion, by_turn, tau = linearized(data, count, state, gradient, still)
     columns = columns_of(errors, by_motion, by_turn, tau, rays, inliers, degrees, True)
-    columns = with_prior(columns, prior, state, noise)
-    sizes = sizes_of(
-        columns, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
+    found = judged(
+        columns, prior, state, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
+    )
+    if not neighbours:
+        return found
+    # Where no field is seen, nor is what neighbours share; and most frames have none.
+    seen = found.sizes.no_field < _NO_FIELD
+    return Examined(
+        found.step, found.covariance, found.sizes,
+        neighbours_agree(errors, measured_tau, rays, inliers),
+        shared_errors(errors, rays, inliers) if seen else 0.0,
+        loudest(errors, by_turn, measured_tau, inliers),
+        found.determined, found.cost, found.finite, columns,
     )  # fmt: skip
-    step, covariance = with_model_error(columns, sizes.noise, sizes.shake, sizes.field)
-    agreement, shared, loudness = 0.0, 0.0, 0.0
-    if neighbours:
-        agreement = neighbours_agree(errors, measured_tau, rays, inliers)
-        loudness = loudest(errors, by_turn, measured_tau, inliers)
-        # Where no field is seen, nor is what neighbours share; and most frames have none.
-        if sizes.no_field < _NO_FIELD:
-            shared = shared_errors(errors, rays, inliers)
-    determined = np.linalg.slogdet(columns.products[:PARAMETERS, :PARAMETERS])[1]
-    return Examined(step, covariance, sizes, agreement, shared, loudness, determined)
+
+
+@kernel
+def judged(
+    columns: Columns, prior: PriorTerms, state: Array, freedom: float, noise: float,
+    shake_sizes: Array, shake_prior: Array, field_sizes: Array, field_prior: Array,
+) -> Examined:  # fmt: skip
+    """What the columns of a motion make of it under a prior, but for what neighbours share."""
+    known = with_prior(columns, prior, state, noise)
+    sizes = sizes_of(
+        known, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
+    )  # fmt: skip
+    step, covariance = with_model_error(known, sizes.noise, sizes.shake, sizes.field)
+    determined = log_determinant(known.products[:PARAMETERS, :PARAMETERS])
+    cost, total = known.squared_errors, 0.0
+    for k in range(len(step)):
+        cost -= step[k] * known.with_errors[k]
+        total += step[k] + covariance[k, k]
+    return Examined(
+        step, covariance, sizes, 0.0, 0.0, 0.0, determined, cost, bool(np.isfinite(total)), columns
+    )
 
 
 @kernel

@@ -8,12 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.steadied import steadied
 from rs_localizer.estimation.assumptions import Assumed
-from rs_localizer.estimation.inputs import distinct, median_point, near_image
+from rs_localizer.estimation.inputs import distinct, near_image
+from rs_localizer.estimation.medians import median_point
 from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.packing import pack
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.sampling import Random
 
@@ -44,30 +48,53 @@ class Usable(NamedTuple):
     centre: Array  # (3,) map frame: the median of the points
     rays: Array  # (n,2), steadied
     by_ray: Array  # (n,2,2) derivatives of the pixels by them
+    tau: Array  # (n,) row times
 
 
 def find_usable(camera: Camera, points: Array, pixels: Array, turn: KnownTurn | None) -> Usable:
     """Find the usable ones of points (n,3) and pixels (n,2); a known turn is taken out of these."""
-    rays, by_ray = camera.rays_and_jacobian(pixels)
+    rays, by_ray = bearings(camera, pixels)
+    tau = camera.row_time(pixels)
     if turn is not None:
-        gradient = camera.row_time_gradient
-        rays, by_ray = steadied(rays, camera.row_time(pixels), by_ray, gradient, turn)
-    seen = np.isfinite(rays[:, 0])
+        rays, by_ray = steadied(rays, tau, by_ray, camera.row_time_gradient, turn)
+    width, height = camera.size
+    shown = near_image(pixels, float(width), float(height))
+    centre, candidates = _candidates(points, rays, shown)
+    return Usable(distinct(points, pixels, candidates), shown, centre, rays, by_ray, tau)
+
+
+@kernel
+def _candidates(points: Array, rays: Array, shown: BoolArray) -> tuple[Array, IntArray]:
+    """The median (3,) of the points with a bearing, and which of these that are shown are near."""
+    count = len(points)
+    seen = np.empty(count, dtype=np.bool_)
+    for i in range(count):
+        seen[i] = np.isfinite(rays[i, 0])
     centre = median_point(points, seen)
-    with np.errstate(over="ignore"):
-        within = np.abs(points - centre).max(axis=1, initial=0.0) < _FARTHEST_POINT
-    shown = near_image(camera, pixels)
-    indices = distinct(points, pixels, np.flatnonzero(seen & within & shown))
-    return Usable(indices, shown, centre, rays, by_ray)
+    for i in range(count):
+        farthest = 0.0
+        for axis in range(3):
+            farthest = max(farthest, abs(points[i, axis] - centre[axis]))
+        seen[i] = seen[i] and shown[i] and farthest < _FARTHEST_POINT
+    return centre, np.flatnonzero(seen)
 
 
-def packed(camera: Camera, points: Array, pixels: Array, usable: Usable) -> Observations:
-    """The usable points, relative to their median."""
-    indices = usable.indices
-    return Observations.of(
-        points[indices] - usable.centre,
-        usable.rays[indices],
-        camera.row_time(pixels[indices]),
-        usable.by_ray[indices],
-        camera.row_time_gradient,
-    )
+def packed(camera: Camera, points: Array, usable: Usable) -> Observations:
+    """The usable points (of these (n,3)), relative to their median."""
+    indices, _, centre, rays, by_ray, tau = usable
+    found = _packed(points, rays, tau, by_ray, indices, centre)
+    near, bearing, times, row_range, lanes = found
+    return Observations(near, bearing, times, row_range, camera.row_time_gradient, lanes)
+
+
+@kernel
+def _packed(
+    points: Array, rays: Array, tau: Array, by_ray: Array, indices: IntArray, centre: Array
+) -> tuple[Array, Array, Array, float, Array]:
+    """Points, bearings and row times at these indices, the range of the times, and all packed."""
+    near, bearing, times = points[indices], rays[indices], tau[indices]
+    for i in range(len(near)):
+        for axis in range(3):
+            near[i, axis] -= centre[axis]
+    row_range = np.max(times) - np.min(times) if len(times) > 0 else 0.0
+    return near, bearing, times, row_range, pack(near, bearing, times, by_ray[indices])

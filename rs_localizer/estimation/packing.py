@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.lanes.simd import LANES
 from rs_localizer.estimation.view import POINT_SIZE
@@ -50,7 +50,7 @@ def thin(data: Array, chosen: IntArray) -> Array:
 
 
 @kernel
-def weighted(data: Array, weights: Array) -> Array:
+def weighted(data: Array, weights: Array | BoolArray) -> Array:
     """The packed points with these weights (n,): 1 or 0."""
     data = data.copy()
     for i in range(len(weights)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,7 +62,7 @@ class Posterior:
     covariance: Array  # (18,18), or more with the coefficients of the shaking
     noise: float  # px, measured standard deviation
     freedom: float  # of the errors
-    smallest_eigenvalue: float  # of the information scaled to a unit diagonal
+    smallest_eigenvalue: float  # of the information scaled to a unit diagonal, or less
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
     mirror: Mirror | None = None
@@ -119,21 +120,44 @@ def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float
 
 
 @kernel
-def decided(information: Array, prior: PriorTerms, noise: float) -> float:
+def decided(inverse: Array, prior: PriorTerms, noise: float) -> float:
     """How many of the parameters the points decide, and not the prior.
 
     Args:
-        information: (18,18) of both, px^2.
+        inverse: (18,18) of the information of both, px^-2.
         noise: px, the one that the prior was weighed against.
     """
-    size = len(information)
-    inverse = inverted(information)
+    size = len(inverse)
     total = float(size)
     for term in range(len(prior.informations)):
         for i in range(size):
             for j in range(size):
                 total -= noise * noise * inverse[i, j] * prior.informations[term, i, j]
     return max(total, 0.0)
+
+
+@kernel
+def _least_eigenvalue(information: Array, inverse: Array) -> float:
+    """Of an information matrix scaled to a unit diagonal; where it is large enough, a bound."""
+    total = 0.0  # of the eigenvalues of the scaled inverse
+    for i in range(len(information)):
+        total += inverse[i, i] * information[i, i]
+    if total > 0.0 and total < 1.0 / _LEAST_EIGENVALUE:
+        return 1.0 / total
+    return smallest_eigenvalue(information)
+
+
+class _Best(NamedTuple):
+    """What :class:`Posterior` needs of the best motion."""
+
+    state: Array
+    cost: float
+    covariance: Array
+    noise: float
+    freedom: float
+    smallest_eigenvalue: float
+    inliers: BoolArray
+    squared_errors: Array
 
 
 @kernel
@@ -144,19 +168,15 @@ def _rounds(
     gradient: Array,
     prior: PriorTerms,
     threshold: float,
-) -> tuple[Array, Array, float, Array, float, float, float]:
-    """Refine, measure the noise, choose the inliers, and again.
-
-    Returns:
-        state, information times the noise variance, cost, squared errors (count,), noise, gate, and
-        the parameters that the points decide (the prior takes its part of them).
-    """
+) -> _Best:
+    """Refine, measure the noise, choose the inliers, and again."""
     # From the wide side: a start that fits few points well would see little noise and keep few.
     state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
     cost = 0.0
     errors = squared_errors(data, count, state, gradient)
     weights = np.empty(count)
     information = np.empty((PARAMETERS, PARAMETERS))
+    inverse = information
     for _ in range(_ROUNDS):
         for i in range(count):
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
@@ -173,10 +193,16 @@ def _rounds(
             _ROUGH,
         )
         errors = squared_errors(data, count, state, gradient)
-        freedom = decided(information, prior, noise)
+        inverse = inverted(information)
+        # The prior takes its part of the parameters that the points decide.
+        freedom = decided(inverse, prior, noise)
         noise = noise_deviation(errors, gate, freedom)
         gate = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
-    return state, information, cost, errors, noise, gate, freedom
+    inliers = errors < gate * gate
+    return _Best(
+        state, cost, noise * noise * inverse, noise, 2.0 * np.sum(inliers) - freedom,
+        _least_eigenvalue(information, inverse), inliers, errors,
+    )  # fmt: skip
 
 
 def maximum_a_posteriori(
@@ -188,41 +214,32 @@ def maximum_a_posteriori(
         start: state (24,).
         threshold: px, least gate for inliers.
     """
-    state, information, cost, errors, noise, gate, by_points = _rounds(
-        observations.packed,
-        len(observations),
-        start,
-        observations.row_time_gradient,
-        prior,
-        threshold,
-    )
-    inliers = errors < gate * gate
     return Posterior(
-        state=state,
-        cost=cost,
-        covariance=noise**2 * inverted(information),
-        noise=noise,
-        freedom=2.0 * np.count_nonzero(inliers) - by_points,
-        smallest_eigenvalue=smallest_eigenvalue(information),
-        inliers=inliers,
-        squared_errors=errors,
+        *_rounds(
+            observations.packed,
+            len(observations),
+            start,
+            observations.row_time_gradient,
+            prior,
+            threshold,
+        )
     )
 
 
+@kernel
 def fit(
-    observations: Observations, start: Array, inliers: BoolArray, prior: PriorTerms, noise: float
-) -> tuple[Array, Array, float, bool]:
-    """Refine a state (24,) on some of the points (see :func:`.refine.refine`)."""
-    fitted: tuple[Array, Array, float, bool] = refine(
-        weighted(observations.packed, inliers.astype(np.float64)),
-        start,
-        observations.row_time_gradient,
-        _NO_SCALE,
-        0.0,
-        prior,
-        noise,
-        2,
-        _ITERATIONS,
-        _FINE,
+    data: Array, start: Array, gradient: Array, terms: PriorTerms, noise: float
+) -> tuple[Array, float, bool]:
+    """State (24,), cost and convergence of a fit to some of the points (see :func:`.refine`).
+
+    Args:
+        data: the points, packed, with weight 1 where they count.
+        start: state (24,).
+        gradient: (2,) row time by pixel.
+        terms: of the prior.
+        noise: px.
+    """
+    state, _, cost, converged = refine(
+        data, start, gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
     )
-    return fitted
+    return state, cost, converged

@@ -68,12 +68,11 @@ def slower_terms(terms: PriorTerms, part: float, turn_known: bool = False) -> Pr
     at any speed. What a gyroscope leaves of a turn does not depend on it.
     """
     informations = terms.informations.copy()
-    kept = informations[0][_TURNING].copy()
     informations[0, ANGULAR] /= part**2
     informations[0, LINEAR] /= max(part, _WALKING) ** 2
     informations[0, ACCELERATIONS] /= min(_JOLTS * part, 1.0) ** 2
     if turn_known:
-        informations[0][_TURNING] = kept
+        informations[0][_TURNING] = terms.informations[0][_TURNING]
     return terms._replace(informations=informations)
 
 
@@ -85,6 +84,13 @@ def held_beside(terms: PriorTerms, turn_known: bool = False) -> PriorTerms:
     informations = held.informations.copy()
     informations[0][_TURNING] = terms.informations[0][_TURNING]
     return held._replace(informations=informations)
+
+
+def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
+    """The terms of a typical speed, as a part of the configured one; 0: a camera at rest."""
+    if speed == 0.0:
+        return held_beside(terms, turn_known)
+    return terms if speed == 1.0 else slower_terms(terms, speed, turn_known)
 
 
 def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:

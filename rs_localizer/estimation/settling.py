@@ -21,10 +21,11 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import LINEAR, PARAMETERS, STATE_TRANSLATION, VELOCITIES, at_rest
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, Assumed
+from rs_localizer.estimation.averaging import alike, volume_of
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
-from rs_localizer.estimation.mirror import mirrored
-from rs_localizer.estimation.mixture import CLEARLY_WORSE, DISTRUST, Inliers, volume_of, weighed
+from rs_localizer.estimation.mirror import CLEARLY_WORSE, mirrored
+from rs_localizer.estimation.mixture import DISTRUST, Inliers, weighed
 from rs_localizer.estimation.model_error import Examined
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
@@ -92,9 +93,12 @@ def _settled(
     other = mirrored(observations.points, best.inliers, best.state)
     mirrored_fits = False
     if other is not None:
-        state, cost = frame.fitted(other, terms)
-        better = frame.fitted(best.state, terms)[1] - cost
+        state, cost = frame.fitted_from_afar(other, terms)
+        again, better = frame.fitted(best.state, terms)
+        better -= cost
         mirrored_fits = abs(better) < CLEARLY_WORSE * best.noise**2
+        if alike(again, state, best.covariance):
+            frame.only_cost = cost / best.noise**2
         if better > best.noise**2:
             best = maximum_a_posteriori(observations, state, terms, threshold)
             if not best.determined:
@@ -137,6 +141,8 @@ def _settled(
         agreement=examined.agreement,
     )
     planar = other is not None
+    if not planar:
+        frame.linear = best.state, examined.columns
     turn_known = assumed.turn is not None
     if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
         found = weighed(frame, found, planar)

@@ -55,7 +55,7 @@ def sight_of(
         return None
     given = np.asarray(points, float)[chosen], np.asarray(pixels, float)[chosen]
     usable = find_usable(camera, *given, found.turn)
-    seen = packed(camera, *given, usable)
+    seen = packed(camera, given[0], usable)
     count, motion = len(seen), found.beside_turn()
     errors, by_motion, by_turn, tau = linearized(
         seen.packed, count, state_in(motion, usable.centre), seen.row_time_gradient,

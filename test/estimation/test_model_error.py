@@ -57,16 +57,16 @@ def test_the_shaking_of_many_rows_and_what_is_taken_away_in_the_middle():
     np.testing.assert_allclose(slopes, 2 * legendre.legval(0.0, legendre.legder(series)))
 
 
-def frame(seed=0):
+def frame(seed=0, count=COUNT):
     """Random lines of a frame: errors, by_motion, by_turn, tau, rays, inliers."""
     rng = np.random.default_rng(seed)
     return (
-        DEVIATION * rng.normal(size=(COUNT, 2)),
-        rng.normal(size=(COUNT, 2, 18)) * 10.0 ** rng.uniform(0, 3, 18),
-        600.0 * rng.normal(size=(COUNT, 2, 3)),
-        rng.uniform(-0.5, 0.5, COUNT),
-        rng.uniform(-0.5, 0.6, (COUNT, 2)),
-        rng.uniform(size=COUNT) < 0.9,
+        DEVIATION * rng.normal(size=(count, 2)),
+        rng.normal(size=(count, 2, 18)) * 10.0 ** rng.uniform(0, 3, 18),
+        600.0 * rng.normal(size=(count, 2, 3)),
+        rng.uniform(-0.5, 0.5, count),
+        rng.uniform(-0.5, 0.6, (count, 2)),
+        rng.uniform(size=count) < 0.9,
     )
 
 
@@ -75,7 +75,7 @@ def design(errors, by_motion, by_turn, tau, rays, inliers, shake=True, field=Tru
     parts = [by_motion]
     if shake:
         turned = np.einsum("nk,nca->ncka", polynomials(tau, DEGREES - 1), by_turn)
-        parts.append(turned.reshape(COUNT, 2, -1))
+        parts.append(turned.reshape(len(tau), 2, -1))
     if field:
         low, high = rays[inliers].min(axis=0), rays[inliers].max(axis=0)
         x, y = ((2 * rays - low - high) / (high - low)).T
@@ -84,14 +84,15 @@ def design(errors, by_motion, by_turn, tau, rays, inliers, shake=True, field=Tru
         series = np.eye(4)[:, orders.T]  # (4, 2, 10)
         terms = sizes * legendre.legval(x, series[:, 0]).T * legendre.legval(y, series[:, 1]).T
         terms /= np.sqrt(np.sum((1 + np.arange(4)) * DEGREE_SIZES**2))
-        parts.append(np.einsum("nk,cd->ncdk", terms, np.eye(2)).reshape(COUNT, 2, -1))
+        parts.append(np.einsum("nk,cd->ncdk", terms, np.eye(2)).reshape(len(tau), 2, -1))
     whole = np.concatenate(parts, axis=2)[inliers]
     return whole.reshape(-1, whole.shape[2]), errors[inliers].ravel()
 
 
+@pytest.mark.parametrize("count", [COUNT, 700])  # within one chunk, and in three
 @pytest.mark.parametrize(("shake", "field"), itertools.product([False, True], repeat=2))
-def test_columns_are_those_of_a_plain_design_matrix(shake, field):
-    lines = frame()
+def test_columns_are_those_of_a_plain_design_matrix(shake, field, count):
+    lines = frame(count=count)
     found = columns_of(*lines, DEGREES if shake else 0, field)
     matrix, errors = design(*lines, shake=shake, field=field)
     scale = np.sqrt(np.sum(matrix**2, axis=0))

@@ -192,42 +192,73 @@ def traced_sums(inputs: int, *bodies: tuple[Callable[[list[Lanes]], Sequence[Num
     @intrinsic
     def sums(typingctx: Any, source: Any, blocks: Any, target: Any) -> Any:
         def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            source_data, target_data = (
-                context.make_array(signature.args[i])(context, builder, args[i]).data
-                for i in (0, 2)
-            )
-            first = builder.bitcast(source_data, _VECTOR.as_pointer())
-            place = 0
+            source_data, target_data = (_data(context, builder, signature, args, i) for i in (0, 2))
             for body, count in bodies:
-                totals = [_alloca_once(builder, _VECTOR) for _ in range(count)]
-                for total in totals:
-                    builder.store(_operand(0.0), total)
-                with cgutils.for_range(builder, args[1]) as loop:
-                    offset = builder.mul(loop.index, ir.Constant(loop.index.type, inputs))
-                    base = builder.gep(first, [offset])
-                    lanes = [
-                        Lanes(
-                            builder,
-                            builder.load(
-                                builder.gep(base, [ir.Constant(ir.IntType(64), i)]), align=8
-                            ),
-                        )
-                        for i in range(inputs)
-                    ]
-                    for total, term in zip(totals, body(lanes), strict=True):
-                        so_far = Lanes(builder, builder.load(total))
-                        builder.store(_operand(so_far + term), total)
-                for total in totals:
-                    scalar = _across_lanes(builder, builder.load(total))
-                    builder.store(
-                        scalar, builder.gep(target_data, [ir.Constant(ir.IntType(64), place)])
-                    )
-                    place += 1
+                _sum_over(builder, [(source_data, inputs)], args[1], body, count, target_data)
+                target_data = builder.gep(target_data, [ir.Constant(ir.IntType(64), count)])
             return context.get_dummy_value()
 
         return types.void(source, blocks, target), compile_call
 
     return sums
+
+
+def traced_products(columns: int) -> Any:
+    """Make a Numba-callable ``function(source, other, blocks, target)`` of sums over points.
+
+    Args:
+        columns: how many values a block of either source holds, at most four: the sums of their
+            products stay in registers.
+
+    Returns:
+        a function for use inside kernels: the target gets the sum over all lanes of the first
+        ``blocks`` blocks for each value of the source times each of the other one.
+    """
+
+    def products(values: list[Lanes]) -> Sequence[Number]:
+        return [a * b for a in values[:columns] for b in values[columns:]]
+
+    @intrinsic
+    def sums(typingctx: Any, source: Any, other: Any, blocks: Any, target: Any) -> Any:
+        def compile_call(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            first, second, data = (_data(context, builder, signature, args, i) for i in (0, 1, 3))
+            sources = [(first, columns), (second, columns)]
+            _sum_over(builder, sources, args[2], products, columns * columns, data)
+            return context.get_dummy_value()
+
+        return types.void(source, other, blocks, target), compile_call
+
+    return sums
+
+
+def _data(context: Any, builder: Any, signature: Any, args: Any, argument: int) -> Any:
+    array = context.make_array(signature.args[argument])(context, builder, args[argument])
+    return array.data
+
+
+def _sum_over(
+    builder: Any, sources: Sequence[tuple[Any, int]], blocks: Any,
+    body: Callable[[list[Lanes]], Sequence[Number]], count: int, target: Any,
+) -> None:  # fmt: skip
+    """Sum the terms of a body over all lanes of the first blocks of sources of so many values."""
+    totals = [_alloca_once(builder, _VECTOR) for _ in range(count)]
+    for total in totals:
+        builder.store(_operand(0.0), total)
+    with cgutils.for_range(builder, blocks) as loop:
+        lanes = []
+        for data, inputs in sources:
+            offset = builder.mul(loop.index, ir.Constant(loop.index.type, inputs))
+            base = builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [offset])
+            for i in range(inputs):
+                value = builder.gep(base, [ir.Constant(ir.IntType(64), i)])
+                lanes.append(Lanes(builder, builder.load(value, align=8)))
+        for total, term in zip(totals, body(lanes), strict=True):
+            so_far = Lanes(builder, builder.load(total))
+            builder.store(_operand(so_far + term), total)
+    for index, total in enumerate(totals):
+        scalar = _across_lanes(builder, builder.load(total))
+        element = builder.gep(target, [ir.Constant(ir.IntType(64), index)])
+        builder.store(scalar, element)
 
 
 def _across_lanes(builder: Any, vector: Any) -> Any:

@@ -163,7 +163,7 @@ def _found(
     terms, assumed = assumptions(camera, config, solver)
     usable = find_usable(camera, *given, turn)
     observed = Observed(
-        packed(camera, *given, usable),
+        packed(camera, given[0], usable),
         usable.indices,
         len(given[0]),
         usable.centre,
