@@ -50,6 +50,8 @@ DISTRUST = 1e9
 # Of Occam's factor in the covariance: what is simpler is more probable, but who moves is not served
 # by that.
 _GENEROSITY = 0.5
+# Probability of one combination, beside which there is no other.
+_ALONE = 0.99
 # Points nearer than this (m) would make any map useless.
 _NEAREST = 1e-6
 # Logarithm of the odds of a typical speed beside a better one, beyond which none is tried.
@@ -96,7 +98,7 @@ class Inliers:
         self.freedom = max(2.0 * count - 6.0, 1.0)
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
-        self.odds = math.log(_ODDS_AGAINST_MOTION)  # logarithm
+        self.odds = math.log(_ODDS_AGAINST_MOTION) + assumed.of_rest  # logarithm
         # Cost (noise variances) of the best motion if the mirrored pose leads back to it.
         self.only_cost = -math.inf
         self.shake_prior = more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
@@ -209,6 +211,12 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     if faces is not None:
         covariance = reaching(covariance, faces.step, faces.evidence)
     costs = np.array([mode.cost for mode in modes])
+    same = [alike(modes[best].state, mode.state, modes[best].covariance) for mode in modes]
+    if not frame.assumed.may_rest and possible @ same > _ALONE:
+        # Nothing but what was found, with its shaking.
+        covariance = along_arcs(found.covariance, found.state[9:12])
+        mirror = farthest(costs, evidence, steps, covariance) if planar else None
+        return replace(found, covariance=covariance, mirror=mirror)
     # Shaking that was not seen may be there all the same, unless the camera rests.
     joint = max(1.0 - possible @ at_rest, 0.0) * found.covariance
     joint[:PARAMETERS, :PARAMETERS] = covariance

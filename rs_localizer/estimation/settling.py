@@ -144,7 +144,8 @@ def _settled(
     if not planar:
         frame.linear = best.state, examined.columns
     turn_known = assumed.turn is not None
-    if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
+    still = assumed.of_rest > 0.0 or not _clearly_moving(found, terms, turn_known)
+    if planar or (assumed.may_rest and still):
         found = weighed(frame, found, planar)
     return averaged(tones, found) if tones else found
 
