@@ -1,7 +1,8 @@
-"""Whether a plane that seems to lean may as well face the camera."""
+"""Planes whose lean is in doubt: its posterior in pieces, and whether they may face the camera."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +12,11 @@ from rs_localizer.core.state import TURN, step_between
 from rs_localizer.estimation.face_on import (
     DENIED,
     NEARBY,
+    OVERLAP,
     RULED_OUT,
     held_facing,
     squared_deviations,
+    windows,
 )
 from rs_localizer.estimation.posterior import Mirror
 from rs_localizer.estimation.prior_terms import terms_at
@@ -41,3 +44,16 @@ def may_face(frame: Inliers, modes: list[Mode], state: Array, covariance: Array)
             if denied and unlikely + worse < (found.evidence if found else RULED_OUT):
                 found = Mirror(step_between(state, there), unlikely + worse, covered=near)
     return found
+
+
+def pieces_of(frame: Inliers, modes: list[Mode], least: float) -> list[Mode]:
+    """Pieces of a speed's Gaussians along the lean, while their evidence is within ``least``."""
+    best = min(modes, key=lambda mode: mode.cost)
+    terms, pieces = terms_at(frame.terms, best.speed, frame.assumed.turn is not None), list[Mode]()
+    points = frame.observations.points
+    for window in windows(points, frame.inliers, best.state, best.covariance):
+        piece = frame.mode(window.state, window.times(terms), best.speed)
+        pieces.append(replace(piece, evidence=piece.evidence - OVERLAP))
+        if piece.evidence < max(one.evidence for one in pieces) - least:
+            break
+    return pieces

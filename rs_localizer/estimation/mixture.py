@@ -25,8 +25,8 @@ from rs_localizer.estimation.averaging import (
 )
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.curvature import along_arcs
-from rs_localizer.estimation.doubt import may_face
-from rs_localizer.estimation.face_on import OVERLAP, reaching, windows
+from rs_localizer.estimation.doubt import may_face, pieces_of
+from rs_localizer.estimation.face_on import reaching
 from rs_localizer.estimation.linear import foreseen
 from rs_localizer.estimation.medians import median_depth
 from rs_localizer.estimation.mirror import farthest, mirrored
@@ -288,17 +288,5 @@ def _in_pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
     for speed, support in supports.items():
         here = [mode for mode in modes if mode.speed == speed]
         counts = support > max(supports.values()) - _HARDLY_COUNTS
-        pieces += (_pieces(frame, here) if counts else []) or here
-    return pieces
-
-
-def _pieces(frame: Inliers, modes: list[Mode]) -> list[Mode]:
-    best = min(modes, key=lambda mode: mode.cost)
-    terms, pieces = terms_at(frame.terms, best.speed, frame.assumed.turn is not None), list[Mode]()
-    points = frame.observations.points
-    for window in windows(points, frame.inliers, best.state, best.covariance):
-        piece = frame.mode(window.state, window.times(terms), best.speed)
-        pieces.append(replace(piece, evidence=piece.evidence - OVERLAP))
-        if piece.evidence < max(one.evidence for one in pieces) - _FAR_LESS_PROBABLE:
-            break
+        pieces += (pieces_of(frame, here, _FAR_LESS_PROBABLE) if counts else []) or here
     return pieces
