@@ -49,7 +49,8 @@ def may_face(frame: Inliers, modes: list[Mode], state: Array, covariance: Array)
 def pieces_of(frame: Inliers, modes: list[Mode], least: float) -> list[Mode]:
     """Pieces of a speed's Gaussians along the lean, while their evidence is within ``least``."""
     best = min(modes, key=lambda mode: mode.cost)
-    terms, pieces = terms_at(frame.terms, best.speed, frame.assumed.turn is not None), list[Mode]()
+    terms = terms_at(frame.terms, best.speed, frame.assumed.turn is not None)
+    pieces: list[Mode] = []
     points = frame.observations.points
     for window in windows(points, frame.inliers, best.state, best.covariance):
         piece = frame.mode(window.state, window.times(terms), best.speed)
