@@ -66,6 +66,8 @@ class Posterior:
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
     mirror: Mirror | None = None
+    # Likewise the pose of a plane that faces the camera; covered: it is no other one
+    facing: Mirror | None = None
     shake: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     agreement: float = 0.0  # of neighbouring rows, standard deviations

@@ -25,8 +25,9 @@ from rs_localizer.estimation.averaging import alike, volume_of
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.mirror import CLEARLY_WORSE, mirrored
-from rs_localizer.estimation.mixture import DISTRUST, Inliers, weighed
+from rs_localizer.estimation.mixture import weighed
 from rs_localizer.estimation.model_error import Examined
+from rs_localizer.estimation.modes import DISTRUST, Inliers
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside

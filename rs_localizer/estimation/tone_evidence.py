@@ -10,7 +10,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import columns_of, with_prior
 from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
-from rs_localizer.estimation.mixture import Inliers
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.spectrum import CYCLES, spectrum

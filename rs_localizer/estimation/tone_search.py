@@ -15,8 +15,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.estimation.assumptions import SHAKE_PRIOR
-from rs_localizer.estimation.mixture import Inliers
 from rs_localizer.estimation.model_error import Examined
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.shaking import agreement_of
 from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, spread_by_tones

@@ -49,7 +49,7 @@ REASONS: dict[str, Meaning] = {
         "the motion would be faster than a camera moves", f"mostly chance matches; {_TURNED}"
     ),
     Reason.MIRRORED: Meaning(
-        "points on a plane fit two poses, mirrored on it, alike",
+        "points on a plane fit two poses alike: mirrored on it, or leaning and facing the camera",
         "come nearer, look from an angle, use a larger board or markers on several walls",
     ),
     Reason.MODEL_ERROR: Meaning(

@@ -136,6 +136,13 @@ def test_a_mirrored_pose_that_fits_as_well(good, turn, covered, expected):
     assert reason(observations, doubtful) is expected
 
 
+@pytest.mark.parametrize(("covered", "expected"), [(False, Reason.MIRRORED), (True, None)])
+def test_a_plane_that_may_face_the_camera(good, covered, expected):
+    observations, posterior = good
+    doubtful = replace(posterior, facing=Mirror(np.full(18, 0.1), 9.0, covered))
+    assert reason(observations, doubtful) is expected
+
+
 def test_an_orientation_that_is_hardly_known(scene):
     camera, _, points, _, measured = scene.frame(noise=0.3, count=40)
     found = Localizer(camera).localize(points, measured)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2, norm
 
 from rs_localizer.core.state import step_between
-from rs_localizer.estimation.mixture import Inliers
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.settling import settle

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.columns import Columns
-from rs_localizer.estimation.mixture import Inliers
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.settling import settle
