@@ -86,6 +86,10 @@ class Localizer:
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
+        # And before a plane whose points agree with nothing.
+        flat = points * (2.0 / points @ [0.1, 0.0, 1.0])[:, None]
+        strewn = np.random.default_rng(1).normal(size=(count, 2))
+        self.localize(flat, pixels + 4.0 * self.config.inlier_threshold * strewn)
         # And beside the turn that a gyroscope knows, of which the delay is in doubt.
         tau = np.linspace(-0.7, 0.7, 29)
         rates = 0.1 * np.column_stack([np.sin(20.0 * tau)] * 3)

@@ -12,12 +12,14 @@ iterated update). A gyroscope takes the place of the motion model's rotation whe
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
@@ -26,7 +28,7 @@ from rs_localizer.estimation.motion_model import (
     FADING,
     acceleration_covariance,
     predict,
-    surprise_of,
+    surprises_of,
     unshaken,
     with_mean_turn,
 )
@@ -46,8 +48,10 @@ _MOST_FAILURES = 5
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
 # How fast surprises change the accelerations that are expected (exponent), and how much at most.
-_LEARNING = 0.2
+_LEARNING = 0.5
 _MOST_JOLTS = 1e4
+# Logarithm of the odds for shaking within frames, for each of the jolts' between them.
+_SHAKEN = 3.0
 # What a gyroscope knows.
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 # Of a motion that is but a first guess.
@@ -64,7 +68,7 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     experience: Experience  # with shaking, map and lens
-    jolts: float  # how many times the configured accelerations, squared
+    jolts: Array  # (2,) how many times the configured accelerations, squared: angular, linear
     failures: int = 0  # frames without a pose since then
 
 
@@ -92,6 +96,10 @@ class Tracker:
         # A readout time that is far off makes wrong velocities per readout of those from frame to
         # frame: then each image speaks for itself, and the frames before give a first guess.
         self.trusts_readout_time = True
+        # s; velocities per readout say that much less of how far the camera goes.
+        self.readout_time_deviation = 0.0
+        # Then, logarithm of the odds for a global shutter, beside those of any.
+        self.of_rest = 0.0
         self._track: _Track | None = None
         readout_time = localizer.camera.readout_time
         self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
@@ -127,13 +135,17 @@ class Tracker:
         if track.estimate.turn is not None:
             motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
-        covariance += track.jolts * acceleration_covariance(acceleration, dt, readout_time)
+        covariance += acceleration_covariance(_jolted(acceleration, track.jolts), dt, readout_time)
         covariance += swing
+        if self.readout_time_deviation > 0.0:
+            share = self.readout_time_deviation / readout_time
+            way = share * dt / readout_time * np.r_[motion.angular_velocity, motion.linear_velocity]
+            covariance[:6, :6] += np.outer(way, way)
         try:
             return Prior(
                 motion=motion,
                 covariance=covariance,
-                of_shake_sizes=track.experience.of_shake_sizes,
+                of_shake_sizes=_shaken(track.experience.of_shake_sizes, track.jolts),
                 of_field_sizes=track.experience.of_field_sizes,
             )
         except ValueError:  # rounding errors are all that is left of the covariance
@@ -166,7 +178,8 @@ class Tracker:
             if prior is None:
                 prior = self.prediction(time_ns)
                 if prior is not None and not self.trusts_readout_time:
-                    prior = replace(prior, covariance=_UNKNOWN)
+                    rest = self.of_rest if turn is None else 0.0
+                    prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
                 prior = prior if turn is None else _beside(prior, turn)
             return self.localizer.find(points, pixels, scores, prior, share, turn), prior
 
@@ -196,7 +209,8 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
-        added += track.jolts * acceleration_covariance(self._beside_turn, dt, readout_time)
+        jolted = replace(self._beside_turn, linear=_jolted(self._beside_turn, track.jolts).linear)
+        added += acceleration_covariance(jolted, dt, readout_time)
         return Before(
             track.time_ns,
             motion,
@@ -226,7 +240,7 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
     """The track and its newest frame."""
     share = float(np.mean(found.inliers))
     if track is None or prior is None or prior.motion is None:
-        return _Track(found, time_ns, share, Experience.of(found), 1.0)
+        return _Track(found, time_ns, share, Experience.of(found), np.ones(2))
     if found.tracked:
         share = (1.0 - _NEWEST) * track.share + _NEWEST * share
     surprise = _surprise(prior, found)
@@ -235,17 +249,34 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
         time_ns,
         share,
         track.experience.and_of(found),
-        float(np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS)),
+        np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS),
     )
 
 
-def _surprise(prior: Prior, found: Estimate) -> float:
-    """How many times farther than predicted the motion has changed, squared."""
+def _surprise(prior: Prior, found: Estimate) -> Array:
+    """How many times farther than predicted the motion has changed, squared: turn and way (2,)."""
     assert prior.motion is not None
     assert prior.covariance is not None
     if np.isinf(prior.covariance.diagonal()).any():
-        return 1.0  # a first guess surprises nobody
+        return np.ones(2)  # a first guess surprises nobody
     motion, origin = found.beside_turn(), np.zeros(3)
     step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
     joint = np.ascontiguousarray(found.joint_covariance)
-    return surprise_of(step, np.ascontiguousarray(prior.covariance), joint)
+    surprises: Array = surprises_of(step, np.ascontiguousarray(prior.covariance), joint)
+    return surprises
+
+
+def _shaken(of_sizes: Array, jolts: Array) -> Array:
+    """Logarithms of the odds of sizes (k,) of shaking, with what the turns between frames say.
+
+    A camera whose turns keep surprising changes them faster than frames follow each other, and so
+    within them: by any size but the least.
+    """
+    odds = of_sizes + _SHAKEN * math.log(jolts[0])
+    odds[:1] = of_sizes[:1]
+    return odds
+
+
+def _jolted(acceleration: Acceleration, jolts: Array) -> Acceleration:
+    angular, linear = np.sqrt(jolts).tolist()
+    return Acceleration(angular * acceleration.angular, linear * acceleration.linear)

@@ -202,8 +202,9 @@ def test_covariance_covers_the_error():
             ]
         )
         distances.append(error @ np.linalg.solve(result.covariance, error))
-    # Median 11.34, less by what a map may be wrong, which deviations allow for (a sixth at 0.5 px).
-    assert 8.4 < np.median(distances) < 14.5
+    # Median 11.34, less by what a map may be wrong, which deviations allow for (a sixth at 0.5 px),
+    # and by tones that noise hides.
+    assert 7.5 < np.median(distances) < 14.5
     assert np.mean(np.array(distances) < 21.03) > 0.85
 
 

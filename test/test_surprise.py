@@ -10,7 +10,7 @@ import rs_localizer as rsl
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.tracking import _followed, _surprise, _Track
+from rs_localizer.tracking import _followed, _shaken, _surprise, _Track
 
 # Radians, metres, per readout and per readout squared.
 UNITS = np.repeat([1e-2, 3e-2, 1e-3, 2e-3, 1e-4, 3e-4], 3)
@@ -85,33 +85,55 @@ def test_a_frame_that_decides_nothing_does_not_surprise():
     spread = covariance(np.random.default_rng(1))
     assert _surprise(predicted(spread), at(np.zeros(18), spread)) == pytest.approx(0.0, abs=1e-9)
     # Rounding errors are not divided by the nothing that was expected.
-    assert _surprise(predicted(spread), at(1e-6 * UNITS, spread)) < 1e-6
+    assert np.all(_surprise(predicted(spread), at(1e-6 * UNITS, spread)) < 1e-6)
 
 
-def followed(times_deviation, tracked=True, jolts=1.0):
+TURN = np.r_[0:3, 6:9, 12:15]
+WAY = TURN + 3
+
+
+def followed(times_deviation, tracked=True, jolts=1.0, of=None):
     spread = covariance(np.random.default_rng(2))
     first = at(np.zeros(18), 0.01 * spread)
-    step = times_deviation * np.sqrt(18.0) * np.linalg.cholesky(spread)[:, 0]
+    step = np.zeros(18)
+    for part in (TURN, WAY) if of is None else (of,):
+        along = np.linalg.cholesky(spread[np.ix_(part, part)])[:, 0]
+        step[part] = times_deviation * np.sqrt(9.0) * along
     found = replace(at(step, 0.01 * spread), tracked=tracked,
                     inliers=np.array([True, False, False, False, False]))  # fmt: skip
-    track = _Track(first, 0, 1.0, Experience.of(first), jolts)
+    track = _Track(first, 0, 1.0, Experience.of(first), jolts * np.ones(2))
     return _followed(track, predicted(spread), found, 5)
 
 
 def test_surprises_raise_what_is_expected_and_calm_lowers_it():
-    assert followed(1.0).jolts == pytest.approx(1.0, abs=0.01)
-    assert followed(10.0).jolts == pytest.approx(100**0.2, rel=0.02)
-    assert followed(0.1, jolts=8.0).jolts == pytest.approx(8.0 * 0.01**0.2, rel=0.02)
+    assert followed(1.0).jolts == pytest.approx([1.0, 1.0], abs=0.01)
+    assert followed(10.0).jolts == pytest.approx([10.0, 10.0], rel=0.02)
+    assert followed(0.1, jolts=20.0).jolts == pytest.approx([2.0, 2.0], rel=0.02)
     # Never below what the configuration says, nor without bound.
-    assert followed(0.0).jolts == 1.0
-    assert followed(100.0, jolts=9e3).jolts == 1e4
+    assert followed(0.0).jolts == pytest.approx([1.0, 1.0])
+    assert followed(100.0, jolts=9e3).jolts == pytest.approx([1e4, 1e4])
+
+
+@pytest.mark.parametrize(("of", "raised"), [(TURN, 0), (WAY, 1)])
+def test_turns_and_moves_surprise_apart(of, raised):
+    jolts = followed(10.0, of=of).jolts
+    assert jolts[raised] == pytest.approx(10.0, rel=0.02)
+    assert jolts[1 - raised] == 1.0
+
+
+def test_turns_that_surprise_speak_for_shaking_of_any_size():
+    before = np.array([0.0, -1.0, -20.0])
+    np.testing.assert_array_equal(_shaken(before, np.array([1.0, 50.0])), before)
+    odds = _shaken(before, np.array([5.0, 1.0])) - before
+    assert odds[0] == 0.0
+    assert np.all(odds[1:] > np.log(100.0))
 
 
 def test_a_first_frame_is_taken_as_it_is():
     found = at(np.zeros(18), np.eye(18))
     track = _followed(None, None, found, 7)
     np.testing.assert_array_equal(track.experience.of_field_sizes, found.of_field_sizes)
-    assert (track.time_ns, track.share, track.jolts) == (7, 1.0, 1.0)
+    assert (track.time_ns, track.share, *track.jolts) == (7, 1.0, 1.0, 1.0)
 
 
 def test_the_share_of_inliers_follows_tracked_frames_slowly():

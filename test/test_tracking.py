@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import step_between
+from rs_localizer.pipeline.moments import twist_at
 from rs_localizer.tracking import Tracker
 
 READOUT = 0.03
@@ -258,3 +259,34 @@ def test_with_a_readout_time_far_off_each_image_speaks_for_itself():
         differences.append([np.linalg.norm(x - alone) for x in (found.angular_velocity, believed)])
     by_doubt, by_trust = np.median(differences[1:], axis=0)
     assert by_doubt < 0.2 * by_trust
+
+
+def test_where_the_readout_time_is_in_doubt_so_is_how_far_the_camera_goes():
+    hand, tracker = Hand(), Tracker(rsl.Localizer(CAMERA))
+    tracker.localize(ns(0.0), *hand.frame(0.0, 150, noise=0.3))
+    sure = tracker.prediction(ns(0.04))
+    tracker.readout_time_deviation = 0.2 * CAMERA.readout_time
+    unsure = tracker.prediction(ns(0.04))
+    added = unsure.covariance - sure.covariance
+    turn = 0.2 * 0.04 / CAMERA.readout_time * sure.motion.angular_velocity
+    np.testing.assert_allclose(added[:3, :3], np.outer(turn, turn), atol=1e-12)
+    assert not added[6:].any()
+
+
+class Drone(Hand):
+    """The same, shaken by 0.1 deg at 20 Hz."""
+
+    def pose(self, t):
+        rotation, place = super().pose(t)
+        swing = np.radians(0.1) * np.sin(40.0 * np.pi * t) * np.array([0.6, 0.64, 0.48])
+        return rotation @ Rotation.from_rotvec(swing).as_matrix(), place
+
+
+def test_turn_rates_of_a_shaken_camera_are_covered():
+    drone, tracker, lengths = Drone(), Tracker(rsl.Localizer(CAMERA)), []
+    for t in times(20):
+        found = tracker.localize(ns(t), *drone.frame(t, 100, WALL, noise=0.1))
+        twist = twist_at(found, 0.0, READOUT)
+        off = twist.angular - drone.motion(t).angular_velocity / READOUT
+        lengths.append(off @ np.linalg.solve(twist.covariance[3:, 3:], off))
+    assert np.mean(np.array(lengths[3:]) < 7.8) > 0.85  # 95 % of three degrees of freedom

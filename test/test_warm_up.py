@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import rs_localizer as rsl
-from rs_localizer.estimation import mixture, settling, tone_evidence
+from rs_localizer.estimation import modes, settling, tone_evidence
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 
@@ -13,7 +13,7 @@ K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 def test_shaking_is_followed_once(direction, monkeypatch):
     """Its kernels are those that an ordinary frame does not need."""
     followed, gains, looked = [], [], []
-    follow, gain, look = settling.follow, mixture.gain_of_shaking, tone_evidence.spectrum
+    follow, gain, look = settling.follow, modes.gain_of_shaking, tone_evidence.spectrum
 
     def watched(*arguments):
         followed.append(follow(*arguments))
@@ -29,7 +29,7 @@ def test_shaking_is_followed_once(direction, monkeypatch):
 
     monkeypatch.setattr(settling, "follow", watched)
     monkeypatch.setattr(tone_evidence, "spectrum", listened)
-    monkeypatch.setattr(mixture, "gain_of_shaking", weighed)
+    monkeypatch.setattr(modes, "gain_of_shaking", weighed)
     camera = rsl.Camera(640, 480, K, readout_time=0.02, scan_direction=direction)
     rsl.Localizer(camera).warm_up()
     assert any(found is not None for found in followed)

@@ -11,7 +11,7 @@ from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.medians import median_depth, median_of
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.estimation.posterior import Mirror, Posterior
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
 _MOST_TURN = 1.5
@@ -90,6 +90,18 @@ def refusal(
             f"standard deviations, {posterior.noise:.2g} px): the camera vibrates faster than its "
             "rows can tell, or the scan direction is another one",
         )
+    if posterior.strangers:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"{posterior.strangers} points lie just beyond the gate of {found} inliers: the camera "
+            "vibrates, and these are too few to tell how",
+        )
+    if posterior.exhausted:
+        return Failure(
+            Reason.MODEL_ERROR,
+            f"the camera vibrates at several frequencies, and {found} inliers are too few to tell "
+            "whether these are all",
+        )
     if rolling and posterior.model_error > _MOST_MODEL_ERROR * threshold:
         return Failure(
             Reason.MODEL_ERROR,
@@ -116,17 +128,22 @@ def refusal(
             f"the camera would move by {travel:.3g} m per readout in front of points "
             f"{depth:.3g} m away",
         )
-    mirror = posterior.mirror
+    mirror, facing = posterior.mirror, posterior.facing
     if mirror is not None and mirror.turn > (
         _MOST_COVERED_TURN if mirror.covered else _MOST_MIRRORED_TURN
     ):
-        return Failure(
-            Reason.MIRRORED,
-            f"the points lie on a plane, and the pose mirrored on it, "
-            f"{math.degrees(mirror.turn):.0f} deg away, fits only {mirror.evidence:.1f} "
-            "sigma^2 worse",
-        )
+        return _not_ruled_out(mirror, "the pose mirrored on it")
+    if facing is not None and not facing.covered:
+        return _not_ruled_out(facing, "the pose that faces it")
     return None
+
+
+def _not_ruled_out(other: Mirror, name: str) -> Failure:
+    return Failure(
+        Reason.MIRRORED,
+        f"the points lie on a plane, and {name}, {math.degrees(other.turn):.0f} deg away, fits "
+        f"only {other.evidence:.1f} sigma^2 worse",
+    )
 
 
 def uncertain(estimate: Estimate, most: float) -> Failure | None:

@@ -64,6 +64,7 @@ class Assumed:
     of_field_sizes: Array
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
+    of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     turn: TurnSeen | None = None  # by a gyroscope
 
     def field_sizes(self, depth: float) -> Array:
@@ -100,10 +101,16 @@ def assumptions(
 
 
 def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None) -> Assumed:
-    """The assumptions and what gyroscope and earlier frames say of turn, shaking, model error."""
+    """The assumptions and what gyroscope and earlier frames say of turn, rest, shaking, model
+    error.
+    """
     if turn is not None:
         assumed = replace(assumed, turn=turn)
-    if prior is None or prior.of_shake_sizes is None or prior.of_field_sizes is None:
+    if prior is None:
+        return assumed
+    if prior.of_rest != 0.0:
+        assumed = replace(assumed, of_rest=prior.of_rest)
+    if prior.of_shake_sizes is None or prior.of_field_sizes is None:
         return assumed
     return replace(
         assumed, of_shake_sizes=prior.of_shake_sizes, of_field_sizes=prior.of_field_sizes

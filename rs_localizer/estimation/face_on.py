@@ -18,7 +18,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import PARAMETERS, TURN, step_between
-from rs_localizer.estimation.mirror import mirrored
+from rs_localizer.estimation.mirror import facing, mirrored
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import apply_step
 
@@ -31,6 +31,19 @@ _PIECES = 5
 _WIDTH = 0.8
 OVERLAP = math.log(_WIDTH * math.sqrt(2.0 * math.pi))
 """Logarithm of the sum of the windows."""
+
+
+# Variances by which the pose that faces the camera must fit worse to be ruled out (once in 20,000).
+RULED_OUT = 20.0
+DENIED = 2.0
+"""So many times more squared deviations than the fit has: a Gaussian denies that pose."""
+NEARBY = 0.14
+"""So near (rad) the pose that faces the camera is no other one."""
+# Squared deviations within which the covariance speaks for it; what is known better than this (rad)
+# leaves no doubt.
+_WITHIN, _LEAST_SPREAD_OF_DOUBT = 1.0, 0.015
+# rad^-2: it holds a lean, whatever the points say.
+_HOLDING = 1e8
 
 
 class Window(NamedTuple):
@@ -73,3 +86,44 @@ def windows(points: Array, inliers: BoolArray, state: Array, covariance: Array) 
     information[TURN, TURN] = np.outer(axis, axis) / (_WIDTH * angle / (_PIECES - 1)) ** 2
     parts = np.linspace(0.0, 1.0, _PIECES)
     return [Window(apply_step(state, part * step), information) for part in parts]
+
+
+def held_facing(
+    points: Array, inliers: BoolArray, state: Array, covariance: Array
+) -> Window | None:
+    """A window that holds a plane so that it faces the camera; the arguments are as before.
+
+    None where it does so anyway, leans clearly, or the covariance speaks for it: what is ruled out,
+    or in, at a glance takes no fit.
+    """
+    if np.trace(covariance[TURN, TURN]) < _LEAST_SPREAD_OF_DOUBT**2:
+        return None
+    towards = facing(points, inliers, state)
+    if towards is None:
+        return None
+    turn = step_between(state, towards)[TURN]
+    lean = float(np.linalg.norm(turn))
+    if lean > _MOST_LEAN or turn @ np.linalg.solve(covariance[TURN, TURN], turn) < _WITHIN:
+        return None
+    information = np.zeros((PARAMETERS, PARAMETERS))
+    information[TURN, TURN] = _HOLDING / lean**2 * np.outer(turn, turn)
+    return Window(towards, information)
+
+
+def squared_deviations(covariance: Array, step: Array) -> float:
+    """Of the pose of a step (n,), by a covariance (n,n)."""
+    pose = slice(0, 6)
+    return float(step[pose] @ np.linalg.solve(covariance[pose, pose], step[pose]))
+
+
+def reaching(covariance: Array, step: Array, squares: float) -> Array:
+    """The least wider covariance (n,n) of which a step is so many squared deviations, or less.
+
+    What noise makes of a plane that faces the camera is a lean whose own Gaussian is thin: the
+    square of the lean is told, to the same deviation at any lean, so that the plane faces the
+    camera at half as many deviations as that Gaussian has it. Only the pose is looked at.
+    """
+    squared = squared_deviations(covariance, step)
+    if not squared > squares:
+        return covariance
+    return covariance + (1.0 / squares - 1.0 / squared) * np.outer(step, step)

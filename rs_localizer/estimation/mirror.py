@@ -30,12 +30,21 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
 
     None if the points (n,3) that count are no plane, or face the camera.
     """
-    found, other = _mirrored(points, inliers, state)
+    found, other = _leaning_less(points, inliers, state, 2.0)
+    return other if found else None
+
+
+def facing(points: Array, inliers: BoolArray, state: Array) -> Array | None:
+    """The state (24,) half-way to the mirrored one, whose plane faces the camera; None as there."""
+    found, other = _leaning_less(points, inliers, state, 1.0)
     return other if found else None
 
 
 @kernel
-def _mirrored(points: Array, inliers: BoolArray, state: Array) -> tuple[bool, Array]:
+def _leaning_less(
+    points: Array, inliers: BoolArray, state: Array, leans: float
+) -> tuple[bool, Array]:
+    """Whether there is a state whose view of the plane leans by so many times its lean less."""
     plane, centre, axis_of_plane = _plane(points, inliers)
     if not plane:
         return False, state
@@ -54,7 +63,7 @@ def _mirrored(points: Array, inliers: BoolArray, state: Array) -> tuple[bool, Ar
     lean = np.arcsin(min(length, 1.0))
     if lean < _LEAST_LEAN:
         return False, state
-    flip = so3.exp(-2.0 * lean / length * axis)
+    flip = so3.exp(-leans * lean / length * axis)
     other = state.copy()
     for i in range(3):
         other[9 + i] = seen[i]

@@ -196,7 +196,7 @@ def with_mean_turn(motion: Motion, covariance: Array, turn: KnownTurn) -> tuple[
 
 
 @kernel
-def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
+def surprises_of(step: Array, covariance: Array, posterior: Array) -> Array:
     """How many times farther than predicted a motion has changed, squared; 1 is as predicted.
 
     The squared step from the prediction to the estimate, in standard deviations of the prediction,
@@ -207,14 +207,32 @@ def surprise_of(step: Array, covariance: Array, posterior: Array) -> float:
         step: (18,).
         covariance: (18,18) of the prediction.
         posterior: (18 + k,18 + k) of the estimate, and of what it has beside the motion.
+
+    Returns:
+        (2,) of all that turns, and of all that moves.
     """
-    information = inverted(covariance)
-    squared, expected = 0.0, float(PARAMETERS)
-    for i in range(PARAMETERS):
-        for j in range(PARAMETERS):
-            squared += step[i] * information[i, j] * step[j]
-            expected -= information[i, j] * posterior[i, j]
-    return squared / max(abs(expected), 1.0)
+    half = PARAMETERS // 2
+    surprises, predicted = np.empty(2), np.empty((half, half))
+    for part in range(2):
+        for i in range(half):
+            for j in range(half):
+                predicted[i, j] = covariance[_place_of(i, part), _place_of(j, part)]
+        information = inverted(predicted)
+        squared, expected = 0.0, float(half)
+        for i in range(half):
+            for j in range(half):
+                row, column = _place_of(i, part), _place_of(j, part)
+                squared += step[row] * information[i, j] * step[column]
+                expected -= information[i, j] * posterior[row, column]
+        surprises[part] = squared / max(abs(expected), 1.0)
+    return surprises
+
+
+@kernel
+def _place_of(i: int, part: int) -> int:
+    """Where a step has the i-th number of what turns (0) or moves (1)."""
+    place: int = 6 * (i // 3) + 3 * part + i % 3
+    return place
 
 
 def warm_up() -> None:
@@ -224,4 +242,4 @@ def warm_up() -> None:
     predict(still, identity, 1.0, 1.0)
     acceleration_covariance(Acceleration(1.0, 1.0), 1.0, 1.0)
     _unshaken(numbers_of(still), np.zeros((0, 3)), identity, *shake_in_the_middle(0))
-    surprise_of(np.zeros(PARAMETERS), identity, identity)
+    surprises_of(np.zeros(PARAMETERS), identity, identity)

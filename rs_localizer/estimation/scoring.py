@@ -13,6 +13,8 @@ from rs_localizer.estimation.residuals import truncated_cost
 
 # Of local optimisation, at the last scale.
 _ITERATIONS = 3
+# Steps of a descent: at its first scale, where it has far to go, and at each of the others.
+_FIRST_STEPS, _STEPS, _RATIO = 20, 3, 0.6
 # Gain, in noise variances, below which another step is not worth its time.
 _TOLERANCE = 1.0
 
@@ -91,3 +93,29 @@ def optimize(
         if cost < best_cost:
             best, best_cost = state, cost
     return best, best_cost
+
+
+@kernel
+def descend(
+    data: Array,
+    start: Array,
+    gradient: Array,
+    first_scale: float,
+    last_scale: float,
+    prior: PriorTerms,
+    noise: float,
+) -> tuple[Array, float]:
+    """As :func:`optimize`, of one state, with steps that are tried before they are taken.
+
+    It takes ten times as long and comes through where pose and motion are hard to tell apart.
+    """
+    state, scale, iterations = start, first_scale, _FIRST_STEPS
+    while scale > last_scale:
+        state, _, _, _ = refine(
+            data, state, gradient, scale, 1.0, prior, noise, 1, iterations, _TOLERANCE
+        )
+        scale, iterations = _RATIO * scale, _STEPS
+    state, _, _, _ = refine(
+        data, state, gradient, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE
+    )
+    return state, truncated_cost(data, state, gradient, last_scale, np.inf)

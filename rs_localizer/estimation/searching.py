@@ -8,13 +8,14 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import at_rest, rotation_of
+from rs_localizer.estimation.mirror import facing
 from rs_localizer.estimation.observing import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
 from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses, search
 from rs_localizer.estimation.refine import EXPECTED_NOISE
 from rs_localizer.estimation.sampling import Pool
-from rs_localizer.estimation.scoring import optimize
+from rs_localizer.estimation.scoring import descend, optimize
 from rs_localizer.solvers.table import Solver, find_solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -147,6 +148,7 @@ class MotionSearch:
         if before is None:
             scale = _POOL_SCALE * self._focal_length
             before = self.optimize(observed, start.state, scale, observed.terms)
+            before = self._facing(observed, start, near, before)
         hypotheses = self._hypotheses(
             self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, observed.terms
         )
@@ -154,6 +156,29 @@ class MotionSearch:
         pools = [Pool(near), *_pools(observed, np.arange(len(observed.observations)))]
         draws = Draws(rotations, pools, self._config.confidence, most, observed.random)
         return search(observed.observations, hypotheses, draws, before)
+
+    def _facing(
+        self, observed: Observed, start: Candidate, near: IntArray, found: Candidate
+    ) -> Candidate:
+        """A motion before a plane that faces the camera, where the start's own led nowhere.
+
+        Turning and moving stretch and shear the image of a plane, so that the global-shutter pose
+        leans by tens of degrees; from there the way leads to other leans, and samples of six noisy
+        points tell leaning from moving no better.
+        """
+        if np.count_nonzero(self._inliers(observed, found)[near]) >= _SAME_GROUP * len(near):
+            return found
+        observations, threshold = observed.observations, self._config.inlier_threshold
+        among = np.ones(len(near), dtype=np.bool_)
+        towards = facing(observations.points[near], among, start.state)
+        if towards is None:
+            return found
+        state, cost = descend(
+            observations.packed, towards, observations.row_time_gradient,
+            _POOL_SCALE * self._focal_length, threshold, observed.terms,
+            EXPECTED_NOISE * threshold,
+        )  # fmt: skip
+        return Candidate(state, cost) if cost < found.cost else found
 
     def _hypotheses(
         self,

@@ -25,15 +25,16 @@ from rs_localizer.estimation.averaging import alike, volume_of
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.mirror import CLEARLY_WORSE, mirrored
-from rs_localizer.estimation.mixture import DISTRUST, Inliers, weighed
+from rs_localizer.estimation.mixture import weighed
 from rs_localizer.estimation.model_error import Examined
+from rs_localizer.estimation.modes import DISTRUST, Inliers
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import PriorTerms, held_beside
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.shaking import AGREEMENT, DEGREES, Scales, follow
 from rs_localizer.estimation.tone_mixture import ToneMixture, averaged
-from rs_localizer.estimation.tone_search import find_tones
+from rs_localizer.estimation.tone_search import FEW, find_tones, strangers_of
 
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part.
@@ -51,6 +52,8 @@ _ENOUGH_POINTS = 2 * 3 * (DEGREES[-1] - 1)
 # More points than this only take time.
 _MOST_POINTS = 2500
 _MOST_SHARED = 0.9  # correlation of neighbours
+# Beside few inliers: so many points just beyond the gate, and such a part of them, are no chance.
+_STRANGERS, _PART = 4, 0.2
 
 
 def settle(
@@ -72,7 +75,9 @@ def settle(
     """
     every = -(-len(observations) // _MOST_POINTS)
     if every <= 1:
-        return _settled(observations, start, terms, threshold, assumed)
+        found = _settled(observations, start, terms, threshold, assumed)
+        shakes = assumed.rolling and assumed.turn is None
+        return replace(found, strangers=_strangers(found, threshold)) if shakes else found
     found = _settled(observations.thinned(every), start, terms, threshold, assumed)
     gate = np.sqrt(found.squared_errors[found.inliers].max(initial=0.0))
     errors = observations.squared_errors(found.state)
@@ -111,7 +116,9 @@ def _settled(
     may_shake = assumed.rolling and not mirrored_fits
     # A gyroscope sees tones; what it leaves of them tells the offset of its stamps.
     may_be_tonal = may_shake and assumed.turn is None
-    tones = find_tones(frame, best, examined, threshold) if may_be_tonal else None
+    tones, frame.unheard = (
+        find_tones(frame, best, examined, threshold) if may_be_tonal else (None, None)
+    )
     toned = _toned(best, sizes, tones) if tones and tones.certain else None
     if tones and toned and tones.tonal and toned.agreement < AGREEMENT:
         return toned
@@ -144,9 +151,19 @@ def _settled(
     if not planar:
         frame.linear = best.state, examined.columns
     turn_known = assumed.turn is not None
-    if planar or (assumed.may_rest and not _clearly_moving(found, terms, turn_known)):
+    still = assumed.of_rest > 0.0 or not _clearly_moving(found, terms, turn_known)
+    if planar or (assumed.may_rest and still):
         found = weighed(frame, found, planar)
+    elif frame.unheard is not None:
+        found.covariance[:PARAMETERS, :PARAMETERS] += frame.unheard
     return averaged(tones, found) if tones else found
+
+
+def _strangers(found: Posterior, threshold: float) -> int:
+    """Points that few inliers swing by, and no shaking explains; 0 where they may be chance."""
+    inliers = np.count_nonzero(found.inliers)
+    strangers = strangers_of(found.squared_errors, found.inliers, threshold)
+    return strangers if inliers < FEW and strangers >= max(_STRANGERS, _PART * inliers) else 0
 
 
 def _seems_to_shake(frame: Inliers, best: Posterior, examined: Examined) -> bool:
@@ -211,6 +228,7 @@ def _toned(best: Posterior, sizes: Sizes, tones: ToneMixture) -> Posterior:
     return replace(
         found,
         covariance=found.covariance / worth,
+        exhausted=tones.exhausted,
         of_shake_sizes=sizes.of_shake_sizes,
         of_field_sizes=sizes.of_field_sizes,
     )

@@ -14,10 +14,11 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.tones import MOST_CYCLES
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
-from rs_localizer.estimation.refine import LEAST_NOISE
+from rs_localizer.estimation.refine import LEAST_NOISE, inverted
 
 # What is slower, polynomials of low degree follow. A readout tells tones apart that differ by one.
 CYCLES = np.arange(1.0, MOST_CYCLES + 0.1, 0.25)
@@ -30,6 +31,8 @@ _BINS = 96
 _ANGLES = 2.0 * math.pi * np.outer(CYCLES, (np.arange(_BINS) + 0.5) / _BINS - 0.5)
 _WAVES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _LITTLE = 1e-300
+_HARDLY = 1e-3  # of the probability, which may be left out
+_RATE = ANGULAR.start  # where angular velocities are among the parameters; turns are the first
 
 
 @kernel
@@ -94,7 +97,72 @@ def spectrum(
         freedom: degrees of freedom of the errors beside the motion.
         noise: px, a first estimate.
     """
-    # What turns at a row have in common with these columns, turns and errors there.
+    base = columns.shape[2]
+    shared = _shared_by_rows(errors, columns, by_turn, tau, chosen)
+    size = base + _TONE
+    products, right = np.zeros((size, size)), np.zeros(size)
+    products[:base, :base] = known.products
+    right[:base] = known.with_errors
+    evidence = np.empty((len(CYCLES), len(SWINGS)))
+    for m in range(len(CYCLES)):
+        _with_tone(shared, m, base, products, right)
+        left = project_out(products, right, known.squared_errors, _TONE)
+        evidence[m], _ = evidence_of_sizes(left, SWINGS, freedom, noise)
+    return evidence
+
+
+@kernel
+def spread_by_tones(
+    errors: Array, columns: Array, by_turn: Array, tau: Array, chosen: BoolArray,
+    covariance: Array, noise: float, evidence: Array,
+) -> Array:  # fmt: skip
+    """What a tone, if there is one, adds to the covariance (18,18) of the motion that is the best
+    without one: second moments of the step to the middle row of the motion with it.
+
+    Args:
+        errors, columns, by_turn, tau, chosen: as of :func:`spectrum`; columns of the motion alone.
+        covariance: (18,18) of the motion without a tone.
+        noise: px.
+        evidence: (m,s) of all frequencies and sizes.
+    """
+    probabilities = np.exp(evidence - np.max(evidence[:, 1:]))
+    probabilities[:, 0] = 0.0
+    probabilities /= probabilities.sum()
+    shared = _shared_by_rows(errors, columns, by_turn, tau, chosen)
+    base, variance = columns.shape[2], noise * noise
+    size = base + _TONE
+    products, right = np.zeros((size, size)), np.zeros(size)
+    added = np.zeros((base, base))
+    for m in range(len(CYCLES)):
+        if probabilities[m].max() < _HARDLY:
+            continue
+        _with_tone(shared, m, base, products, right)
+        along = np.ascontiguousarray(products[base:, :base])
+        pulled = along @ covariance / variance
+        beside = products[base:, base:] - pulled @ along.T
+        moments = np.zeros((_TONE, _TONE))
+        for k in range(1, len(SWINGS)):
+            if probabilities[m, k] < _HARDLY:
+                continue
+            known = beside.copy()
+            for i in range(_TONE):
+                known[i, i] += variance / SWINGS[k] ** 2
+            inverse = inverted(known)
+            swings = inverse @ right[base:]
+            moments += probabilities[m, k] * (np.outer(swings, swings) + variance * inverse)
+        way = -pulled
+        for axis in range(3):
+            way[axis, axis] += 1.0
+            way[3 + axis, _RATE + axis] += 2.0 * math.pi * CYCLES[m]
+        added += way.T @ moments @ way
+    return added
+
+
+@kernel
+def _shared_by_rows(
+    errors: Array, columns: Array, by_turn: Array, tau: Array, chosen: BoolArray
+) -> Array:
+    """What turns at a row have in common with the columns, turns and errors there: (bins,3,p+4)."""
     base = columns.shape[2]
     shared = np.zeros((_BINS, 3, base + 4))
     for i in range(len(errors)):
@@ -108,16 +176,7 @@ def spectrum(
                     for other in range(3):
                         at[axis, base + other] += turn * by_turn[i, line, other]
                     at[axis, base + 3] += turn * errors[i, line]
-    size = base + _TONE
-    products, right = np.zeros((size, size)), np.zeros(size)
-    products[:base, :base] = known.products
-    right[:base] = known.with_errors
-    evidence = np.empty((len(CYCLES), len(SWINGS)))
-    for m in range(len(CYCLES)):
-        _with_tone(shared, m, base, products, right)
-        left = project_out(products, right, known.squared_errors, _TONE)
-        evidence[m], _ = evidence_of_sizes(left, SWINGS, freedom, noise)
-    return evidence
+    return shared
 
 
 @kernel

@@ -10,7 +10,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import columns_of, with_prior
 from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
-from rs_localizer.estimation.mixture import Inliers
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.spectrum import CYCLES, spectrum
@@ -26,7 +26,7 @@ _OUTLIERS = 0.1  # what part of the points may be wrong, a priori
 
 def spectrum_of(frame: Inliers, tones: Tones, seen: Seen, chosen: BoolArray, noise: float) -> Array:
     """Evidence (m,s) of one tone more."""
-    known, _ = products_of(tones, seen, chosen, frame.terms, noise)
+    known, *_ = products_of(tones, seen, chosen, frame.terms, noise)
     freedom = max(2.0 * np.count_nonzero(chosen) - 6.0, 1.0)
     found: Array = spectrum(
         seen.errors, seen.columns, seen.by_turn, seen.tau, chosen, known, freedom, noise
@@ -36,9 +36,19 @@ def spectrum_of(frame: Inliers, tones: Tones, seen: Seen, chosen: BoolArray, noi
 
 def odds_of(frame: Inliers, evidence: Array) -> float:
     """Logarithm of the odds that there is a tone, of any frequency and size."""
-    tonal = max(_TONAL * (1.0 - float(frame.shake_prior[0])), _LEAST_PROBABLE)
     likelihood = float(np.logaddexp.reduce(evidence[:, 1:], axis=None) - evidence[0, 0])
-    return likelihood - math.log(evidence[:, 1:].size) + math.log(tonal / (1.0 - tonal))
+    return likelihood - math.log(evidence[:, 1:].size) + prior_odds(frame)
+
+
+def prior_odds(frame: Inliers) -> float:
+    """Logarithm of the odds that there is a tone, before the points are asked."""
+    return tonal_odds(float(frame.shake_prior[0]))
+
+
+def tonal_odds(no_shake: float) -> float:
+    """Logarithm of the odds of a tone where no shaking is as probable as this."""
+    tonal = max(_TONAL * (1.0 - no_shake), _LEAST_PROBABLE)
+    return math.log(tonal / (1.0 - tonal))
 
 
 def gain_of_field(

@@ -15,8 +15,8 @@ from rs_localizer.estimation.tones import Fit
 
 CERTAIN = 0.98
 """Probability from which on nothing else counts."""
-# More tones than these may be any shaking.
-_FEW_TONES = 2
+FEW_TONES = 2
+"""More than these may be any shaking."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +27,7 @@ class ToneMixture:
     probabilities: Array  # of each
     none: float  # probability that it is none of them
     agreement: float  # of neighbouring rows beside the most probable one
+    exhausted: bool  # whether further tones are likely, and the points too few to tell them
 
     @property
     def certain(self) -> bool:
@@ -36,12 +37,17 @@ class ToneMixture:
     @property
     def tonal(self) -> bool:
         """Whether so few tones explain the frame that it can be nothing else."""
-        return len(self.best.tones.cycles) <= _FEW_TONES
+        return len(self.best.tones.cycles) <= FEW_TONES
 
     @property
     def best(self) -> Fit:
         """The most probable one."""
         return self.fits[int(np.argmax(self.probabilities))]
+
+
+def room_for_more(fit: Fit) -> bool:
+    """Whether there would be as many points as parameters with one tone more."""
+    return len(fit.covariance) + 7 <= int(np.count_nonzero(fit.inliers))
 
 
 class _Mode(NamedTuple):

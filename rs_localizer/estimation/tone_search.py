@@ -9,33 +9,51 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.estimation.mixture import Inliers
+from rs_localizer.estimation.assumptions import SHAKE_PRIOR
 from rs_localizer.estimation.model_error import Examined
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.shaking import agreement_of
-from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest
+from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, spread_by_tones
 from rs_localizer.estimation.tone_evidence import (
     NEAR,
     evidence_of,
     evidence_of_none,
     gain_of_field,
     odds_of,
+    prior_odds,
     spectrum_of,
+    tonal_odds,
 )
-from rs_localizer.estimation.tone_mixture import CERTAIN, ToneMixture
-from rs_localizer.estimation.tones import FEWEST, Fit, Tones, fitted, seen_at
+from rs_localizer.estimation.tone_mixture import (
+    CERTAIN,
+    FEW_TONES,
+    ToneMixture,
+    room_for_more,
+)
+from rs_localizer.estimation.tones import FEWEST, Fit, Seen, Tones, fitted, seen_at
 
-# Power of the loudest tone that noise exceeds in two or three frames of a hundred.
-_LOUD = 20.0
+# Power of the loudest tone that noise exceeds in two frames of five.
+_LOUD = 12.0
 # So many points that are near, but no inliers, and such a part of the inliers: random matches
 # seldom lie there.
-_FEWEST_STRANGERS, _STRANGERS = 4, 0.1
+_STRANGERS, _PART = 4, 0.1
+# Among fewer inliers a motion alone leaves little of a tone to be heard, and strangers say more.
+FEW = 40
+"""Inliers, below which tones are hard to hear."""
+_LOUD_OF_FEW = 9.0
+_FEWEST_INLIERS = 6  # of a motion near which tones are looked for
+_SWING = float(SWINGS[4])  # of tones that a spectrum does not show
 _WIDE = 3.5  # times the median error, of the points among which tones are looked for
-_IMPROBABLE = 0.2
+_IMPROBABLE = math.log(0.3)  # odds
+# Whether noise hides a tone, the covariance takes for as probable as not: logarithm of the odds by
+# which that is more than the prior's, for any camera.
+_EVEN = -tonal_odds(float(SHAKE_PRIOR[0]))
 # Logarithm of the odds beside the best tone, beyond which none counts.
 _FAR_LESS_PROBABLE = 6.0
 _ALTERNATIVES = 3
@@ -44,6 +62,8 @@ _ALIKE = 0.1  # cycles
 # where they swing out of the gate, tones find the points again.
 _SLOW = 1.75
 _MOST_TONES = 6  # and no more parameters than points
+# Power that tells of a further tone where there is no room for one.
+_STILL_LOUD = 12.0
 # Beside a tone another one is nothing strange: power from which on it is looked for, and logarithms
 # of the odds that it has to gain to count alone, or at all.
 _BESIDE, _FURTHER, _DOUBTFUL = 8.0, 3.0, math.log((1.0 - CERTAIN) / CERTAIN)
@@ -57,52 +77,81 @@ class _Near:
     gate: float  # px
     noise: float  # px
     strangers: bool  # whether some are no inliers
+    few: bool  # inliers
 
 
-def find_tones(
-    frame: Inliers, best: Posterior, examined: Examined, threshold: float
-) -> ToneMixture | None:
-    """The tones that may shake the camera, if they are not improbable.
+class Heard(NamedTuple):
+    """What is known of tones that may shake a camera."""
+
+    mixture: ToneMixture | None  # if they are not improbable
+    unheard: Array | None  # (18,18) what tones that hide in the noise add to the covariance
+
+
+_SILENCE = Heard(None, None)
+
+
+def find_tones(frame: Inliers, best: Posterior, examined: Examined, threshold: float) -> Heard:
+    """The tones that may shake the camera.
 
     Args:
         best: the motion without one.
         examined: what it leaves of the image.
         threshold: px, of inliers.
     """
-    strangers = _strangers(best, threshold)
-    if examined.loudness < _LOUD and not strangers:
-        return None
-    near = _near(best, strangers, threshold)
+    inliers = np.count_nonzero(best.inliers)
+    if inliers < _FEWEST_INLIERS:
+        return _SILENCE
+    few = bool(inliers < FEW)
+    near = _near(best, few, threshold)
+    if examined.loudness < (_LOUD_OF_FEW if few else _LOUD) and not near.strangers:
+        return _SILENCE
     if np.count_nonzero(near.chosen) < FEWEST:
-        return None
+        return _SILENCE
     still = Tones.none(best.state)
-    evidence, odds = _first_look(frame, still, examined, near)
-    if odds < math.log(_IMPROBABLE):
-        return None
-    fits = _alternatives(frame, still, evidence, near, threshold)
-    if not fits:
-        return None
-    found = np.array([evidence_of(fit, threshold) for fit in fits])
-    if near.strangers:
-        # Points far off count for more than they should.
-        odds = min(odds, float(found.max()) - evidence_of_none(frame, best, threshold))
-    none = 1.0 / (1.0 + math.exp(min(odds, 500.0)))
-    return None if none > 1.0 - _IMPROBABLE else _mixture(frame, fits, found, none, near, threshold)
-
-
-def _first_look(
-    frame: Inliers, still: Tones, examined: Examined, near: _Near
-) -> tuple[Array, float]:
-    """The spectrum (m,s), and the logarithm of the odds that tones are in it."""
     seen = seen_at(frame.observations, still)
     evidence = spectrum_of(frame, still, seen, near.chosen, near.noise)
-    odds = odds_of(frame, evidence)
-    if odds < math.log(_IMPROBABLE):
-        return evidence, odds
-    # Map and lens, or slow shaking, may explain as much.
-    field = gain_of_field(frame, still.beside, seen, near.chosen, near.noise)
+    odds, others = odds_of(frame, evidence), _of_others(frame, still, examined, seen, best)
+    fits = list[Fit]()
+    if near.strangers or odds - others > _IMPROBABLE:
+        fits = _alternatives(frame, still, evidence, near, threshold)
+    found = np.array([evidence_of(fit, threshold) for fit in fits])
+    if near.strangers:
+        # Points far off count in a spectrum for more than they should.
+        evidence = spectrum_of(frame, still, seen, best.inliers, best.noise)
+        odds = odds_of(frame, evidence)
+        if fits:
+            none = evidence_of_none(frame, best, threshold)
+            odds = prior_odds(frame) + float(found.max()) - none
+    odds -= others
+    if not fits or odds < _IMPROBABLE:
+        return Heard(None, _unheard(seen, best, evidence, odds))
+    return Heard(_mixture(frame, fits, found, _probability(-odds), near, threshold), None)
+
+
+def _unheard(seen: Seen, best: Posterior, evidence: Array, odds: float) -> Array | None:
+    """What tones of this evidence (m,s) that hide in the noise add to the covariance (18,18);
+    None where that cannot be computed."""
+    added: Array = spread_by_tones(
+        seen.errors, seen.columns, seen.by_turn, seen.tau, best.inliers, best.covariance,
+        best.noise, evidence,
+    )  # fmt: skip
+    return _probability(odds + _EVEN) * added if np.all(np.isfinite(added)) else None
+
+
+def _probability(odds: float) -> float:
+    """Of the logarithm of odds."""
+    return 1.0 / (1.0 + math.exp(-min(max(odds, -500.0), 500.0)))
+
+
+def _of_others(
+    frame: Inliers, still: Tones, examined: Examined, seen: Seen, best: Posterior
+) -> float:
+    """How much better than noise alone map and lens, or slow shaking, explain the inliers."""
+    field = gain_of_field(frame, still.beside, seen, best.inliers, best.noise)
     slow = np.logaddexp.reduce(np.log(frame.shake_prior) + examined.sizes.of_shake_sizes)
-    return evidence, odds - max(field, float(slow))
+    # Polynomials follow what is slow only where there are points enough for them.
+    few = np.count_nonzero(best.inliers) < FEW
+    return field if few else max(field, float(slow))
 
 
 def _mixture(
@@ -121,26 +170,37 @@ def _mixture(
     agreement = agreement_of(
         frame.observations, best.seen.errors, best.seen.squared_errors, best.inliers
     )
-    return ToneMixture(fits, (1.0 - none) * weights / weights.sum(), none, agreement)
+    probabilities = (1.0 - none) * weights / weights.sum()
+    return ToneMixture(fits, probabilities, none, agreement, _exhausted(best))
 
 
-def _strangers(best: Posterior, threshold: float) -> bool:
-    """Whether more lies just beyond the gate than chance would put there."""
-    near = np.count_nonzero(best.squared_errors < (NEAR * threshold) ** 2)
-    inliers = np.count_nonzero(best.inliers)
-    return bool(near - inliers > max(_FEWEST_STRANGERS, _STRANGERS * inliers))
+def _exhausted(fit: Fit) -> bool:
+    """Whether there may be further tones, and the points are too few to look for them."""
+    tones, seen = len(fit.tones.cycles), fit.seen
+    if tones < FEW_TONES or room_for_more(fit):
+        return False
+    left = loudest(seen.errors, seen.by_turn, seen.tau, fit.inliers)
+    return tones > FEW_TONES or left > _STILL_LOUD
 
 
-def _near(best: Posterior, strangers: bool, threshold: float) -> _Near:
-    """The inliers, and strangers."""
+def strangers_of(squared_errors: Array, inliers: BoolArray, threshold: float) -> int:
+    """How many points lie near, but beyond the gate (threshold: px, of inliers)."""
+    near = np.count_nonzero(squared_errors < (NEAR * threshold) ** 2)
+    return int(near - np.count_nonzero(inliers))
+
+
+def _near(best: Posterior, few: bool, threshold: float) -> _Near:
+    """The inliers, and strangers where there are more than chance would put there."""
     lengths = np.sqrt(best.squared_errors)
     gate = float(lengths[best.inliers].max(initial=threshold))
-    if not strangers:
-        return _Near(best.inliers, gate, best.noise, False)
+    strangers = strangers_of(best.squared_errors, best.inliers, threshold)
+    by_chance = 0.0 if few else max(_STRANGERS, _PART * np.count_nonzero(best.inliers))
+    if strangers <= by_chance:
+        return _Near(best.inliers, gate, best.noise, False, few)
     typical = float(np.median(lengths[lengths < NEAR * threshold]))
     gate = min(max(2.0 * gate, _WIDE * typical), NEAR * threshold)
     chosen = lengths < gate
-    return _Near(chosen, gate, math.sqrt(0.5 * float(np.mean(lengths[chosen] ** 2))), True)
+    return _Near(chosen, gate, math.sqrt(0.5 * float(np.mean(lengths[chosen] ** 2))), True, few)
 
 
 def _alternatives(
@@ -151,9 +211,35 @@ def _alternatives(
     padded = np.concatenate([[-np.inf], of_cycles, [-np.inf]])
     peaks = np.flatnonzero((of_cycles >= padded[:-2]) & (of_cycles > padded[2:]))
     peaks = peaks[of_cycles[peaks] > of_cycles.max() - _FAR_LESS_PROBABLE]
-    fits: list[Fit] = []
-    for peak in peaks[np.argsort(-of_cycles[peaks])][:_ALTERNATIVES]:
-        start = _with_peak(still, evidence, int(peak))
+    starts = [
+        _with_peak(still, evidence, int(peak))
+        for peak in peaks[np.argsort(-of_cycles[peaks])][:_ALTERNATIVES]
+    ]
+    fits = _distinct(frame, starts, [], near, threshold)
+    if near.strangers and near.few and not _explained(fits, threshold):
+        # A spectrum of errors beyond the gate may have its peaks anywhere.
+        starts = [still.with_one(float(cycles), _SWING) for cycles in CYCLES[::2]]
+        fits = _distinct(frame, starts, fits, near, threshold)
+        best = max((evidence_of(fit, threshold) for fit in fits), default=0.0)
+        fits = [f for f in fits if evidence_of(f, threshold) > best - _FAR_LESS_PROBABLE]
+    return fits
+
+
+def _explained(fits: list[Fit], threshold: float) -> bool:
+    """Whether one of them leaves no strangers."""
+    return any(
+        strangers_of(fit.seen.squared_errors, fit.inliers, threshold)
+        <= max(1.0, _PART * np.count_nonzero(fit.inliers))
+        for fit in fits
+    )
+
+
+def _distinct(
+    frame: Inliers, starts: list[Tones], fits: list[Fit], near: _Near, threshold: float
+) -> list[Fit]:
+    """These fits and those from other starts that are none of them."""
+    fits = list(fits)
+    for start in starts:
         fit = fitted(frame.observations, start, near.gate, frame.terms, threshold)
         if fit and all(abs(fit.tones.cycles[0] - f.tones.cycles[0]) > _ALIKE for f in fits):
             fits.append(fit)
@@ -170,7 +256,7 @@ def _with_others(frame: Inliers, fit: Fit, near: _Near, threshold: float) -> lis
     evidence = evidence_of(fit, threshold)
     while len(fit.tones.cycles) < _MOST_TONES:
         seen = fit.seen
-        if len(fit.covariance) + 7 > np.count_nonzero(fit.inliers):
+        if not room_for_more(fit):
             break
         if loudest(seen.errors, seen.by_turn, seen.tau, fit.inliers) < _BESIDE:
             break

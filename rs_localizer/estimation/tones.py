@@ -24,7 +24,7 @@ from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.residuals import linearized
 
-FEWEST = 20
+FEWEST = 12
 """Points that a tone could be told from."""
 _LEAST_SIZE = 1e-6  # rad
 _SLOWEST, _FASTEST = 0.5, MOST_CYCLES + 0.5  # cycles per readout
@@ -35,6 +35,8 @@ _CLOSING = 0.6  # of the gate, from step to step
 _STEPS = 20
 _CLOSE = 0.01  # squared length of the last step, in standard deviations
 _BEHIND = 1e150  # px
+# Parameters that the points decide, and not the prior, before any fit has told.
+_DECIDED_AT_FIRST = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +143,8 @@ def seen_at(observations: Observations, tones: Tones) -> Seen:
     behind = np.isinf(observations.squared_errors(tones.beside))
     errors[behind] = _BEHIND
     squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
+    if len(tones.cycles) == 0:
+        return Seen(errors, squared, by_motion, by_turn, tau)
     angle = 2.0 * math.pi * np.outer(tau, tones.cycles)
     waves = np.stack([np.cos(angle), np.sin(angle)], axis=2)  # (n,q,2)
     by_swings = np.einsum("nqw,nia->niqwa", waves, by_turn).reshape(*errors.shape, -1)
@@ -154,12 +158,13 @@ def seen_at(observations: Observations, tones: Tones) -> Seen:
 
 def products_of(
     tones: Tones, seen: Seen, chosen: BoolArray, terms: PriorTerms, noise: float
-) -> tuple[Columns, float]:
+) -> tuple[Columns, Array, float]:
     """Products of the columns of the chosen points (n,), with all that is known beforehand, px^2;
-    and the cost of the motion's prior, in noise variances."""
+    without it; and the cost of the motion's prior, in noise variances."""
     columns = seen.columns[chosen].reshape(-1, seen.columns.shape[2])
     errors = seen.errors[chosen].ravel()
     products, with_errors = columns.T @ columns, -columns.T @ errors
+    by_points = products.copy()
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     cost = float(add_prior(*terms, tones.beside, 1.0, information, slope))
     known = np.zeros(len(products))
@@ -170,7 +175,8 @@ def products_of(
     with_errors[:PARAMETERS] -= variance * slope
     products[np.diag_indices_from(products)] += variance * known
     with_errors[tones.swung] -= variance * known[tones.swung] * tones.swings.ravel()
-    return Columns(products, with_errors, float(errors @ errors) + variance * cost, 0), cost
+    found = Columns(products, with_errors, float(errors @ errors) + variance * cost, 0)
+    return found, by_points, cost
 
 
 def fitted(
@@ -186,24 +192,25 @@ def fitted(
 
     None where the fit leaves what can be computed, or nearly all points.
     """
-    tones, last = start, gate
+    tones, last, decided = start, gate, float(_DECIDED_AT_FIRST)
     chosen = np.zeros(len(observations), dtype=np.bool_)
     for index in range(_STEPS):
         seen = seen_at(observations, tones)
-        noise = noise_deviation(seen.squared_errors, gate, float(seen.columns.shape[2]))
+        noise = noise_deviation(seen.squared_errors, gate, decided)
         if index > 0:
             last = min(max(threshold, GATE * noise), WIDEST_GATE * threshold)
             gate = max(_CLOSING * gate, last)
         before, chosen = chosen, seen.squared_errors < gate * gate
         if np.count_nonzero(chosen) < FEWEST:
             return None
-        products, cost = products_of(tones, seen, chosen, terms, noise)
+        products, by_points, cost = products_of(tones, seen, chosen, terms, noise)
         if not np.all(np.isfinite(products.products)):
             return None
         inverse = inverted(products.products)
         if not np.all(np.isfinite(inverse)):
             return None
         step, covariance = inverse @ products.with_errors, noise * noise * inverse
+        decided = float(np.sum(inverse * by_points))
         small = step @ products.with_errors < _CLOSE * noise * noise
         settled = small and gate == last and np.array_equal(before, chosen)
         if settled or index == _STEPS - 1:

@@ -207,19 +207,27 @@ class FrameLocalizer:
         for name, text in oddities(cloud, method.camera, frame).items():
             self._notice(name, text)
         given = (cloud.points, cloud.pixels, cloud.scores)
+        deviation = max(method.config.readout_time_deviation, self.readout_watch.error)
         if method.follower is None:
             self.imu.without_tracker(method.config)
-            result = (method.experienced or method.localizer).localize(*given)
+            still = Prior(of_rest=self.readout_watch.of_rest)
+            result = (
+                method.localizer.localize(*given, still)
+                if method.experienced is None
+                else method.experienced.localize(*given)
+            )
         else:
             time_ns = method.middle_row_ns(cloud.stamp_ns)
             if method.tracker is not None:
                 method.tracker.trusts_readout_time = not self.readout_watch.far_off
+                method.tracker.readout_time_deviation = deviation
+            method.follower.of_rest = self.readout_watch.of_rest
             result = self.imu.track(
                 method.follower, method.config, time_ns, frame, self.transforms, given
             )
         if not result:
             return Refusal(result.reason, result.detail)
-        localized = of_camera(cloud, result, method.config, method.camera, frame)
+        localized = of_camera(cloud, result, method.config, method.camera, frame, deviation)
         self._watch_readout(cloud, result)
         return self.mounted(localized)
 

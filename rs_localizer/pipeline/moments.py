@@ -32,6 +32,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
@@ -69,19 +70,25 @@ def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Tur
     return numbers_of(estimate), np.ascontiguousarray(estimate.shake), joint, turn, float(tau)
 
 
-def with_timing(pose: Pose, twist: Twist, deviation: float, delay: float) -> tuple[Pose, Twist]:
+def with_timing(
+    pose: Pose, twist: Twist, deviation: float, delay: float, acceleration: Acceleration
+) -> tuple[Pose, Twist]:
     """The covariances with what is not known of the readout time.
 
     Args:
         pose, twist: of the camera at one moment.
         deviation: of the readout time, as a part of it: velocities are inverse to it.
         delay: s by which the moment itself is uncertain.
+        acceleration: that the camera may have all the time.
     """
     velocity = np.concatenate([twist.linear, twist.angular])
     in_map = np.concatenate([pose.rotation @ twist.linear, pose.rotation @ twist.angular])
+    change = np.diag(np.repeat([acceleration.linear, acceleration.angular], 3) * delay) ** 2
+    moved = delay**2 * np.outer(in_map, in_map) + 0.25 * delay**2 * change
+    changed = deviation**2 * np.outer(velocity, velocity) + change
     return (
-        replace(pose, covariance=pose.covariance + delay**2 * np.outer(in_map, in_map)),
-        replace(twist, covariance=twist.covariance + deviation**2 * np.outer(velocity, velocity)),
+        replace(pose, covariance=pose.covariance + moved),
+        replace(twist, covariance=twist.covariance + changed),
     )
 
 

@@ -20,19 +20,28 @@ from rs_localizer.solvers.table import find_solver
 
 
 def of_camera(
-    cloud: Correspondences, estimate: Estimate, config: NodeConfig, camera: Camera, frame: str
+    cloud: Correspondences,
+    estimate: Estimate,
+    config: NodeConfig,
+    camera: Camera,
+    frame: str,
+    deviation: float,
 ) -> Localized:
-    """Pose and twist of the camera's optical frame, of this name, at the published moment."""
+    """Pose and twist of the camera's optical frame, of this name, at the published moment.
+
+    Args:
+        deviation: s, of the readout time.
+    """
     readout_time = config.readout_time
     stamp_ns, tau = published_moment(config, camera, cloud.stamp_ns)
     moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
     pose = pose_at(estimate, tau)
     twist = twist_at(estimate, tau, readout_time) if moving else None
-    deviation = config.readout_time_deviation
     if twist is not None and deviation > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.
         delay = deviation * camera.first_row_time if tau == 0.0 else 0.0
-        pose, twist = with_timing(pose, twist, deviation / readout_time, delay)
+        share = deviation / readout_time
+        pose, twist = with_timing(pose, twist, share, delay, config.acceleration)
     return Localized(
         input_stamp_ns=cloud.stamp_ns,
         stamp_ns=stamp_ns,

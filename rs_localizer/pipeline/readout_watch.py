@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from enum import Enum, auto
 
@@ -31,6 +32,7 @@ _SURELY = 4.0
 # Of the setting: from here on frames that stand alone are better than tracked ones, and from here
 # on nothing tells the shutter from a global one.
 _FAR_OFF, _GLOBAL = 0.5, 0.2
+_CERTAINLY = math.log(1e9)  # of the odds for a global one that was found
 
 
 class _Kind(Enum):
@@ -58,10 +60,18 @@ class ReadoutWatch:
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
         self.fault = ""  # how that contradicts the setting, in one sentence
+        self.error = 0.0  # s, how far it says that the setting is off; 0: not
         # Whether the setting is wrong by so much that what the camera does from frame to frame
         # says nothing of what it does within them: a global shutter, or a reversed one. Once it
         # was, doubts are not enough.
         self.far_off = False
+        # Whether, of these, the shutter is a global one.
+        self.global_shutter = False
+
+    @property
+    def of_rest(self) -> float:
+        """Logarithm of the odds that what looks like motion within an image is none."""
+        return _CERTAINLY if self.global_shutter else 0.0
 
     def warm_up(self, camera: Camera) -> None:
         """Compile what frames of this camera need."""
@@ -73,7 +83,8 @@ class ReadoutWatch:
         self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
         self._said.clear()
-        self.measured, self.fault, self.far_off = None, "", False
+        self.measured, self.fault, self.error = None, "", 0.0
+        self.far_off = self.global_shutter = False
 
     def add(
         self,
@@ -99,18 +110,33 @@ class ReadoutWatch:
             self._under_way = None
             return config
         if found is None:
+            self._doubt(config)
             return config
         self.measured = found
         if estimates:
             return self._adopt(config, found)
+        self._judge(config, found)
+        return config
+
+    def _doubt(self, config: NodeConfig) -> None:
+        """What a few frames tell, as long as a measurement says nothing else."""
+        silent = self.fault == "" and (self.measured is None or _may_be_none(config, self.measured))
+        if silent and self._monitor.global_shutter.certain:
+            self.far_off = self.global_shutter = True
+
+    def _judge(self, config: NodeConfig, found: MeasuredReadout) -> None:
         wrong = _wrong(config, found)
         self.fault = "" if wrong is None else _sentence(wrong, config, found)
-        may_be = found.readout_time < _FAR_OFF * config.readout_time
+        off = math.hypot(found.readout_time - config.readout_time, found.deviation)
+        self.error = 0.0 if wrong is None else off
+        may_be = _may_be_none(config, found)
         self.far_off = may_be and (self.far_off or wrong is not None)
+        self.global_shutter = self.far_off and (
+            self.global_shutter if wrong is None else wrong is _Kind.GLOBAL
+        )
         if wrong is not None and wrong not in self._said:
             self._said.add(wrong)
             self._notice(Notice.READOUT_TIME, self.fault)
-        return config
 
     def _measure(
         self, camera: Camera, time_ns: int, estimate: Estimate, cloud: Correspondences
@@ -146,6 +172,11 @@ class ReadoutWatch:
             readout_time_deviation=min(found.deviation, LONGEST_READOUT_TIME),
             scan_direction=direction.value,
         )
+
+
+def _may_be_none(config: NodeConfig, found: MeasuredReadout) -> bool:
+    """Whether the readout time may be so far off that a global shutter is no worse."""
+    return found.readout_time < _FAR_OFF * config.readout_time
 
 
 def _wrong(config: NodeConfig, found: MeasuredReadout) -> _Kind | None:

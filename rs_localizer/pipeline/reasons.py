@@ -49,12 +49,12 @@ REASONS: dict[str, Meaning] = {
         "the motion would be faster than a camera moves", f"mostly chance matches; {_TURNED}"
     ),
     Reason.MIRRORED: Meaning(
-        "points on a plane fit two poses, mirrored on it, alike",
+        "points on a plane fit two poses alike: mirrored on it, or leaning and facing the camera",
         "come nearer, look from an angle, use a larger board or markers on several walls",
     ),
     Reason.MODEL_ERROR: Meaning(
-        "the errors of neighbouring points agree: vibration faster than the rows can tell, or a "
-        "map or calibration that is too far off for any pose",
+        "the errors of neighbouring points agree, or few points shake out of the gate: vibration "
+        "that the rows cannot tell, or a map or calibration that is too far off for any pose",
         f"a stiffer mounting, the calibration, the map; {_TURNED}",
     ),
     Reason.UNCERTAIN: Meaning(

@@ -28,6 +28,8 @@ class SingleFrames:
 
     def __init__(self, localizer: Localizer, inertial: InertialSettings) -> None:
         self._localizer = localizer
+        # Logarithm of the odds for a global shutter, beside those of any.
+        self.of_rest = 0.0
         given = replace(inertial, estimate_time_offset=False)
         self._aid = GyroscopeAid(given, localizer.camera.readout_time)
         self._aid.warm_up()
@@ -56,6 +58,8 @@ class SingleFrames:
         def localized(foreseen: Foreseen | None) -> tuple[Estimate | Failure, Prior | None]:
             prior = None if foreseen is None else foreseen.prior
             turn = None if foreseen is None else foreseen.turn
+            if turn is None and self.of_rest > 0.0:
+                prior = replace(prior or Prior(), of_rest=self.of_rest)
             found = self._localizer.localize(points, pixels, scores, prior, turn=turn)
             return found, prior
 

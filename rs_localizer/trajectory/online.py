@@ -32,6 +32,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.trajectory.image_alone import image_alone
 from rs_localizer.trajectory.measured_readout import MeasuredReadout, Measurement
 from rs_localizer.trajectory.online_kernels import SIDE, Equations, View, equation
+from rs_localizer.trajectory.shutter_odds import ShutterOdds
 
 REVERSED = {
     ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
@@ -84,6 +85,10 @@ class _Window:
     def equations(self) -> Equations:
         return Equations(*(part[self._first : self._end] for part in self._all))
 
+    def newest(self, count: int) -> Equations:
+        """The last ones."""
+        return Equations(*(part[self._end - count : self._end] for part in self._all))
+
     def _make_room(self) -> None:
         held, times_ns = self.equations(), self._times_ns[self._first : self._end]
         size = max(2 * len(self), _LEAST_ROOM)
@@ -110,11 +115,15 @@ class ReadoutMonitor:
         self._window_ns = round(window * 1e9)
         self._views: deque[tuple[int, View]] = deque(maxlen=3)
         self._window = _Window()
+        self._in_a_row = 0  # triples, each one frame after the other
+        self.global_shutter = ShutterOdds()
 
     def reset(self) -> None:
         """Forget all frames: the camera, the map or the assumed direction has changed."""
         self._views.clear()
         self._window.clear()
+        self._in_a_row = 0
+        self.global_shutter.reset()
 
     def add(
         self, time_ns: int, camera: Camera, estimate: Estimate, points: Array, pixels: Array
@@ -122,7 +131,7 @@ class ReadoutMonitor:
         """Take a frame whose middle row was exposed at ``time_ns``.
 
         Args:
-            camera: its lens and scan direction count, its readout time does not.
+            camera: its lens and scan direction count; its readout time is compared with none.
             estimate: of this frame, tracked or not.
             points, pixels: (n,3) and (n,2) as they were localized.
 
@@ -142,6 +151,7 @@ class ReadoutMonitor:
         alone = image_alone(camera, steady, points[chosen], pixels[chosen])
         if alone is None:
             self._views.clear()
+            self._in_a_row = 0
             return
         offset, covariance = alone
         motion = np.concatenate([estimate.angular_velocity, estimate.linear_velocity])
@@ -154,16 +164,21 @@ class ReadoutMonitor:
         )
         self._views.append((time_ns, view))
         if len(self._views) == 3:
-            self._add_equation()
+            self._add_equation(camera.readout_time)
         self._window.forget(time_ns - self._window_ns)
 
-    def _add_equation(self) -> None:
+    def _add_equation(self, readout_time: float) -> None:
         (before_ns, _), (now_ns, _), (after_ns, _) = self._views
         first, second = (now_ns - before_ns) * 1e-9, (after_ns - now_ns) * 1e-9
-        if max(first, second) <= _LONGEST_INTERVAL and (
+        if max(first, second) > _LONGEST_INTERVAL or not (
             1.0 / _MOST_UNLIKE < first / second < _MOST_UNLIKE
         ):
-            self._window.add(now_ns, [view for _, view in self._views], first, second)
+            self._in_a_row = 0
+            return
+        self._window.add(now_ns, [view for _, view in self._views], first, second)
+        self._in_a_row += 1
+        if self._in_a_row > 1 and readout_time > 0.0:
+            self.global_shutter.add(self._window.newest(2), readout_time)
 
     def measure(self) -> MeasuredReadout | None:
         """What the window shows; None as long as the motion determines nothing.
@@ -189,3 +204,5 @@ def warm_up(camera: Camera) -> None:
     window, view = _Window(), View(np.eye(3), np.zeros(3), np.zeros(SIDE), np.eye(2 * SIDE))
     window.add(0, [view, view, view], 1.0, 1.0)
     Measurement(window.equations()).finish()
+    window.add(1, [view, view, view], 1.0, 1.0)
+    ShutterOdds().add(window.newest(2), 1.0)

@@ -91,6 +91,12 @@ def test_errors_that_neighbouring_rows_share(good):
     assert reason(observations, replace(shaking, noise=0.09)) is None
 
 
+def test_points_that_inliers_swing_by(good):
+    observations, posterior = good
+    assert reason(observations, replace(posterior, strangers=4)) is Reason.MODEL_ERROR
+    assert reason(observations, replace(posterior, exhausted=True)) is Reason.MODEL_ERROR
+
+
 def test_errors_that_are_smooth_over_the_image(good):
     observations, posterior = good
     assert reason(observations, replace(posterior, model_error=0.79)) is None
@@ -127,6 +133,13 @@ def test_a_mirrored_pose_that_fits_as_well(good, turn, covered, expected):
     step = np.zeros(18)
     step[1] = turn
     doubtful = replace(posterior, mirror=Mirror(step, 1.0, covered))
+    assert reason(observations, doubtful) is expected
+
+
+@pytest.mark.parametrize(("covered", "expected"), [(False, Reason.MIRRORED), (True, None)])
+def test_a_plane_that_may_face_the_camera(good, covered, expected):
+    observations, posterior = good
+    doubtful = replace(posterior, facing=Mirror(np.full(18, 0.1), 9.0, covered))
     assert reason(observations, doubtful) is expected
 
 

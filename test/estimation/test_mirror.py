@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.estimation.mirror import mirrored
+from rs_localizer.estimation.mirror import facing, mirrored
 
 MOTION = np.linspace(0.01, 0.12, 12)  # velocities and accelerations
 ALL = np.ones(40, dtype=bool)
@@ -58,3 +58,14 @@ def test_only_the_points_that_count_are_the_plane():
         mirrored(strewn, counting, state), mirrored(points, ALL, state), atol=1e-12
     )
     assert mirrored(strewn, np.zeros(50, dtype=bool), state) is None
+
+
+def test_half_way_to_the_mirrored_pose_the_plane_faces_the_camera():
+    points, rotation = plane(), so3.exp(np.array([0.4, 0.3, 0.0]))
+    sight = np.array([1.0, -0.5, 4.0])
+    found = facing(points, ALL, state_of(rotation, sight - rotation @ points.mean(axis=0)))
+    turned = found[:9].reshape(3, 3)
+    across = np.cross(turned[:, 2], sight / np.linalg.norm(sight))
+    np.testing.assert_allclose(across, 0.0, atol=1e-9)
+    np.testing.assert_allclose(turned @ points.mean(axis=0) + found[9:12], sight, atol=1e-9)
+    assert facing(points, ALL, found) is None

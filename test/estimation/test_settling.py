@@ -12,7 +12,8 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.assumptions import assumptions
-from rs_localizer.estimation.mixture import Inliers, weighed
+from rs_localizer.estimation.mixture import weighed
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior_terms import held_terms

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.columns import Columns
-from rs_localizer.estimation.mixture import Inliers
+from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.settling import settle
@@ -51,7 +51,7 @@ def shaken(seed, cycles=4.0, swings=SWING, noise=0.2, wrong=0, count=80):
 def mixture_of(observations, start):
     best = maximum_a_posteriori(observations, start, PRIOR, THRESHOLD)
     inliers = Inliers(observations, best, PRIOR, ASSUMED)
-    return find_tones(inliers, best, inliers.examined(best.state, PRIOR, 6), THRESHOLD)
+    return find_tones(inliers, best, inliers.examined(best.state, PRIOR, 6), THRESHOLD).mixture
 
 
 def angle_off(found, state, cycles, swings, tau):
@@ -204,7 +204,7 @@ def test_loudness_is_that_of_chance_without_a_tone():
 
 
 def test_few_points_cannot_tell():
-    observations, state = shaken(2, count=18)
+    observations, state = shaken(2, count=11)
     tones = Tones.none(state).with_one(4.0, 0.003)
     assert fitted(observations, tones, 20.0, PRIOR, THRESHOLD) is None
 

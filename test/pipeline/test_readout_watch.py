@@ -74,12 +74,22 @@ def test_a_wrong_readout_time_is_said_once(factor: float, tracking: bool) -> Non
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation < 0.1 * READOUT
     assert frames.readout_watch.fault
     assert not frames.readout_watch.far_off
+    # As long as it is wrong, what is published is as uncertain as that.
+    error = frames.readout_watch.error
+    assert error == pytest.approx(0.2 * READOUT, rel=0.2)
+    last = frames.localize(clouds()[-1])
+    assert last
+    assert last.twist is not None
+    speed = np.concatenate([last.twist.linear, last.twist.angular])
+    known = np.linalg.solve(last.twist.covariance, speed) @ speed
+    assert known < (factor * READOUT / error) ** 2
 
 
 def test_the_right_one_is_confirmed() -> None:
     frames, notices = watched(readout_time=READOUT)
     assert notices == []
     assert frames.readout_watch.fault == ""
+    assert not frames.readout_watch.far_off
     found = frames.readout_watch.measured
     assert found is not None
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation
@@ -100,6 +110,17 @@ def test_a_reversed_scan_is_said() -> None:
     assert "against scan_direction bottom_to_top" in text
     assert text.endswith("is it top_to_bottom?")
     assert frames.readout_watch.far_off
+
+
+@pytest.mark.parametrize("tracking", [True, False])
+def test_a_global_shutter_is_known_within_a_second_and_stays_one(tracking: bool) -> None:
+    frames = FrameLocalizer(NodeConfig(readout_time=READOUT, tracking=tracking))
+    with open_bag(data.path(data.GLOBAL_SHUTTER_TAGS)) as bag:
+        for (_, found), _ in zip(replay(bag, find_topics(bag), frames), range(30), strict=False):
+            assert found
+    assert frames.readout_watch.far_off
+    assert frames.readout_watch.global_shutter
+    assert np.linalg.norm(found.estimate.angular_velocity) < 1e-4  # 0.3 deg/s
 
 
 @pytest.mark.parametrize("change", ["reset", "settings", "camera", "map"])

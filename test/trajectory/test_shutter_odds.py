@@ -1,0 +1,63 @@
+"""A global shutter is told from a rolling one by what changes from frame to frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rs_localizer.trajectory.online_kernels import SIDE, Equations
+from rs_localizer.trajectory.shutter_odds import ShutterOdds
+
+SET = 0.02
+NOISE = 1e-3
+
+
+def odds(
+    true: float, speed: float = 0.3, offset: float = 0.01, shaking: float = 0.0, count: int = 20
+) -> ShutterOdds:
+    """Of triples whose velocities are off by the same everywhere, by ten times the noise."""
+    rng = np.random.default_rng(1)
+    off = rng.normal(0.0, offset, SIDE)
+    x = speed * np.cumsum(rng.normal(size=(count, SIDE)), axis=0) / np.sqrt(count)
+    images = rng.normal(0.0, NOISE, (count + 2, SIDE)) + rng.normal(0.0, shaking, (count + 2, SIDE))
+    y = true * x + off + (images[:-2] + 4.0 * images[1:-1] + images[2:]) / 6.0
+    none = np.zeros((count, SIDE, SIDE))
+    yy = np.broadcast_to(0.5 * NOISE**2 * np.eye(SIDE), none.shape)
+    found = ShutterOdds()
+    for k in range(2, count + 1):
+        of = Equations(x, y, none, none, yy)
+        found.add(Equations(*(np.ascontiguousarray(part[k - 2 : k]) for part in of)), SET)
+    return found
+
+
+def test_a_global_shutter_is_found_behind_errors_of_the_map() -> None:
+    assert odds(0.0, speed=1.0).certain
+
+
+def test_of_a_shutter_as_it_is_set_there_is_no_doubt() -> None:
+    found = odds(SET, speed=1.0)
+    assert not found.certain
+    assert found.logarithm < -4.6
+
+
+@pytest.mark.parametrize("share", [0.7, 1.5])
+def test_nor_of_one_that_is_nearer_to_the_setting_than_to_none(share: float) -> None:
+    assert odds(share * SET, speed=1.0).logarithm < 0.0
+
+
+def test_at_rest_nothing_is_known() -> None:
+    assert abs(odds(0.0, speed=0.0).logarithm) < 1e-9
+    assert ShutterOdds().logarithm == 0.0
+
+
+def test_a_camera_that_shakes_within_its_frames_has_no_global_shutter() -> None:
+    found = odds(0.0, speed=3.0, shaking=10.0 * NOISE)
+    assert found.logarithm > 4.6
+    assert not found.certain
+
+
+def test_what_was_seen_is_forgotten() -> None:
+    found = odds(0.0, speed=1.0)
+    found.reset()
+    assert found.logarithm == 0.0
+    assert not found.certain
