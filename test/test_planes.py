@@ -124,7 +124,7 @@ def small_planes():
 
 def test_a_mirrored_pose_is_never_published(small_planes):
     turns = [turn_between(result, true) for result, _, _, true in small_planes if result]
-    assert len(turns) > 12
+    assert len(turns) > 20
     assert max(turns) < 10.0
     refused = [result for result, *_ in small_planes if not result]
     assert sum(result.reason == "mirrored" for result in refused) > 5

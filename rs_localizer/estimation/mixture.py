@@ -53,7 +53,9 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
         np.array([mode.covariance for mode in modes]),
         best, counting, possible,
     )  # fmt: skip
-    faces = may_face(frame, modes, state, covariance) if planar else None
+    # A motion that is not known leaves room for the facing pose as it is.
+    known = frame.assumed.turn is not None or not frame.assumed.rolling
+    faces = may_face(frame, modes, state, covariance) if planar and known else None
     if faces is not None:
         covariance = reaching(covariance, faces.step, faces.evidence)
     costs = np.array([mode.cost for mode in modes])

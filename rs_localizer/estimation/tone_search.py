@@ -38,8 +38,8 @@ from rs_localizer.estimation.tone_mixture import (
 )
 from rs_localizer.estimation.tones import FEWEST, Fit, Seen, Tones, fitted, seen_at
 
-# Power of the loudest tone that noise exceeds in two frames of five.
-_LOUD = 12.0
+# Power of the loudest tone that noise exceeds in one frame of ten.
+_LOUD = 15.0
 # So many points that are near, but no inliers, and such a part of the inliers: random matches
 # seldom lie there.
 _STRANGERS, _PART = 4, 0.1
