@@ -52,8 +52,9 @@ _ENOUGH_POINTS = 2 * 3 * (DEGREES[-1] - 1)
 # More points than this only take time.
 _MOST_POINTS = 2500
 _MOST_SHARED = 0.9  # correlation of neighbours
-# Beside few inliers: so many points just beyond the gate, and such a part of them, are no chance.
-_STRANGERS, _PART = 4, 0.2
+# Beside few inliers: so many points just beyond the gate, and such a part of them, are no chance;
+# nor are they the corners of one marker that is not where the map has it.
+_STRANGERS, _PART = 5, 0.2
 
 
 def settle(

@@ -38,8 +38,9 @@ from rs_localizer.estimation.tone_mixture import (
 )
 from rs_localizer.estimation.tones import FEWEST, Fit, Seen, Tones, fitted, seen_at
 
-# Power of the loudest tone that noise exceeds in one frame of ten.
-_LOUD = 15.0
+# Power of the loudest tone that noise seldom exceeds. Below it, good frames with chance matches
+# were now and then taken for shaken.
+_LOUD = 20.0
 # So many points that are near, but no inliers, and such a part of the inliers: random matches
 # seldom lie there.
 _STRANGERS, _PART = 4, 0.1
@@ -88,6 +89,11 @@ class Heard(NamedTuple):
 
 
 _SILENCE = Heard(None, None)
+
+
+def warm_up() -> None:
+    """Compile what only frames with a tone and few points, or more tones, come to."""
+    loudest(np.zeros((1, 2)), np.zeros((1, 2, 3)), np.zeros(1), np.zeros(1, dtype=bool))
 
 
 def find_tones(frame: Inliers, best: Posterior, examined: Examined, threshold: float) -> Heard:

@@ -54,9 +54,10 @@ def _tridiagonal(matrix: Array) -> tuple[Array, Array]:
     for k in range(count - 1):
         vector = matrix[k]
         diagonal[k] = vector[k]
-        squared = 0.0
         for i in range(k + 1, count):
             vector[i] = matrix[i, k]
+        squared = 0.0
+        for i in range(k + 1, count):
             squared += vector[i] * vector[i]
         first = vector[k + 1]
         beside[k] = -math.copysign(math.sqrt(squared), first)
@@ -77,6 +78,7 @@ def _tridiagonal(matrix: Array) -> tuple[Array, Array]:
             row, own, total = matrix[i], vector[i], 0.0
             for j in range(k + 1, i):
                 total += row[j] * vector[j]
+            for j in range(k + 1, i):
                 along[j] += row[j] * own
             along[i] += total + row[i] * own
         part = 0.0
