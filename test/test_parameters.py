@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 MOST = 6
 
 # Compiled code takes arrays one by one, and so does what stands in for a kernel.
-COMPILED = {"kernel", "error_model"}
+COMPILED = {"kernel", "inlined", "error_model"}
 INSTEAD_OF_KERNELS = {"solvers/r6p.py: solve_batch"}
 # Declarations, which are called with keywords.
 DECLARATIONS = {"config/declared.py: setting", "solvers/minimal.py: solve_minimal"}

@@ -182,9 +182,10 @@ def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array
         for axis in range(3):
             squares[axis] += _WEIGHTS[node] * here[axis] * here[axis]
     parabola = np.empty((3, 3))
-    parabola[0] = found[0] - 0.5 * found[2]
-    parabola[1] = 2.0 * found[1]
-    parabola[2] = 6.0 * found[2]
+    for axis in range(3):
+        parabola[0, axis] = found[0, axis] - 0.5 * found[2, axis]
+        parabola[1, axis] = 2.0 * found[1, axis]
+        parabola[2, axis] = 6.0 * found[2, axis]
     left = 0.0  # by Parseval
     for axis in range(3):
         left += squares[axis]

@@ -7,8 +7,9 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import add_block
 from rs_localizer.core.known_turn import Turning, find_turn, late_at
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.rate_spline import change_at
 from rs_localizer.core.shake import shake_basis
 from rs_localizer.core.shutter import Numbers
@@ -40,16 +41,15 @@ def pose_of(
     map_from_then = map_from_swing @ np.ascontiguousarray(known.T)
     by_angle = map_from_middle @ so3.right_jacobian_of(-angle)
     jacobian = np.zeros((6, len(joint)))
-    jacobian[0:3, 0:3] = -map_from_middle @ so3.hat_of(way)
-    jacobian[0:3, 3:6] = map_from_middle
-    jacobian[0:3, 9:12] = tau * map_from_middle
-    jacobian[0:3, 15:18] = 0.5 * tau * tau * map_from_middle
-    jacobian[3:6, 0:3] = map_from_middle
-    jacobian[3:6, 6:9] = tau * by_angle
-    jacobian[3:6, 12:15] = 0.5 * tau * tau * by_angle
+    add_block(jacobian, 0, 0, -1.0, map_from_middle @ so3.hat_of(way))
+    add_block(jacobian, 0, 3, 1.0, map_from_middle)
+    add_block(jacobian, 0, 9, tau, map_from_middle)
+    add_block(jacobian, 0, 15, 0.5 * tau * tau, map_from_middle)
+    add_block(jacobian, 3, 0, 1.0, map_from_middle)
+    add_block(jacobian, 3, 6, tau, by_angle)
+    add_block(jacobian, 3, 12, 0.5 * tau * tau, by_angle)
     for k in range(_columns(joint)):
-        place = PARAMETERS + 3 * k
-        jacobian[3:6, place : place + 3] = values[k] * map_from_swing
+        add_block(jacobian, 3, PARAMETERS + 3 * k, values[k], map_from_swing)
     covariance = _propagated(jacobian, joint)
     late = turn.delay * (map_from_then @ late_at(tau, turn.tau, turn.rates, turn.parabola)[0])
     for i in range(3):
@@ -86,18 +86,19 @@ def twist_of(
     by_rate = so3.hat_of(linear) @ (beside @ by_angle)
     by_acceleration = 0.5 * tau * (beside @ (np.eye(3) + by_angle))
     jacobian = np.zeros((6, len(joint)))
-    jacobian[0:3, 6:9] = tau * by_rate
-    jacobian[0:3, 12:15] = 0.5 * tau * tau * by_rate
-    jacobian[0:3, 9:12] = by_turn
-    jacobian[0:3, 15:18] = tau * by_turn
-    jacobian[3:6, 6:9] = beside
-    jacobian[3:6, 12:15] = by_acceleration
+    add_block(jacobian, 0, 6, tau, by_rate)
+    add_block(jacobian, 0, 12, 0.5 * tau * tau, by_rate)
+    add_block(jacobian, 0, 9, 1.0, by_turn)
+    add_block(jacobian, 0, 15, tau, by_turn)
+    add_block(jacobian, 3, 6, 1.0, beside)
+    add_block(jacobian, 3, 12, 1.0, by_acceleration)
     linear_by_shake = so3.hat_of(linear) @ known
     angular_by_shake = so3.hat_of(swinging) @ known
     for k in range(_columns(joint)):
         place = PARAMETERS + 3 * k
-        jacobian[0:3, place : place + 3] = values[k] * linear_by_shake
-        jacobian[3:6, place : place + 3] = rates[k] * known + values[k] * angular_by_shake
+        add_block(jacobian, 0, place, values[k], linear_by_shake)
+        add_block(jacobian, 3, place, rates[k], known)
+        add_block(jacobian, 3, place, values[k], angular_by_shake)
     covariance = _propagated(jacobian, joint)
     late = turn.delay * late_at(tau, turn.tau, turn.rates, turn.parabola)[1]
     across = so3.hat_of(linear)
@@ -113,7 +114,7 @@ def twist_of(
     return linear, angular, covariance
 
 
-@kernel
+@inlined
 def _better_known(turn: Turning, tau: float, covariance: Array) -> bool:
     """Whether the gyroscope alone knows the rate better; the covariance (6,6) is its own then."""
     if not turn.tau[0] <= tau <= turn.tau[-1]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.so3 import coefficients
 
@@ -130,14 +131,14 @@ def rotations_at_knots(times: Array, cubics: Array) -> Array:
     """Rotations (k,3,3), camera_then_from_camera_at_time_0, at the knots of a spline of rates."""
     count = len(times)
     rotations = np.empty((count, 3, 3))
-    rotations[0] = np.eye(3)
+    write(rotations[0], np.eye(3))
     for i in range(count - 1):
         turn_on(turn_in(cubics[i], times[i + 1] - times[i]), rotations[i], rotations[i + 1])
     start, middle = place_of(0.0, times), np.empty((3, 3))
     turn_on(turn_in(cubics[start], -times[start]), rotations[start], middle)
     back = middle.T.copy()
     for i in range(count):
-        rotations[i] = multiplied(rotations[i], back)
+        write(rotations[i], multiplied(rotations[i], back))
     return rotations
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 
 # Below this angle the series of the coefficients are exact to double precision.
@@ -77,8 +78,10 @@ def quaternion(matrix: Array) -> Array:
     norm = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if q[3] < 0.0:
         norm = -norm
-    unit: Array = q / norm
-    return unit
+    scale = 1.0 / norm
+    for i in range(4):
+        q[i] *= scale
+    return q
 
 
 @kernel
@@ -89,7 +92,9 @@ def log(matrix: Array) -> Array:
     sine = np.sqrt(sine_squared)
     # Series of 2 atan2(s, w)/s: the direct form is 0/0 at the identity.
     scale = 2.0 + sine_squared / 3.0 if sine < 1e-5 else 2.0 * np.arctan2(sine, q[3]) / sine
-    vector: Array = scale * q[:3]
+    vector = np.empty(3)
+    for i in range(3):
+        vector[i] = scale * q[i]
     return vector
 
 
@@ -148,5 +153,5 @@ def exp_many(vectors: Array) -> Array:
 def _exp_many(vectors: Array) -> Array:
     matrices = np.empty((len(vectors), 3, 3))
     for i in range(len(vectors)):
-        matrices[i] = exp(vectors[i])
+        write(matrices[i], exp(vectors[i]))
     return matrices

@@ -59,7 +59,9 @@ def step_between(state: Array, other: Array) -> Array:
             turn[i, j] = total
             moved -= total * other[_POSE_SIZE - 3 + j]
         step[3 + i] = moved
-    step[:3] = so3.log(turn)
+    turned = so3.log(turn)
+    for i in range(3):
+        step[i] = turned[i]
     for i in range(6, PARAMETERS):
         step[i] = other[6 + i] - state[6 + i]
     return step

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import PARAMETERS, TURN, step_between
 from rs_localizer.estimation.curvature import told_from
@@ -32,7 +33,7 @@ def averaged(
     count = len(states)
     steps, mean = np.empty((count, PARAMETERS)), np.empty(PARAMETERS)
     for k in range(count):
-        steps[k] = step_between(states[best], states[k])
+        write(steps[k], step_between(states[best], states[k]))
     for i in range(PARAMETERS):
         total = 0.0
         for k in range(count):

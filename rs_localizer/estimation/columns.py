@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.lanes.simd import LANES, traced_products
 from rs_localizer.core.shake import FIRST_DEGREE, legendre, shake_basis
 from rs_localizer.core.state import PARAMETERS
@@ -88,7 +88,7 @@ def columns_of(
     return _assembled(products, first, second, of_terms, shake, terms)
 
 
-@kernel
+@inlined
 def _fill_dense(
     dense: Array, errors: Array, by_motion: Array, by_turn: Array, tau: Array, chosen: IntArray,
     degrees: int,
@@ -118,7 +118,7 @@ def _fill_dense(
             dense[column // _TILE, block, column % _TILE * LANES + lane] = errors[i, row]
 
 
-@kernel
+@inlined
 def _fill_smooth(smooth: Array, rays: Array, inliers: IntArray, chosen: IntArray) -> None:
     """The field's terms of the chosen points among the inliers, in tiles and lanes."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -150,7 +150,7 @@ def _add_products(columns: Array, others: Array, triangle: bool, products: Array
                     products[a * _TILE + i, b * _TILE + j] += sums[i * _TILE + j]
 
 
-@kernel
+@inlined
 def _assembled(
     products: Array, first: Array, second: Array, of_terms: Array, shake: int, terms: int
 ) -> Columns:
@@ -192,7 +192,7 @@ def with_prior(columns: Columns, prior: PriorTerms, state: Array, noise: float) 
     return Columns(products, with_errors, columns.squared_errors + cost, columns.shake)
 
 
-@kernel
+@inlined
 def _field_terms(x: Array, y: Array, terms: Array) -> None:
     """Fill in the terms of a field whose expected mean square over the image is 1."""
     place = 0

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOVE, TURN
 
@@ -66,7 +66,7 @@ def along_arcs(covariance: Array, centre: Array) -> Array:
     return farther
 
 
-@kernel
+@inlined
 def told_from(covariance: Array, turn: Array) -> Array:
     """The covariance (n,n) of steps from one state as that of steps from another one.
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.refine import LEAST_NOISE
@@ -67,7 +67,7 @@ def project_out(products: Array, with_errors: Array, squared_errors: float, kept
     return Projected(left, along, left_over)
 
 
-@kernel
+@inlined
 def log_determinant(matrix: Array) -> float:
     """Of a symmetric positive definite matrix, by Cholesky."""
     size = len(matrix)
@@ -122,7 +122,7 @@ def evidence_of_sizes(
     return evidence, noises
 
 
-@kernel
+@inlined
 def tridiagonal(matrix: Array, column: Array) -> tuple[Array, Array, float]:
     """A symmetric matrix (q,q) in the axes in which it is tridiagonal and a column lies along the
     first one: shifted by any multiple of the identity, it is solved and has its determinant in q
@@ -203,7 +203,7 @@ def possible(evidence: Array, prior: Array, sizes: Array, noises: Array) -> Arra
     return np.array([square, noise, weights[0] / total, highest + np.log(total)])
 
 
-@kernel
+@inlined
 def sizes_of(
     columns: Columns, freedom: float, noise: float,
     shake_sizes: Array, shake_prior: Array, field_sizes: Array, field_prior: Array,

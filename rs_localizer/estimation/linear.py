@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.model_error import Examined, judged
@@ -54,7 +54,7 @@ def foreseen(
     return near, apply_step(start, step), examined.cost, examined
 
 
-@kernel
+@inlined
 def _still(state: Array, columns: Columns) -> tuple[Columns, Array]:
     """Columns of motion and field told from a camera at rest, and the step (18,) there.
 

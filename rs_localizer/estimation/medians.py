@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 
 
 @kernel
@@ -16,7 +16,7 @@ def median_of(values: Array, chosen: BoolArray) -> float:
     return float(np.partition(of, middle)[middle]) if len(of) > 0 else np.nan
 
 
-@kernel
+@inlined
 def median_point(points: Array, chosen: BoolArray) -> Array:
     """Median (3,) of each coordinate over some of the points (n,3); zero if there are none."""
     median = np.zeros(3)

@@ -11,7 +11,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.estimation.averaging import longest_axis
 from rs_localizer.estimation.posterior import Mirror
 
@@ -75,7 +75,7 @@ def _leaning_less(
     return True, other
 
 
-@kernel
+@inlined
 def _plane(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
     """Whether the points that count lie on a plane, their centre (3,) and its normal (3,)."""
     centre, spread, count = np.zeros(3), np.zeros((3, 3)), 0

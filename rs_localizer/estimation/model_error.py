@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.shake import FIRST_DEGREE
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.assumptions import FIELD_PRIOR
@@ -47,7 +47,7 @@ RIDGE = 1.0 + 1e-14
 _TRIED = np.array([1e-3, 0.3, 0.6, 1.2, 2.5, 10.0])
 
 
-@kernel
+@inlined
 def with_model_error(
     columns: Columns, noise: float, shake_size: float, field_size: float
 ) -> tuple[Array, Array]:
@@ -127,7 +127,7 @@ def neighbours_agree(errors: Array, tau: Array, rays: Array, inliers: BoolArray)
     return normalized
 
 
-@kernel
+@inlined
 def shared_errors(errors: Array, rays: Array, inliers: BoolArray) -> float:
     """Correlation of the errors of points with those of their nearest neighbours in the image.
 

@@ -13,6 +13,7 @@ import numpy as np
 from rs_localizer.config import Acceleration
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import add_block
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import shake_in_the_middle
@@ -57,22 +58,22 @@ def _later(
     turned = so3.right_jacobian_of(angle)
     velocity = back @ (linear + faster * acceleration)
     transport = np.zeros((PARAMETERS, PARAMETERS))
-    _place(transport, _TURN, _TURN, 1.0, back)
-    _place(transport, _TURN, _ANGULAR, readouts, turned)
-    _place(transport, _TURN, _CHANGE, farther, turned)
-    _place(transport, _MOVE, _MOVE, 1.0, back)
-    _place(transport, _MOVE, _TURN, -1.0, back @ so3.hat_of(way))
-    _place(transport, _MOVE, _LINEAR, readouts, back)
-    _place(transport, _MOVE, _ACCELERATION, farther, back)
-    _place(transport, _LINEAR, _LINEAR, 1.0, back)
-    _place(transport, _LINEAR, _ACCELERATION, faster, back)
-    _place(transport, _ACCELERATION, _ACCELERATION, left, back)
+    add_block(transport, _TURN, _TURN, 1.0, back)
+    add_block(transport, _TURN, _ANGULAR, readouts, turned)
+    add_block(transport, _TURN, _CHANGE, farther, turned)
+    add_block(transport, _MOVE, _MOVE, 1.0, back)
+    add_block(transport, _MOVE, _TURN, -1.0, back @ so3.hat_of(way))
+    add_block(transport, _MOVE, _LINEAR, readouts, back)
+    add_block(transport, _MOVE, _ACCELERATION, farther, back)
+    add_block(transport, _LINEAR, _LINEAR, 1.0, back)
+    add_block(transport, _LINEAR, _ACCELERATION, faster, back)
+    add_block(transport, _ACCELERATION, _ACCELERATION, left, back)
     across = so3.hat_of(velocity) @ turned
-    _place(transport, _LINEAR, _ANGULAR, readouts, across)
-    _place(transport, _LINEAR, _CHANGE, farther, across)
+    add_block(transport, _LINEAR, _ANGULAR, readouts, across)
+    add_block(transport, _LINEAR, _CHANGE, farther, across)
     # Without acceleration the body rate stays what it is, however far the camera turns.
     mean = farther / readouts
-    _place(transport, _ANGULAR, _CHANGE, faster - mean, turned)
+    add_block(transport, _ANGULAR, _CHANGE, faster - mean, turned)
     for axis in range(3):
         transport[_ANGULAR + axis, _ANGULAR + axis] = 1.0
         transport[_ANGULAR + axis, _CHANGE + axis] += mean
@@ -82,14 +83,6 @@ def _later(
         left * change, left * (back @ acceleration),
     )  # fmt: skip
     return later, transport @ covariance @ transport.T
-
-
-@kernel
-def _place(matrix: Array, row: int, column: int, factor: float, block: Array) -> None:
-    """Write a multiple of a block (3,3) into a matrix."""
-    for i in range(3):
-        for j in range(3):
-            matrix[row + i, column + j] = factor * block[i, j]
 
 
 def acceleration_covariance(acceleration: Acceleration, dt: float, readout_time: float) -> Array:

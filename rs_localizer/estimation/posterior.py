@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.packing import weighted
@@ -121,7 +121,7 @@ def noise_deviation(squared_errors: Array, gate: float, freedom: float) -> float
     return max(math.sqrt(variance), LEAST_NOISE)
 
 
-@kernel
+@inlined
 def decided(inverse: Array, prior: PriorTerms, noise: float) -> float:
     """How many of the parameters the points decide, and not the prior.
 
@@ -138,7 +138,7 @@ def decided(inverse: Array, prior: PriorTerms, noise: float) -> float:
     return max(total, 0.0)
 
 
-@kernel
+@inlined
 def _least_eigenvalue(information: Array, inverse: Array) -> float:
     """Of an information matrix scaled to a unit diagonal; where it is large enough, a bound."""
     total = 0.0  # of the eigenvalues of the scaled inverse

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     PARAMETERS,
@@ -62,7 +62,7 @@ def add_prior(
     return cost
 
 
-@kernel
+@inlined
 def _add_posed(
     prior: Array,
     pulled: Array,
@@ -102,7 +102,7 @@ def _add_posed(
             information[i, j] += weight * half[i, j]
 
 
-@kernel
+@inlined
 def _pose_offset(
     state: Array, reference: Array, offset: Array, by_turn: Array, by_move: Array
 ) -> None:
@@ -138,7 +138,7 @@ def _pose_offset(
         offset[3 + i] = reference[9 + i] - moved
 
 
-@kernel
+@inlined
 def _add_gravity(
     gravity: Array, state: Array, weight: float, information: Array, slope: Array
 ) -> float:

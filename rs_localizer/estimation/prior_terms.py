@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,
@@ -186,7 +186,7 @@ def _with_motion(
     return found, of
 
 
-@kernel
+@inlined
 def _inverse(covariance: Array) -> Array:
     """Information (18,18) of a covariance, zero for parameters of infinite variance."""
     places = np.flatnonzero(np.isfinite(np.diag(covariance)))

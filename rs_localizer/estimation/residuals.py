@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced, traced_sums
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
@@ -238,7 +239,7 @@ def linearized(
     by_turn, tau = np.empty((count, 2, 3)), np.empty(count)
     for block in range(len(data)):
         first = block * LANES
-        block_data[: POINT_SIZE * LANES] = data[block]
+        write(block_data[: POINT_SIZE * LANES], data[block])
         here = min(LANES, count - first)
         for lane in range(here):
             for k in range(SHAKE_SIZE):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 
 Random = NDArray[np.uint64]  # (1,), the state of the generator
 
@@ -50,7 +50,7 @@ class Pool:
         return np.minimum(size + np.searchsorted(expected, drawn), total).astype(np.int64)
 
 
-@kernel
+@inlined
 def _next(random: Any) -> Any:
     """SplitMix64 (Steele, Lea, Flood, OOPSLA 2014): the next 64 bits; ``random`` is (1,) uint64."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import STATE_SIZE
 from rs_localizer.estimation.prior_terms import PriorTerms
@@ -57,10 +58,10 @@ def best_models(
                 place = keep - 1
                 while place > 0 and cost < costs[place - 1]:
                     costs[place] = costs[place - 1]
-                    states[place] = states[place - 1]
+                    write(states[place], states[place - 1])
                     place -= 1
                 costs[place] = cost
-                states[place] = state
+                write(states[place], state)
     return states, costs
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.model_error import RIDGE
 from rs_localizer.estimation.refine import LEAST_NOISE, half_inverse, inverted
@@ -98,7 +98,7 @@ def _weighed(
         matrix[i, i] *= RIDGE
 
 
-@kernel
+@inlined
 def _solved(half: Array, scale: Array, right: Array) -> Array:
     """The inverse (see :func:`half_inverse`) times a column (m,)."""
     count = len(right)
@@ -114,7 +114,7 @@ def _solved(half: Array, scale: Array, right: Array) -> Array:
     return solution
 
 
-@kernel
+@inlined
 def _variances(half: Array, scale: Array, variances: Array) -> None:
     """The diagonal (m,) of the inverse."""
     variances[:] = 0.0
@@ -126,7 +126,7 @@ def _variances(half: Array, scale: Array, variances: Array) -> None:
         variances[i] *= scale[i] * scale[i]
 
 
-@kernel
+@inlined
 def _by_prior(half: Array, scale: Array, information: Array) -> float:
     """The trace of the first parameters' covariance times the information of their prior."""
     size = len(information)
@@ -145,7 +145,7 @@ def _by_prior(half: Array, scale: Array, information: Array) -> float:
     return total
 
 
-@kernel
+@inlined
 def _share(found: Array, least: float, sizes: Array) -> None:
     """Mean squares of the neighbouring degrees, even and odd alike."""
     count = len(found)

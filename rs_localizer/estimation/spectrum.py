@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.tones import MOST_CYCLES
@@ -101,13 +102,14 @@ def spectrum(
     shared = _shared_by_rows(errors, columns, by_turn, tau, chosen)
     size = base + _TONE
     products, right = np.zeros((size, size)), np.zeros(size)
-    products[:base, :base] = known.products
-    right[:base] = known.with_errors
+    for i in range(base):
+        write(products[i, :base], known.products[i])
+    write(right[:base], known.with_errors)
     evidence = np.empty((len(CYCLES), len(SWINGS)))
     for m in range(len(CYCLES)):
         _with_tone(shared, m, base, products, right)
         left = project_out(products, right, known.squared_errors, _TONE)
-        evidence[m], _ = evidence_of_sizes(left, SWINGS, freedom, noise)
+        write(evidence[m], evidence_of_sizes(left, SWINGS, freedom, noise)[0])
     return evidence
 
 

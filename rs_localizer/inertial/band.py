@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
@@ -66,10 +67,10 @@ def densified(times: Array, rates: Array) -> tuple[Array, Array]:
     dense, found = np.empty(2 * count - 1), np.zeros((2 * count - 1, 3))
     for i in range(count):
         dense[2 * i] = times[i]
-        found[2 * i] = rates[i]
+        write(found[2 * i], rates[i])
         if i + 1 < count:
             between = 0.5 * (times[i] + times[i + 1])
-            found[2 * i + 1] = mean
+            write(found[2 * i + 1], mean)
             dense[2 * i + 1] = between
             here, aside = np.sin(width * between), np.cos(width * between)
             for k in range(count):

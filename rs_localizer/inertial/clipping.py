@@ -12,14 +12,14 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 
 _EPSILON = float(np.finfo(np.float64).eps)
 # QL steps in all, for n eigenvalues: (least, for each); about two for each do.
 _MOST_STEPS = (30, 4)
 
 
-@kernel
+@inlined
 def clipped_product(matrix: Array, limit: float, columns: Array) -> Array:
     """``V min(D, limit) V^T columns`` for a symmetric matrix ``V D V^T`` (n,n) and columns (n,m).
 
@@ -42,7 +42,7 @@ def clipped_product(matrix: Array, limit: float, columns: Array) -> Array:
     return product
 
 
-@kernel
+@inlined
 def _tridiagonal(matrix: Array) -> tuple[Array, Array]:
     """Diagonal (n,) and what is beside it (n,), the last 0, of a matrix that is made tridiagonal.
 
@@ -105,7 +105,7 @@ def _reflect(vector: Array, first: int, columns: Array) -> None:
             columns[i, column] -= along * vector[i]
 
 
-@kernel
+@inlined
 def _diagonalized(diagonal: Array, beside: Array, columns: Array) -> Array:
     """Make a tridiagonal matrix diagonal, and turn columns (n,m) with it.
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
 from rs_localizer.core.state import (
     ANGULAR,
@@ -267,7 +267,7 @@ def _learned(
     return gain @ step, covariance, tied
 
 
-@kernel
+@inlined
 def _gain(before: Array, after: Array, with_parameters: Array) -> tuple[Array, Array, Array]:
     """Gain (4,k), what it takes from the covariance (4,4), and what is left of the one (k,4).
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, differentiate, make_row
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL, ORDER
 
@@ -77,7 +77,7 @@ def record(curve: Curve, sights: Sights, terms: Terms, values: Array) -> None:
             out[LOCAL + shared + 3] = scale * row.error[r]
 
 
-@kernel
+@inlined
 def _invert(a: Array, out: Array) -> None:
     """Inverse of a symmetric positive (3,3) matrix."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
@@ -124,7 +124,7 @@ def gather(rows: Rows, landmark: int, scratch: Scratch) -> int:
     return runs
 
 
-@kernel
+@inlined
 def _touch(rows: Rows, landmark: int, scratch: Scratch, shared: int) -> tuple[int, int]:
     """List the controls that see a landmark, and clear what couples it with them; returns their
     number, and that of their runs and of the shared numbers' one.
@@ -236,7 +236,7 @@ def slopes(rows: Rows, out: Array) -> None:
         out[landmark] = scratch.slope
 
 
-@kernel
+@inlined
 def _within(scratch: Scratch, runs: int, inverse: Array, out: Array) -> None:
     """``W^T S^-1 W`` (3,3), by the lower triangle of ``S^-1``: what lies beside its diagonal
     counts twice.

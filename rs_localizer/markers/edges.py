@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.blocks import write
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.markers.profiles import BLACK, CUT, SEEN, VARIANCE, WHITE, edge_points
 
 # Most points along a side, of each round: the first only has to get near.
@@ -70,7 +71,7 @@ def _fit(s: Array, e: Array, used: NDArray[np.bool_], parabola: bool, c: Array) 
     return n
 
 
-@kernel
+@inlined
 def _depth(q: Array, at: int) -> float:
     """The lesser distance (px) of the far corners from the side that corner ``at`` begins."""
     a, b = q[at], q[(at + 1) % 4]
@@ -97,7 +98,7 @@ def _width(rises: Array) -> float:
     return math.sqrt(12.0 * max(rises[VARIANCE] - _SHARP_VARIANCE, 0.0))
 
 
-@kernel
+@inlined
 def _levels(rises: Array, at: int, cell: float) -> tuple[float, float]:
     """The level half way up the edge of a side, and how far around it to go, where its rises
     (4,5) of the round before are not whole; else NaN.
@@ -117,7 +118,7 @@ def _levels(rises: Array, at: int, cell: float) -> tuple[float, float]:
     return 0.5 * (black + own), _AROUND * (own - black)
 
 
-@kernel
+@inlined
 def _side(
     image: NDArray[np.uint8],
     q: Array,
@@ -144,14 +145,14 @@ def _side(
     cell = _depth(q, at) / cells
     levels = _levels(before, at, cell)
     half = min(max(_HALF_CELLS * cell, _HALF_LEAST), _HALF_MOST)
-    rises[:] = edge_points(image, a, b, half, levels, s, e)
+    write(rises, edge_points(image, a, b, half, levels, s, e))
     while rises[CUT] * rises[SEEN] > count // 2 and half < cell:
         half = min(_LONGER * half, cell)
-        rises[:] = edge_points(image, a, b, half, levels, s, e)
+        write(rises, edge_points(image, a, b, half, levels, s, e))
     return _fit_twice(s, e, length >= _PARABOLA_FROM, c)
 
 
-@kernel
+@inlined
 def _fit_twice(s: Array, e: Array, parabola: bool, c: Array) -> bool:
     """Fit the points that are no NaN, then those that are near the first fit."""
     count, used = len(s), ~np.isnan(e)
@@ -169,7 +170,7 @@ def _fit_twice(s: Array, e: Array, parabola: bool, c: Array) -> bool:
     return _fit(s, e, used, parabola, c) >= max(_LEAST_POINTS, count // 2)
 
 
-@kernel
+@inlined
 def _corner(q: Array, at: int, before: Array, after: Array) -> tuple[float, float]:
     """Where the tangents of two sides meet, taken at the sides' ends in this corner."""
     p, r = (at + 3) % 4, (at + 1) % 4
@@ -218,12 +219,12 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
                 good[s] = _side(image, q, s, cells[m], most_points, before, rises[s], curves[s])
             for k in range(4):
                 found[m, k] = good[k] and good[(k + 3) % 4]
-                moved[k] = q[k]
+                write(moved[k], q[k])
                 if found[m, k]:
                     x, y = _corner(q, k, curves[(k + 3) % 4], curves[k])
                     moved[k, 0], moved[k, 1] = x, y
-            q[:] = moved
-            before[:] = rises
+            write(q, moved)
+            write(before, rises)
         dx, dy = quads[m, 1, 0] - quads[m, 0, 0], quads[m, 1, 1] - quads[m, 0, 1]
         most = max(_MOST_MOVE_PIXELS, _MOST_MOVE_CELLS * math.sqrt(dx * dx + dy * dy) / cells[m])
         for k in range(4):
@@ -231,5 +232,5 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
             # Comparison with NaN is false.
             found[m, k] = found[m, k] and dx * dx + dy * dy <= most * most
             if found[m, k]:
-                quads[m, k] = q[k]
+                write(quads[m, k], q[k])
     return found

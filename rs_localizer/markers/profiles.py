@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 
 # px between the samples of a profile; more for one that reaches farther than so many steps.
 _STEP, _MOST_STEPS = 0.5, 7
@@ -62,11 +62,13 @@ def edge_points(
         if _sample(image, x - reach * nx, y - reach * ny, step * nx, step * ny, profile):
             e[k] = step * _edge(profile, levels, step, rises) - reach
     if rises[SEEN] > 0.0:
-        rises[1:] /= rises[SEEN]
+        seen = rises[SEEN]
+        for i in range(1, len(rises)):
+            rises[i] /= seen
     return rises
 
 
-@kernel
+@inlined
 def _sample(
     image: NDArray[np.uint8], x: float, y: float, dx: float, dy: float, profile: Array
 ) -> bool:
@@ -90,7 +92,7 @@ def _outside(image: NDArray[np.uint8], x: float, y: float) -> bool:
     return not (0.0 <= x < width - 1.0 and 0.0 <= y < height - 1.0)
 
 
-@kernel
+@inlined
 def _edge(profile: Array, levels: tuple[float, float], step: float, rises: Array) -> float:
     """The place (samples) of the steepest unbroken rise, which is added to the rises; NaN: none.
 

@@ -13,7 +13,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 
 _BLOCK = 256  # landmarks whose words stay in the first cache
 _FAR = 1 << 30
@@ -41,7 +41,7 @@ def _insert(distance: float, index: int, distances: Any, indices: Any) -> None:
         distances[1], indices[1] = distance, index
 
 
-@kernel
+@inlined
 def _hamming(query: Any, columns: Any, start: int, count: int, found: Any) -> None:
     """Distances of one descriptor (w,) to ``count`` columns of (w,n)."""
     for word in range(0, len(query), 4):

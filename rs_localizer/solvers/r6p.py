@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.algebra import cross, dot, least_squares, triangularize
 from rs_localizer.core.lanes.eigenvalues import real_eigenvalues, reduce_to_hessenberg
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, select, traced
 from rs_localizer.core.lanes.vectors import lane_array
 from rs_localizer.solvers import linear, rank_drop
@@ -123,7 +123,7 @@ _begin_lanes = traced(_begin, _INPUTS)
 _solution_lanes = traced(_solution, _INPUTS + _A, _CANDIDATE)
 
 
-@kernel
+@inlined
 def _nearest_first(solutions: Array, count: int, lane: int) -> None:
     """Order a lane's solutions by length of v; those that are none, and NaN, come last."""
     for k in range(count):

@@ -21,7 +21,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.algebra import least_squares
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced
 from rs_localizer.core.lanes.vectors import load, root, store, uniform, where_less
 
@@ -122,7 +122,7 @@ def _collect(
             store(operands, 4 * size + count * i + k, load(smaller, begin + stride * others + k))
 
 
-@kernel
+@inlined
 def find_relations(matrix: Array, offset: int, work: Array, relations: Array) -> None:
     """The relations of the quotient ring.
 
@@ -147,7 +147,7 @@ def find_relations(matrix: Array, offset: int, work: Array, relations: Array) ->
     _back_substitute(work, relations)
 
 
-@kernel
+@inlined
 def _triangularize(work: Array, axis: Array) -> None:
     """Householder QR of the quartics, the monomials of degree four first; room for a column."""
     zero, one = uniform(0.0), uniform(1.0)
@@ -178,7 +178,7 @@ def _triangularize(work: Array, axis: Array) -> None:
                 store(work, entry, load(work, entry) + load(axis, i) * product)
 
 
-@kernel
+@inlined
 def _back_substitute(work: Array, relations: Array) -> None:
     """Solve the last ten rows, which hold no other monomial of degree four, for ``y m``."""
     count = _WIDTH - _FIRST_Y
@@ -192,7 +192,7 @@ def _back_substitute(work: Array, relations: Array) -> None:
             store(relations, i * SOLUTIONS + j, rest * inverse)
 
 
-@kernel
+@inlined
 def fill_multiplication(relations: Array, h: Array) -> None:
     """Multiplication by y as a matrix, stored as in :mod:`rs_localizer.core.lanes.eigenvalues`."""
     for i in range((SOLUTIONS + 1) ** 2):

@@ -6,8 +6,9 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.shutter import Motion
 
 # Directions that the image does not see: least eigenvalue of the information, diagonal scaled to 1.
@@ -59,7 +60,7 @@ def _seen(
     turns, local = np.empty((count, 3, 3)), np.empty((count, 3))
     there = np.empty(3)
     for n in range(count):
-        turns[n] = so3.exp(-tau[n] * omega)
+        write(turns[n], so3.exp(-tau[n] * omega))
         for i in range(3):
             there[i] = translation[i] - tau[n] * v[i]
             for j in range(3):
@@ -128,7 +129,7 @@ def _normal(
     return information, slope, squared, used
 
 
-@kernel
+@inlined
 def _line(
     g: Array, turned: Array, point: Array, turn: Array, tau: float, omega: Array, v: Array,
     work: Array, line: Array,

@@ -10,7 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.rate_spline import multiplied
 from rs_localizer.core.so3 import log
 from rs_localizer.estimation.refine import inverted
 
@@ -67,7 +69,7 @@ def score(of: Equations, value: float) -> Score:
             for j in range(SIDE):
                 both = of.yx[n, i, j] + of.yx[n, j, i]
                 spread[i, j] = of.yy[n, i, j] - value * both + value * value * of.xx[n, i, j]
-        weights[n] = inverted(spread)
+        write(weights[n], inverted(spread))
         for i in range(SIDE):
             for j in range(SIDE):
                 squared[n] += error[n, i] * weights[n, i, j] * error[n, j]
@@ -125,21 +127,27 @@ def equation(
     span = first + second
     # Integral of the parabola through three values (Simpson's rule for unlike intervals).
     shares = (2.0 - second / first, span * span / (first * second), 2.0 - first / second)
-    back = np.ascontiguousarray(now.rotation.T)
-    x, y = of.x[place], of.y[place]
-    x[:3] = log(np.ascontiguousarray(before.rotation.T) @ now.rotation)
-    x[:3] += log(back @ after.rotation)
-    x[3:] = back @ (after.position - before.position)
-    x /= span
-    y[:], of.xx[place], of.yx[place], of.yy[place] = 0.0, 0.0, 0.0, 0.0
-    axes = np.eye(2 * SIDE)  # now from then; turns add up in the camera's own axes
+    back = now.rotation.T.copy()
+    onward = log(multiplied(before.rotation.T.copy(), now.rotation))
+    further = log(multiplied(back, after.rotation))
+    for i in range(3):
+        way = 0.0
+        for j in range(3):
+            way += back[i, j] * (after.position[j] - before.position[j])
+        of.x[place, i], of.x[place, 3 + i] = (onward[i] + further[i]) / span, way / span
+    of.y[place], of.xx[place], of.yx[place], of.yy[place] = 0.0, 0.0, 0.0, 0.0
     views = (before, now, after)
     for k in range(3):
-        axes[3:6, 3:6] = back @ views[k].rotation
-        axes[9:, 9:] = axes[3:6, 3:6]
+        axes = np.eye(2 * SIDE)  # now from then; turns add up in the camera's own axes
+        moved = multiplied(back, views[k].rotation)
+        for i in range(3):
+            for j in range(3):
+                axes[3 + i, 3 + j] = axes[9 + i, 9 + j] = moved[i, j]
         covariance = axes @ views[k].covariance @ axes.T
         share, pace = shares[k] / 6.0, (k - 1.0) / span
-        y += share * (axes[:SIDE, :SIDE].copy() @ views[k].motion)
-        of.xx[place] += pace * pace * covariance[:SIDE, :SIDE]
-        of.yx[place] += pace * share * covariance[SIDE:, :SIDE]
-        of.yy[place] += share * share * covariance[SIDE:, SIDE:]
+        for i in range(SIDE):
+            for j in range(SIDE):
+                of.y[place, i] += share * axes[i, j] * views[k].motion[j]
+                of.xx[place, i, j] += pace * pace * covariance[i, j]
+                of.yx[place, i, j] += pace * share * covariance[SIDE + i, j]
+                of.yy[place, i, j] += share * share * covariance[SIDE + i, SIDE + j]

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.so3 import coefficients, log
 
 ORDER = 4
@@ -51,7 +51,7 @@ def product(a: Array, b: Array, out: Array) -> None:
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@kernel
+@inlined
 def turn(vector: Array, scale: float, rotation: Array, jacobian: Array) -> None:
     """``exp(scale v)`` and ``scale`` times the right Jacobian of the exponential there."""
     x, y, z = scale * vector[0], scale * vector[1], scale * vector[2]
@@ -74,7 +74,7 @@ def turn(vector: Array, scale: float, rotation: Array, jacobian: Array) -> None:
     jacobian[2, 1] = scale * (third * yz - second * x)
 
 
-@kernel
+@inlined
 def inverse_right_jacobian(v: Array, out: Array) -> None:
     """Inverse of the right Jacobian of the exponential at a rotation vector; its transpose is
     that of the left one.

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.jit import inlined
 from rs_localizer.core.lanes.simd import LANES
 from rs_localizer.core.lanes.vectors import absolute, load, root, store, uniform, where_less
 
@@ -25,7 +25,7 @@ _EPSILON = 2.0**-52
 _SWEEPS = 8  # per eigenvalue of the slowest lane; the usual number is below two
 
 
-@kernel
+@inlined
 def reduce_to_hessenberg(h: Array, n: int, axis: Array) -> None:
     """Similarity transformation to upper Hessenberg form, in place.
 
@@ -65,7 +65,7 @@ def reduce_to_hessenberg(h: Array, n: int, axis: Array) -> None:
                 store(h, i * row + j, load(h, i * row + j) + load(axis, j) * product)
 
 
-@kernel
+@inlined
 def _sweep(h: Array, n: int, first: Array, last: Array, bulge: Array) -> None:
     """One implicit double shift in the window ``first .. last`` of every lane.
 
@@ -125,7 +125,7 @@ def _sweep(h: Array, n: int, first: Array, last: Array, bulge: Array) -> None:
             store(h, at + 2, c - s * r)
 
 
-@kernel
+@inlined
 def _find_windows(h: Array, n: int, first: Array, last: Array) -> None:
     """Set ``first`` to the top of the unreduced block that ends at ``last``, in every lane."""
     row = n + 1
@@ -145,7 +145,7 @@ def _find_windows(h: Array, n: int, first: Array, last: Array) -> None:
     store(first, 0, top)
 
 
-@kernel
+@inlined
 def _deflate(
     h: Array, n: int, lane: int, begin: int, end: int, bound: float, counts: Any, found: Array
 ) -> None:
@@ -168,7 +168,7 @@ def _deflate(
             counts[lane] += 1
 
 
-@kernel
+@inlined
 def _shift(
     h: Array, n: int, lane: int, begin: int, end: int, exceptional: bool, bulge: Array
 ) -> None:
@@ -189,7 +189,7 @@ def _shift(
     bulge[2 * LANES + lane] = below * h[at + 2 * row + LANES]
 
 
-@kernel
+@inlined
 def real_eigenvalues(
     h: Array, n: int, bound: float, work: Array, counts: Any, eigenvalues: Array
 ) -> None:

@@ -77,13 +77,35 @@ def _stamp(file: str) -> str:
 
 def kernel(function: F) -> F:
     """Compile a function with Numba: cached on disk, without the GIL, NaN preserved."""
-    compiled: Any = numba.njit(
+    return _compiled(function, "never")
+
+
+def inlined(function: F) -> F:
+    """A :func:`kernel` that one other calls, at one place: compiled as a part of it.
+
+    By itself it would be compiled, optimized and kept on disk twice, once for nobody.
+    """
+    return _compiled(function, "always")
+
+
+def _compiled(function: F, inline: str) -> F:
+    njit: Any = numba.njit  # its type knows fewer options than it does
+    compiled = njit(
         nogil=True,
+        inline=inline,
+        no_cfunc_wrapper=True,  # for C's callbacks, which nobody wants
         # Without it every division is checked for zero, which stops vectorization.
         error_model="numpy",
         # NaN and infinity keep their meaning: they mark lanes and points without a solution.
         fastmath={"contract", "reassoc", "nsz", "arcp"},
     )(function)
+    template = compiled.get_call_template
+    # Numba would compile a callee for every constant among its arguments, as often with all that
+    # it calls.
+    compiled.get_call_template = lambda given, named: template(
+        tuple(map(numba.types.unliteral, given)),
+        {name: numba.types.unliteral(kind) for name, kind in named.items()},
+    )
     if Path(function.__code__.co_filename).is_file():  # not what was typed at a prompt
         compiled._cache = _Cache(function)
     return cast(F, compiled)

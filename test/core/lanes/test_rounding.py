@@ -17,12 +17,13 @@ import rs_localizer
 
 PACKAGE = Path(rs_localizer.__file__).parent
 FOLDERS = ("core", "solvers", "estimation", "inertial")
+MARKS = ("kernel", "inlined")
 
 
 def innermost_loops(source: str) -> Iterator[ast.For]:
     for function in ast.walk(ast.parse(source)):
         if isinstance(function, ast.FunctionDef) and any(
-            isinstance(mark, ast.Name) and mark.id == "kernel" for mark in function.decorator_list
+            isinstance(mark, ast.Name) and mark.id in MARKS for mark in function.decorator_list
         ):
             for loop in ast.walk(function):
                 if isinstance(loop, ast.For) and not any(
