@@ -147,6 +147,7 @@ class Tracker:
                 covariance=covariance,
                 of_shake_sizes=_shaken(track.experience.of_shake_sizes, track.jolts),
                 of_field_sizes=track.experience.of_field_sizes,
+                of_tones=track.experience.of_tones,
             )
         except ValueError:  # rounding errors are all that is left of the covariance
             return None
