@@ -8,7 +8,6 @@ from typing import Self
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.tone_memory import with_frame
 
 # What a frame says fades by this from frame to frame, and counts as part of what an independent
 # frame would say: the next frame shows much the same.
@@ -22,20 +21,17 @@ class Experience:
 
     of_shake_sizes: Array
     of_field_sizes: Array
-    # Of each tone, for the next frame; None: nothing is known.
-    of_tones: Array | None = None
 
     @classmethod
     def of(cls, first: Estimate) -> Self:
         """That of one frame."""
-        return cls(first.of_shake_sizes, first.of_field_sizes, with_frame(None, first))
+        return cls(first.of_shake_sizes, first.of_field_sizes)
 
     def and_of(self, newest: Estimate) -> Experience:
         """The experience after one more frame."""
         return Experience(
             _MEMORY * self.of_shake_sizes + _INDEPENDENT * newest.of_shake_sizes,
             _MEMORY * self.of_field_sizes + _INDEPENDENT * newest.of_field_sizes,
-            with_frame(self.of_tones, newest),
         )
 
     @property

@@ -17,7 +17,7 @@ from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR
 from rs_localizer.estimation.spectrum import CYCLES, SWINGS
 
 # Probability that from frame to frame the shaking becomes another, or none.
-_CHANGES = 0.05
+_CHANGES = 0.02
 # Beforehand, a tone is as probable as none.
 _EACH = 0.5 / (len(CYCLES) * (len(SWINGS) - 1))
 
