@@ -140,7 +140,10 @@ def any_vibration(
     tones: int = 1,
 ) -> Motions:
     """The same by some tones between these limits, one camera another than the next."""
-    drawn = [np.exp(rng.uniform(*np.log(of), (tones, count))) for of in (degrees, hertz)]
+    drawn = [
+        np.exp(rng.uniform(math.log(low), math.log(high), (tones, count)))
+        for low, high in (degrees, hertz)
+    ]
     each = [vibration(count, rng, *one) for one in zip(*drawn, strict=True)]
     return _with_last_of(each[0], each[1:])
 
