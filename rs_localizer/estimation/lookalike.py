@@ -16,8 +16,8 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.state import ACCELERATIONS, PARAMETERS, TURN, step_between
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.state import ACCELERATIONS, PARAMETERS, TURN, step_between
 from rs_localizer.estimation.averaging import longest_axis
 from rs_localizer.estimation.curvature import told_from
 from rs_localizer.estimation.modes import Mode
@@ -28,8 +28,8 @@ _AS_WELL = 10.0
 # Second moments of the motion that the region holds, times this: motions that look like rest are at
 # the edge of what motions do, and the valley is curved.
 _TIMES = 3.0
-# A motion whose pose may be so many radians off, twice what is accepted by default, leaves no pose to
-# publish: the region holds the longest turn, too.
+# A motion whose pose may be so many radians off, twice what is accepted by default, leaves no pose
+# to publish: the region holds the longest turn, too.
 _TOO_FAR = math.radians(8.0)
 _ROUNDS = 3  # one for each axis of a turn
 
@@ -41,7 +41,7 @@ def holding_motion(modes: list[Mode], state: Array, covariance: Array) -> Array:
     """
     least = min(mode.cost for mode in modes) + _AS_WELL
     speed = max(mode.speed for mode in modes)
-    if not any(mode.speed == 0.0 and mode.cost < least for mode in modes):
+    if speed == 0.0 or not any(mode.speed == 0.0 and mode.cost < least for mode in modes):
         return covariance
     farthest, held = 0.0, None
     for mode in modes:
