@@ -11,8 +11,6 @@ anyway, and decides whether a pose is published.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rs_localizer.core.arrays import Array
@@ -28,9 +26,6 @@ _AS_WELL = 10.0
 # Second moments of the motion that the region holds, times this: motions that look like rest are at
 # the edge of what motions do, and the valley is curved.
 _TIMES = 3.0
-# A motion whose pose may be so many radians off, twice what is accepted by default, leaves no pose
-# to publish: the region holds the longest turn, too.
-_TOO_FAR = math.radians(8.0)
 _ROUNDS = 3  # one for each axis of a turn
 
 
@@ -52,8 +47,6 @@ def holding_motion(modes: list[Mode], state: Array, covariance: Array) -> Array:
                 farthest, held = turn, moment
     if held is None or not np.all(np.isfinite(covariance)):
         return covariance
-    if farthest > _TOO_FAR:
-        return covariance + held
     wider: Array = _widened(covariance, _TIMES * held)
     return wider
 
