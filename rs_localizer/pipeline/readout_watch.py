@@ -29,6 +29,8 @@ _SHARE = 300
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
+# Of the odds for it (logarithm), what has to be there beside that.
+_SUPPORTED = 1.0
 # Of the setting: from here on frames that stand alone are better than tracked ones, and from here
 # on nothing tells the shutter from a global one.
 _FAR_OFF, _GLOBAL = 0.5, 0.2
@@ -139,7 +141,8 @@ class ReadoutWatch:
             if estimates:
                 return self._adopt(config, found)
             wrong = _wrong(config, found)
-            if wrong is _Kind.REVERSED:
+            # Errors of the map may look like motion, but do not change as motion does.
+            if wrong is _Kind.REVERSED and self._monitor.odds.of_reversed > _SUPPORTED:
                 return self._turn_round(config)
             self._judge(config, found, wrong)
         return self._doubt(config)
@@ -170,8 +173,11 @@ class ReadoutWatch:
         return replace(config, scan_direction=REVERSED[given].value)
 
     def _judge(self, config: NodeConfig, found: MeasuredReadout, wrong: _Kind | None) -> None:
+        sure = self._monitor.odds.certain  # of a global one, whatever errors of the map look like
         if wrong is None:
             self._contradiction = ""
+        elif sure:
+            self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
         else:
             self._contradict(wrong, _sentence(wrong, config, found))
         off = math.hypot(found.readout_time - config.readout_time, found.deviation)
@@ -182,7 +188,7 @@ class ReadoutWatch:
         may_be = _may_be_none(config, found)
         self.far_off = may_be and (self.far_off or wrong is not None)
         self.global_shutter = self.far_off and (
-            self.global_shutter if wrong is None else wrong is _Kind.GLOBAL
+            self.global_shutter if wrong is None else sure or wrong is _Kind.GLOBAL
         )
 
     def _contradict(self, kind: _Kind, text: str) -> None:

@@ -25,14 +25,16 @@ _MEMORY = 0.95
 # independent ones would say, this part.
 _INDEPENDENT = 1.0 / 6.0
 # Of the least mean square that any value leaves, what one triple may say: four of twenty are not
-# enough to be certain.
-_MOST = 3.9
+# enough to be certain, but one is to doubt.
+_MOST = np.array([[3.9], [10.0]])
 # Mean square of what changes at no readout time, in variances of its noise, that noise alone makes.
 _MOST_SCATTER = 1.5
 _CERTAIN, _OVERWHELMING = math.log(100.0), math.log(1000.0)
 # A camera that moves so much that the odds should be this (logarithm), if the setting were right,
 # has to show at least a part of it.
 _TELLING, _LEAST_SHOWN = 1.0, 0.5
+# Odds (logarithm) of another value that are enough to doubt; at rest, chance makes less.
+_DOUBT = 2.0
 # Of the variance of the way's noise, what is taken from its square: it may be wrong, and scatters.
 _WAY_NOISE = 2.0
 
@@ -45,12 +47,12 @@ class ShutterOdds:
     """Compares the newest triples with those before them."""
 
     def __init__(self) -> None:
-        self._count = 0.0
-        self._left = np.zeros(4)
+        self.reset()
 
     def reset(self) -> None:
         """Forget all triples."""
-        self._count, self._left = 0.0, np.zeros(4)
+        self._count = 0.0
+        self._left = np.zeros((2, 4))  # to be certain, and to doubt
 
     def add(self, of: Equations, readout_time: float) -> None:
         """Compare the last two triples, one frame apart.
@@ -62,18 +64,18 @@ class ShutterOdds:
         none, rolling = changed(of, 0.0), changed(of, readout_time)
         left = np.array([none[0], rolling[0], changed(of, -readout_time)[0], rolling[1]])
         if np.all(np.isfinite(left)):
-            usual = self._least / self._count if self._count > 0.0 else 0.0
-            most = _MOST * max(float(np.min(left[:_APART])), usual, SIDE)
+            # Neighbouring triples share their noise: less changes than it would of others.
+            usual = (np.min(self._left[0, :_APART]) + SIDE) / (self._count + 1.0)
+            most = _MOST * max(np.min(left[:_APART]), usual)
             self._count = _MEMORY * self._count + 1.0
             self._left = _MEMORY * self._left + np.minimum(left, most)
 
-    @property
-    def _least(self) -> float:
-        return float(np.min(self._left[:_APART]))
-
-    def _odds(self, one: int, other: int) -> float:
+    def _odds(self, one: int, other: int, to_doubt: bool = False) -> float:
         """Logarithm of the odds for one value against another."""
-        ours, theirs = float(self._left[one]), float(self._left[other])
+        left = self._left[int(to_doubt)]
+        return self._logarithm(float(left[one]), float(left[other]))
+
+    def _logarithm(self, ours: float, theirs: float) -> float:
         if not min(ours, theirs) > 0.0:
             return 0.0
         return 0.5 * SIDE * _INDEPENDENT * self._count * math.log(theirs / ours)
@@ -88,28 +90,33 @@ class ShutterOdds:
     @property
     def certain(self) -> bool:
         """Whether the shutter is a global one rather than one of the readout time that is set."""
-        scatter = float(self._left[_NONE]) / (SIDE * max(self._count, 1.0))
+        scatter = float(self._left[0, _NONE]) / (SIDE * max(self._count, 1.0))
         against = min(self.logarithm, self._odds(_NONE, _REVERSED))
         return scatter < _MOST_SCATTER and against > _CERTAIN
 
     @property
+    def of_reversed(self) -> float:
+        """Logarithm of the odds that rows run the other way rather than as is set, or at once."""
+        return min(self._odds(_REVERSED, _SET), self._odds(_REVERSED, _NONE))
+
+    @property
     def reversed_(self) -> bool:
-        """Whether rows run the other way rather than as is set, or at once."""
-        return min(self._odds(_REVERSED, _SET), self._odds(_REVERSED, _NONE)) > _OVERWHELMING
+        """Whether that is certain."""
+        return self.of_reversed > _OVERWHELMING
 
     @property
     def may_be_reversed(self) -> bool:
         """Whether that fits better than what is set."""
-        return self._odds(_REVERSED, _SET) > 0.0
+        return self._odds(_REVERSED, _SET, to_doubt=True) > 0.0
 
     @property
     def doubtful(self) -> bool:
-        """Whether the camera moves, and what is set does not show as it should."""
-        if not self._least > 0.0:
-            return False
-        apart = max(float(self._left[_APART]), 0.0) / self._least
-        should = 0.5 * SIDE * _INDEPENDENT * self._count * math.log1p(apart)
-        return should > _TELLING and -self.logarithm < _LEAST_SHOWN * should
+        """Whether the camera moves, and what is set does not show, or another value fits better."""
+        least, apart = float(np.min(self._left[1, :_APART])), float(self._left[1, _APART])
+        should = self._logarithm(least, least + apart)
+        shown = self._odds(_SET, _NONE, to_doubt=True)
+        silent = should > _TELLING and shown < _LEAST_SHOWN * should
+        return silent or max(-shown, self._odds(_REVERSED, _SET, to_doubt=True)) > _DOUBT
 
 
 @kernel
@@ -135,4 +142,4 @@ def changed(of: Equations, readout_time: float) -> tuple[float, float]:
             noise = of.xx[last, i, j] + of.xx[last - 1, i, j]
             noise *= _WAY_NOISE * readout_time * readout_time
             apart += weights[i, j] * (way[i] * way[j] - noise)
-    return squared, apart
+    return squared, max(apart, 0.0)
