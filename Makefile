@@ -65,7 +65,8 @@ $(ready): setup.py pyproject.toml Makefile
 	@echo "Preparing $(VENV) (once, takes a few minutes)"
 	@[ -e $@ ] || $(PYTHON) -m venv --clear $(VENV)
 	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,hloc,mapping,view,test]'
-	@$(python) -m compileall -qq -j 0 $(VENV)/lib || true  # pip does one file after the other
+	@# Which pip does one file after the other, and the tests of other packages with them.
+	@$(python) -m compileall -qq -j 0 -x '/(tests|pip)/' $(VENV)/lib || true
 	@touch $@
 
 clean:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
+import llvmlite.binding
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
@@ -34,6 +35,8 @@ _PACKAGE = Path(__file__).resolve().parents[2]
 # What reading a file that was cut off, overwritten or written by another program may raise.
 _DAMAGE = (EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError)
 _CHECKSUM_BYTES = 4
+# A module without a function.
+_NOTHING = llvmlite.binding.parse_assembly("").as_bitcode()
 _said: set[str] = set()
 
 
@@ -124,6 +127,29 @@ class _Implementation(CompileResultCacheImpl):
     def __init__(self, function: Any) -> None:
         self._locator_classes = [_Locator]
         super().__init__(function)
+
+    def rebuild(self, target: Any, stored: Any) -> Any:
+        """A function as it was kept.
+
+        Numba would read its intermediate code, too, and list what is in it: half of the time that a
+        process needs for its kernels. Only who compiles a function that calls it wants that.
+        """
+        match stored:
+            case ((str() as name, "object", (code, intermediate)), described, *rest):
+                kept = (name, "object", (code, _NOTHING)), described, *rest
+                target.codegen()._engine._defined_symbols.add(described.llvm_cpython_wrapper_name)
+                found = super().rebuild(target, kept)
+                found.library._get_module_for_linking = functools.cache(
+                    functools.partial(_intermediate, target.codegen(), intermediate)
+                )
+                return found
+        return super().rebuild(target, stored)
+
+
+def _intermediate(codegen: Any, bitcode: bytes) -> Any:
+    module = llvmlite.binding.parse_bitcode(bitcode)
+    codegen._engine._load_defined_symbols(module)
+    return module
 
 
 class _File(IndexDataCacheFile):

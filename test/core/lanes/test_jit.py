@@ -21,6 +21,10 @@ from rs_localizer.core.lanes.jit import kernel
 @kernel
 def double(x):
     return 2.0 * x
+
+@kernel
+def quadruple(x):
+    return double(double(x))
 """
 Load = Callable[[], Any]
 
@@ -132,6 +136,19 @@ def test_a_full_disk_is_a_warning(
     assert "kernels are compiled again at the next start" in str(said.message)
     assert str(cache) in str(said.message)
     assert files(cache, ".nbc") == []
+
+
+def test_a_kernel_is_compiled_with_one_that_comes_from_the_cache(load: Load, cache: Path) -> None:
+    load()(1.5)
+    double = load()
+    assert double(1.5) == 3.0
+    assert hits(double) == 1
+    quadruple = sys.modules["doubling"].quadruple
+    assert quadruple(1.5) == 6.0
+    assert hits(quadruple) == 0
+    # The callee has been inlined, as it is where both are compiled.
+    (code,) = quadruple.inspect_llvm().values()
+    assert "8doubling6double" not in "".join(line for line in code.splitlines() if " call " in line)
 
 
 def test_a_folder_that_cannot_be_made_is_a_warning(load: Load, cache: Path) -> None:

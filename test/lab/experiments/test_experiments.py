@@ -13,7 +13,9 @@ from functools import cache
 import pytest
 
 from rs_localizer import data
+from rs_localizer.lab.experiments import augmented_reality, readout_time
 from rs_localizer.lab.experiments.honesty import against_p3p, coverage
+from rs_localizer.lab.experiments.inertial import experiment as inertial
 from rs_localizer.lab.experiments.results import Context, Result, Verdict
 from rs_localizer.lab.experiments.table import EXPERIMENTS
 
@@ -183,6 +185,11 @@ def result(name: str) -> Result:
         # Of some 500 conditions even a single frame takes long.
         patch.setattr(against_p3p, "conditions", some(against_p3p.conditions, 9))
         patch.setattr(coverage, "conditions", some(coverage.conditions, 5))
+        # The least that is taken for a result is too much here.
+        patch.setattr(augmented_reality, "_LEAST_FRAMES", 20)
+        patch.setattr(readout_time, "_LEAST", 4)
+        patch.setattr(readout_time, "_GLOBAL", 4)  # one of them
+        patch.setattr(inertial, "_TEN_SECONDS", 150)
         return EXPERIMENTS[name](context)
 
 
