@@ -34,7 +34,7 @@ class MeasuredReadout:
         off = abs(self.readout_time - readout_time)
         largest = max(abs(self.readout_time), readout_time)
         # Of few triples the deviation itself is uncertain: Student's t.
-        deviations = float(stdtrit(min(self.triples, 2.0 * self.telling) / _LAGS, 1.0 - _CHANCE))
+        deviations = float(stdtrit(min(self.triples, 4.0 * self.telling) / _LAGS, 1.0 - _CHANCE))
         return off > max(deviations * self.deviation, _LEAST_DIFFERENCE * largest)
 
     @property

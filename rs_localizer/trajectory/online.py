@@ -170,13 +170,13 @@ class ReadoutMonitor:
     def _add_equation(self, readout_time: float) -> None:
         (before_ns, _), (now_ns, _), (after_ns, _) = self._views
         first, second = (now_ns - before_ns) * 1e-9, (after_ns - now_ns) * 1e-9
-        views = [view for _, view in self._views]
+        before, now, after = (view for _, view in self._views)
         alike = 1.0 / _MOST_UNLIKE < first / second < _MOST_UNLIKE
         near = max(first, second) <= _LONGEST_INTERVAL
-        if not (alike and near) or jumps(*views, first, second):
+        if not (alike and near) or jumps(before, now, after, first, second):
             self._in_a_row = 0
             return
-        self._window.add(now_ns, views, first, second)
+        self._window.add(now_ns, (before, now, after), first, second)
         self._in_a_row += 1
         if self._in_a_row > 1 and readout_time > 0.0:
             self.odds.add(self._window.newest(2), readout_time)

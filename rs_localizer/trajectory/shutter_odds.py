@@ -32,7 +32,7 @@ _MOST_SCATTER = 1.5
 _CERTAIN, _OVERWHELMING = math.log(100.0), math.log(1000.0)
 # A camera that moves so much that the odds should be this (logarithm), if the setting were right,
 # has to show at least a part of it.
-_TELLING, _LEAST_SHOWN = 1.0, 0.5
+_TELLING, _LEAST_SHOWN = 0.7, 0.5
 # Odds (logarithm) of another value that are enough to doubt; at rest, chance makes less.
 _DOUBT = 2.0
 # Of the variance of the way's noise, what is taken from its square: it may be wrong, and scatters.
