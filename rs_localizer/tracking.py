@@ -33,6 +33,7 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
+from rs_localizer.estimation.tone_memory import with_frame
 from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -68,6 +69,7 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     experience: Experience  # with shaking, map and lens
+    tones: Array | None  # logarithm of the odds of each that may shake the camera
     jolts: Array  # (2,) how many times the configured accelerations, squared: angular, linear
     failures: int = 0  # frames without a pose since then
 
@@ -147,6 +149,7 @@ class Tracker:
                 covariance=covariance,
                 of_shake_sizes=_shaken(track.experience.of_shake_sizes, track.jolts),
                 of_field_sizes=track.experience.of_field_sizes,
+                of_tones=track.tones,
             )
         except ValueError:  # rounding errors are all that is left of the covariance
             return None
@@ -179,7 +182,7 @@ class Tracker:
                 prior = self.prediction(time_ns)
                 if prior is not None and not self.trusts_readout_time:
                     rest = self.of_rest if turn is None else 0.0
-                    prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
+                    prior = replace(prior, covariance=_UNKNOWN, of_rest=rest, of_tones=None)
                 prior = prior if turn is None else _beside(prior, turn)
             return self.localizer.find(points, pixels, scores, prior, share, turn), prior
 
@@ -240,7 +243,8 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
     """The track and its newest frame."""
     share = float(np.mean(found.inliers))
     if track is None or prior is None or prior.motion is None:
-        return _Track(found, time_ns, share, Experience.of(found), np.ones(2))
+        tones = with_frame(None, found)
+        return _Track(found, time_ns, share, Experience.of(found), tones, np.ones(2))
     if found.tracked:
         share = (1.0 - _NEWEST) * track.share + _NEWEST * share
     surprise = _surprise(prior, found)
@@ -249,6 +253,7 @@ def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_n
         time_ns,
         share,
         track.experience.and_of(found),
+        with_frame(track.tones, found),
         np.clip(track.jolts * surprise**_LEARNING, 1.0, _MOST_JOLTS),
     )
 

@@ -101,7 +101,7 @@ def followed(times_deviation, tracked=True, jolts=1.0, of=None):
         step[part] = times_deviation * np.sqrt(9.0) * along
     found = replace(at(step, 0.01 * spread), tracked=tracked,
                     inliers=np.array([True, False, False, False, False]))  # fmt: skip
-    track = _Track(first, 0, 1.0, Experience.of(first), jolts * np.ones(2))
+    track = _Track(first, 0, 1.0, Experience.of(first), None, jolts * np.ones(2))
     return _followed(track, predicted(spread), found, 5)
 
 

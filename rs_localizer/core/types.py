@@ -40,6 +40,8 @@ class Estimate(Motion):
     # the sizes that rs_localizer.estimation.settling tries.
     of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
     of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
+    # Logarithm of the likelihood (m,s) of each tone, less that of none; empty where not asked.
+    of_tones: Array = field(default_factory=lambda: np.zeros((0, 0)))
     tracked: bool = False  # found near a prior motion, without a search
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both
     turn: KnownTurn | None = None

@@ -64,6 +64,7 @@ class Assumed:
     of_field_sizes: Array
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
+    of_tones: Array | None = None  # of each against none, by the last frames
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     turn: TurnSeen | None = None  # by a gyroscope
 
@@ -110,6 +111,8 @@ def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None
         return assumed
     if prior.of_rest != 0.0:
         assumed = replace(assumed, of_rest=prior.of_rest)
+    if prior.of_tones is not None:
+        assumed = replace(assumed, of_tones=prior.of_tones)
     if prior.of_shake_sizes is None or prior.of_field_sizes is None:
         return assumed
     return replace(

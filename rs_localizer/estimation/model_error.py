@@ -31,7 +31,7 @@ from rs_localizer.estimation.evidence import (
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import LEAST_NOISE, inverted
 from rs_localizer.estimation.residuals import linearized
-from rs_localizer.estimation.spectrum import loudest
+from rs_localizer.estimation.spectrum import Powers, powers
 
 # Probability of no field, the one assumed beforehand, above which none is looked for among
 # neighbours.
@@ -163,7 +163,7 @@ class Examined(NamedTuple):
     agreement: float  # of neighbouring rows, see :func:`neighbours_agree`
     # Correlation of each point's error with that of its neighbour in the image.
     shared: float
-    loudness: float  # of the loudest tone, see :func:`rs_localizer.estimation.spectrum.loudest`
+    tones: Powers  # how loud they are among the errors
     determined: float  # logarithm of the determinant of the information of the motion, px^2
     cost: float  # of the points and the prior after the step, px^2
     # Whether the points are enough for what was asked of them: else covariances are none.
@@ -205,7 +205,7 @@ def examine(
         found.step, found.covariance, found.sizes,
         neighbours_agree(errors, measured_tau, rays, inliers),
         shared_errors(errors, rays, inliers) if seen else 0.0,
-        loudest(errors, by_turn, measured_tau, inliers),
+        powers(errors, by_turn, measured_tau, inliers),
         found.determined, found.cost, found.finite, columns,
     )  # fmt: skip
 
@@ -227,8 +227,9 @@ def judged(
         cost -= step[k] * known.with_errors[k]
         total += step[k] + covariance[k, k]
     return Examined(
-        step, covariance, sizes, 0.0, 0.0, 0.0, determined, cost, bool(np.isfinite(total)), columns
-    )
+        step, covariance, sizes, 0.0, 0.0, Powers(0.0, np.zeros((0, 0))), determined, cost,
+        bool(np.isfinite(total)), columns,
+    )  # fmt: skip
 
 
 @kernel

@@ -76,6 +76,7 @@ class Posterior:
     # What the frame says of the sizes of shaking and field, logarithms of odds; empty: nothing.
     of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
     of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
+    of_tones: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def determined(self) -> bool:

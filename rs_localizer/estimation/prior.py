@@ -27,6 +27,8 @@ class Prior:
             times the readout time (rad per readout), and its standard deviation.
         of_shake_sizes, of_field_sizes: what the frames before say of shaking and model error, as
             the fields of ``Estimate`` of these names.
+        of_tones: logarithm of the odds of each tone against none, see
+            :mod:`rs_localizer.estimation.tone_memory`.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
@@ -46,6 +48,7 @@ class Prior:
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
     of_shake_sizes: Array | None = None
     of_field_sizes: Array | None = None
+    of_tones: Array | None = None
     of_rest: float = 0.0
 
     def __post_init__(self) -> None:

@@ -54,6 +54,7 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         model_error=posterior.model_error,
         of_shake_sizes=posterior.of_shake_sizes,
         of_field_sizes=posterior.of_field_sizes,
+        of_tones=posterior.of_tones,
         global_shutter_inliers=still,
         iterations=samples,
         turn=turn,

@@ -117,10 +117,16 @@ def _settled(
     may_shake = assumed.rolling and not mirrored_fits
     # A gyroscope sees tones; what it leaves of them tells the offset of its stamps.
     may_be_tonal = may_shake and assumed.turn is None
+    best = replace(
+        best,
+        of_shake_sizes=sizes.of_shake_sizes,
+        of_field_sizes=sizes.of_field_sizes,
+        of_tones=examined.tones.likelihood if may_be_tonal else best.of_tones,
+    )
     tones, frame.unheard = (
         find_tones(frame, best, examined, threshold) if may_be_tonal else (None, None)
     )
-    toned = _toned(best, sizes, tones) if tones and tones.certain else None
+    toned = _toned(best, tones) if tones and tones.certain else None
     if tones and toned and tones.tonal and toned.agreement < AGREEMENT:
         return toned
     seems_to_shake = may_shake and _seems_to_shake(frame, best, examined)
@@ -144,8 +150,6 @@ def _settled(
         covariance=best.inflation / frame.worth * examined.covariance,
         shake=examined.step[PARAMETERS:].reshape(-1, 3),
         model_error=sizes.field,
-        of_shake_sizes=sizes.of_shake_sizes,
-        of_field_sizes=sizes.of_field_sizes,
         agreement=examined.agreement,
     )
     planar = other is not None
@@ -217,12 +221,10 @@ def _followed(frame: Inliers, best: Posterior, sizes: Sizes, threshold: float) -
         inliers=shaken.inliers,
         shake=shaken.coefficients,
         agreement=shaken.agreement,
-        of_shake_sizes=sizes.of_shake_sizes,
-        of_field_sizes=sizes.of_field_sizes,
     )
 
 
-def _toned(best: Posterior, sizes: Sizes, tones: ToneMixture) -> Posterior:
+def _toned(best: Posterior, tones: ToneMixture) -> Posterior:
     """The posterior of a camera that tones shake."""
     found = averaged(tones, best)
     worth = _worth(_correlation(tones.agreement, found.inliers))
@@ -230,8 +232,6 @@ def _toned(best: Posterior, sizes: Sizes, tones: ToneMixture) -> Posterior:
         found,
         covariance=found.covariance / worth,
         exhausted=tones.exhausted,
-        of_shake_sizes=sizes.of_shake_sizes,
-        of_field_sizes=sizes.of_field_sizes,
     )
 
 

@@ -9,6 +9,7 @@ and parameter estimation", 1988).
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,9 +41,24 @@ def _bin(tau: float) -> int:
     return min(max(int((tau + 0.5) * _BINS), 0), _BINS - 1)
 
 
+class Powers(NamedTuple):
+    """What a first look hears of tones."""
+
+    loudest: float  # power of the loudest tone: of each, without one, chi-squared of six
+    # (m,s-1) logarithm of the likelihood of each frequency and size, less that of none.
+    likelihood: Array
+
+
 @kernel
 def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> float:
-    """Power of the loudest tone among errors: of each, without one, chi-squared of six.
+    """Power of the loudest tone alone, see :func:`powers`."""
+    found: float = powers(errors, by_turn, tau, chosen).loudest
+    return found
+
+
+@kernel
+def powers(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> Powers:
+    """How loud each tone is among errors.
 
     A first look that takes microseconds, because it leaves the motion as it is.
 
@@ -51,6 +67,7 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
             :func:`rs_localizer.estimation.residuals.linearized`.
         chosen: (n,) the points that count.
     """
+    likelihood = np.zeros((len(CYCLES), len(SWINGS) - 1))
     sums, known = np.zeros((_BINS, 3)), np.zeros(3)
     squared, count = 0.0, 0
     for i in range(len(errors)):
@@ -63,10 +80,13 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
             squared += errors[i, 0] ** 2 + errors[i, 1] ** 2
             count += 1
     if not squared > 0.0:
-        return 0.0
-    most = 0.0
+        return Powers(0.0, likelihood)
+    # The squares of a wave are a half in the mean; squared errors are those of two coordinates.
+    variance = max(0.5 * squared / count, LEAST_NOISE * LEAST_NOISE)
+    most, power = 0.0, np.empty(3)
+    explained, volume = _of_sizes(known, variance)
     for m in range(len(CYCLES)):
-        power = 0.0
+        power[:] = 0.0
         for wave in range(2):
             x, y, z = 0.0, 0.0, 0.0
             for place in range(_BINS):
@@ -74,12 +94,34 @@ def loudest(errors: Array, by_turn: Array, tau: Array, chosen: BoolArray) -> flo
                 x += along * sums[place, 0]
                 y += along * sums[place, 1]
                 z += along * sums[place, 2]
-            power += x * x / max(known[0], _LITTLE) + y * y / max(known[1], _LITTLE)
-            power += z * z / max(known[2], _LITTLE)
-        most = max(most, power)
-    # The squares of a wave are a half in the mean; squared errors are those of two coordinates.
-    loud: float = 2.0 * most / max(0.5 * squared / count, LEAST_NOISE * LEAST_NOISE)
-    return loud
+            power[0] += x * x
+            power[1] += y * y
+            power[2] += z * z
+        total = 0.0
+        for axis in range(3):
+            power[axis] *= 2.0 / (variance * max(known[axis], _LITTLE))
+            total += power[axis]
+        most = max(most, total)
+        for k in range(len(volume)):
+            for axis in range(3):
+                likelihood[m, k] += explained[k, axis] * power[axis]
+            likelihood[m, k] -= volume[k]
+    return Powers(most, likelihood)
+
+
+@kernel
+def _of_sizes(known: Array, variance: float) -> tuple[Array, Array]:
+    """What part of half the powers (s-1,3) swings of each size explain, and what they cost (s-1,).
+
+    Of each axis there are two coefficients, known by half the squares (3,) of the turns.
+    """
+    explained, volume = np.empty((len(SWINGS) - 1, 3)), np.zeros(len(SWINGS) - 1)
+    for k in range(len(volume)):
+        for axis in range(3):
+            ratio = 0.5 * SWINGS[k + 1] ** 2 * known[axis] / variance
+            explained[k, axis] = 0.5 * ratio / (1.0 + ratio)
+            volume[k] += np.log(1.0 + ratio)
+    return explained, volume
 
 
 @kernel

@@ -8,12 +8,14 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.state import PARAMETERS
+from rs_localizer.estimation.assumptions import SHAKE_PRIOR
 from rs_localizer.estimation.columns import columns_of, with_prior
 from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
 from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.spectrum import CYCLES, spectrum
+from rs_localizer.estimation.tone_memory import leaning
 from rs_localizer.estimation.tones import Fit, Seen, Tones, products_of
 
 NEAR = 16.0
@@ -34,6 +36,25 @@ def spectrum_of(frame: Inliers, tones: Tones, seen: Seen, chosen: BoolArray, noi
     return found
 
 
+def leaned(frame: Inliers, evidence: Array) -> Array:
+    """Evidence (m,s) with what the last frames say of each tone, if there is one."""
+    if frame.assumed.of_tones is None:
+        return evidence
+    more = evidence.copy()
+    more[:, 1:] += leaning(frame.assumed.of_tones)
+    return more
+
+
+def evidence_for(frame: Inliers, fit: Fit, threshold: float) -> float:
+    """Logarithm of the marginal likelihood of the first tone alone, with what the last frames say
+    of its frequency."""
+    evidence = evidence_of(fit, threshold)
+    if frame.assumed.of_tones is None:
+        return evidence
+    lean = leaning(frame.assumed.of_tones)[np.argmin(np.abs(CYCLES - fit.tones.cycles[0]))]
+    return evidence + float(np.logaddexp.reduce(lean)) - math.log(len(lean))
+
+
 def odds_of(frame: Inliers, evidence: Array) -> float:
     """Logarithm of the odds that there is a tone, of any frequency and size."""
     likelihood = float(np.logaddexp.reduce(evidence[:, 1:], axis=None) - evidence[0, 0])
@@ -42,13 +63,22 @@ def odds_of(frame: Inliers, evidence: Array) -> float:
 
 def prior_odds(frame: Inliers) -> float:
     """Logarithm of the odds that there is a tone, before the points are asked."""
-    return tonal_odds(float(frame.shake_prior[0]))
+    odds, known = tonal_odds(float(frame.shake_prior[0])), frame.assumed.of_tones
+    if known is None:
+        return odds
+    # What the last frames say of any shaking may make it more probable still.
+    return float(np.logaddexp.reduce(known, axis=None)) - EVEN + max(odds + EVEN, 0.0)
 
 
 def tonal_odds(no_shake: float) -> float:
     """Logarithm of the odds of a tone where no shaking is as probable as this."""
     tonal = max(_TONAL * (1.0 - no_shake), _LEAST_PROBABLE)
     return math.log(tonal / (1.0 - tonal))
+
+
+EVEN = -tonal_odds(float(SHAKE_PRIOR[0]))
+"""Logarithm of the odds by which a tone is more probable than the prior has it, for any camera,
+where it is as probable as not."""
 
 
 def gain_of_field(

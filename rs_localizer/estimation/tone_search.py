@@ -14,21 +14,22 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.estimation.assumptions import SHAKE_PRIOR
 from rs_localizer.estimation.model_error import Examined
 from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.shaking import agreement_of
 from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, spread_by_tones
 from rs_localizer.estimation.tone_evidence import (
+    EVEN,
     NEAR,
+    evidence_for,
     evidence_of,
     evidence_of_none,
     gain_of_field,
+    leaned,
     odds_of,
     prior_odds,
     spectrum_of,
-    tonal_odds,
 )
 from rs_localizer.estimation.tone_mixture import (
     CERTAIN,
@@ -52,9 +53,8 @@ _FEWEST_INLIERS = 6  # of a motion near which tones are looked for
 _SWING = float(SWINGS[4])  # of tones that a spectrum does not show
 _WIDE = 3.5  # times the median error, of the points among which tones are looked for
 _IMPROBABLE = math.log(0.3)  # odds
-# Whether noise hides a tone, the covariance takes for as probable as not: logarithm of the odds by
-# which that is more than the prior's, for any camera.
-_EVEN = -tonal_odds(float(SHAKE_PRIOR[0]))
+# Logarithm of the odds from which on a tone, that the last frames told of, is looked for.
+_TOLD = -1.0
 # Logarithm of the odds beside the best tone, beyond which none counts.
 _FAR_LESS_PROBABLE = 6.0
 _ALTERNATIVES = 3
@@ -109,21 +109,22 @@ def find_tones(frame: Inliers, best: Posterior, examined: Examined, threshold: f
         return _SILENCE
     few = bool(inliers < FEW)
     near = _near(best, few, threshold)
-    if examined.loudness < (_LOUD_OF_FEW if few else _LOUD) and not near.strangers:
+    loud = examined.tones.loudest >= (_LOUD_OF_FEW if few else _LOUD)
+    if not (loud or near.strangers or _told(frame, examined)):
         return _SILENCE
     if np.count_nonzero(near.chosen) < FEWEST:
         return _SILENCE
     still = Tones.none(best.state)
     seen = seen_at(frame.observations, still)
-    evidence = spectrum_of(frame, still, seen, near.chosen, near.noise)
+    evidence = leaned(frame, spectrum_of(frame, still, seen, near.chosen, near.noise))
     odds, others = odds_of(frame, evidence), _of_others(frame, still, examined, seen, best)
     fits = list[Fit]()
     if near.strangers or odds - others > _IMPROBABLE:
         fits = _alternatives(frame, still, evidence, near, threshold)
-    found = np.array([evidence_of(fit, threshold) for fit in fits])
+    found = np.array([evidence_for(frame, fit, threshold) for fit in fits])
     if near.strangers:
         # Points far off count in a spectrum for more than they should.
-        evidence = spectrum_of(frame, still, seen, best.inliers, best.noise)
+        evidence = leaned(frame, spectrum_of(frame, still, seen, best.inliers, best.noise))
         odds = odds_of(frame, evidence)
         if fits:
             none = evidence_of_none(frame, best, threshold)
@@ -134,6 +135,14 @@ def find_tones(frame: Inliers, best: Posterior, examined: Examined, threshold: f
     return Heard(_mixture(frame, fits, found, _probability(-odds), near, threshold), None)
 
 
+def _told(frame: Inliers, examined: Examined) -> bool:
+    """Whether the last frames and this one together tell of a tone."""
+    before = frame.assumed.of_tones
+    if before is None:
+        return False
+    return bool(np.logaddexp.reduce(before + examined.tones.likelihood, axis=None) > _TOLD)
+
+
 def _unheard(seen: Seen, best: Posterior, evidence: Array, odds: float) -> Array | None:
     """What tones of this evidence (m,s) that hide in the noise add to the covariance (18,18);
     None where that cannot be computed."""
@@ -141,7 +150,7 @@ def _unheard(seen: Seen, best: Posterior, evidence: Array, odds: float) -> Array
         seen.errors, seen.columns, seen.by_turn, seen.tau, best.inliers, best.covariance,
         best.noise, evidence,
     )  # fmt: skip
-    return _probability(odds + _EVEN) * added if np.all(np.isfinite(added)) else None
+    return _probability(odds + EVEN) * added if np.all(np.isfinite(added)) else None
 
 
 def _probability(odds: float) -> float:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import step_between
@@ -11,7 +12,7 @@ from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.settling import settle
-from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, spectrum
+from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, powers, spectrum
 from rs_localizer.estimation.tone_mixture import averaged
 from rs_localizer.estimation.tone_search import find_tones
 from rs_localizer.estimation.tones import Tones, fitted, seen_at
@@ -201,6 +202,29 @@ def test_loudness_is_that_of_chance_without_a_tone():
     swung = np.einsum("nij,nj->ni", by_turn, np.sin(30.0 * tau)[:, None] * [1.0, 0.5, -0.5])
     assert loudest(rng.normal(size=(100, 2)) + swung, by_turn, tau, chosen) > 30.0
     assert loudest(np.zeros((100, 2)), by_turn, tau, chosen) == 0.0
+
+
+def test_powers_are_worth_what_gaussian_swings_make_probable():
+    """Where waves are square to each other, as at even rows: against the normal density."""
+    rng = np.random.default_rng(5)
+    tau = (np.arange(96) + 0.5) / 96.0 - 0.5
+    by_turn = np.einsum("nl,la->nla", np.ones((96, 2)), [[30.0, 0.0, 0.0], [0.0, 20.0, 0.0]])
+    errors = rng.normal(size=(96, 2)) * [1.2, 0.8]
+    found = powers(errors, by_turn, tau, np.ones(96, dtype=bool))
+    variance = np.mean(errors**2)
+    for m in (4, 20):
+        angle = 2.0 * np.pi * CYCLES[m] * tau
+        wave = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        for s in range(1, len(SWINGS)):
+            expected = 0.0
+            for line, known in enumerate((30.0, 20.0)):
+                spread = variance * np.eye(96) + (SWINGS[s] * known) ** 2 * wave @ wave.T
+                densities = [
+                    multivariate_normal.logpdf(errors[:, line], cov=matrix)
+                    for matrix in (spread, variance * np.eye(96))
+                ]
+                expected += densities[0] - densities[1]
+            assert found.likelihood[m, s - 1] == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_few_points_cannot_tell():

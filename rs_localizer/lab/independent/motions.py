@@ -7,6 +7,7 @@ that may stop, so pose, velocities and accelerations are known exactly at every 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,11 +110,17 @@ def hand(count: int, rng: np.random.Generator, slower: float = 1.0) -> Motions:
     return _motions(count, rng, waves)
 
 
-def vibration(count: int, rng: np.random.Generator, degrees: float, hertz: float) -> Motions:
-    """Cameras on a hovering drone that shakes them to and fro by an angle, about any axis."""
+def vibration(
+    count: int, rng: np.random.Generator, degrees: float | Array, hertz: float | Array
+) -> Motions:
+    """Cameras on a hovering drone that shakes them to and fro by an angle, about any axis.
+
+    ``degrees`` and ``hertz``: of all, or of each (count,).
+    """
     amplitude, frequency = _waves(count, rng, _DRIFT_HERTZ, _DRIFT_RATE, _DRIFT_SPEED)
     shaking = np.zeros((count, 1, 6))
-    shaking[:, 0, :3] = math.radians(degrees) * directions(count, rng)
+    swing = np.radians(np.full(count, degrees))
+    shaking[:, 0, :3] = swing[:, None] * directions(count, rng)
     return _motions(
         count,
         rng,
@@ -125,18 +132,28 @@ def vibration(count: int, rng: np.random.Generator, degrees: float, hertz: float
     )
 
 
+def any_vibration(
+    count: int,
+    rng: np.random.Generator,
+    degrees: tuple[float, float],
+    hertz: tuple[float, float],
+    tones: int = 1,
+) -> Motions:
+    """The same by some tones between these limits, one camera another than the next."""
+    drawn = [
+        np.exp(rng.uniform(math.log(low), math.log(high), (tones, count)))
+        for low, high in (degrees, hertz)
+    ]
+    each = [vibration(count, rng, *one) for one in zip(*drawn, strict=True)]
+    return _with_last_of(each[0], each[1:])
+
+
 def shaken_hand(
     count: int, rng: np.random.Generator, shaking: tuple[tuple[float, float], ...]
 ) -> Motions:
     """Cameras in a hand that vibrate besides, each vibration (degrees, hertz) about any axis."""
     held = hand(count, rng)
-    motions = [vibration(count, rng, *one) for one in shaking]
-    return replace(
-        held,
-        amplitude=np.concatenate([held.amplitude, *(m.amplitude[:, -1:] for m in motions)], 1),
-        frequency=np.concatenate([held.frequency, *(m.frequency[:, -1:] for m in motions)], 1),
-        phase=np.concatenate([held.phase, *(m.phase[:, -1:] for m in motions)], 1),
-    )
+    return _with_last_of(held, [vibration(count, rng, *one) for one in shaking])
 
 
 def steady(count: int, rng: np.random.Generator, rate: float, speed: float) -> Motions:
@@ -155,6 +172,17 @@ def sudden_stop(count: int, rng: np.random.Generator, earliest: float, latest: f
         np.column_stack(velocities),
         (rng.uniform(earliest, latest, count), rng.uniform(*_STOP_SECONDS, count)),
     )
+
+
+def _with_last_of(first: Motions, others: Sequence[Motions]) -> Motions:
+    """Motions with the last sine of others besides."""
+    joined = {
+        name: np.concatenate(
+            [getattr(first, name), *(getattr(other, name)[:, -1:] for other in others)], axis=1
+        )
+        for name in ("amplitude", "frequency", "phase")
+    }
+    return replace(first, **joined)
 
 
 def directions(count: int, rng: np.random.Generator) -> Array:

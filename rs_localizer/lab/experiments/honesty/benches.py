@@ -11,6 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from rs_localizer.lab.experiments.honesty import (
     against_p3p,
     coverage,
+    few_points,
     rendered,
     small_planes,
     tags,
@@ -86,6 +87,7 @@ def benches(recordings: Recordings) -> dict[str, Bench[Any, Any]]:
             against_p3p.row,
         ),
         "vibration": Bench("Vibration", vibration.conditions(), vibration.measure, *regions),
+        "few": Bench("Few points, shaken", few_points.conditions(), few_points.measure, *regions),
         "planes": Bench(
             "Small planes", small_planes.conditions(), small_planes.measure,
             small_planes.COLUMNS, small_planes.row,
