@@ -19,6 +19,7 @@ from rs_localizer.estimation.averaging import alike, averaged, normalized
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.doubt import may_face, pieces_of
 from rs_localizer.estimation.face_on import reaching
+from rs_localizer.estimation.lookalike import holding_motion
 from rs_localizer.estimation.mirror import farthest, mirrored
 from rs_localizer.estimation.modes import Inliers, Mode
 from rs_localizer.estimation.posterior import Posterior
@@ -58,6 +59,8 @@ def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
     faces = may_face(frame, modes, state, covariance) if planar and known else None
     if faces is not None:
         covariance = reaching(covariance, faces.step, faces.evidence)
+    if planar and frame.assumed.may_rest:
+        covariance = holding_motion(modes, state, covariance)
     costs = np.array([mode.cost for mode in modes])
     same = [alike(modes[best].state, mode.state, modes[best].covariance) for mode in modes]
     if not frame.assumed.may_rest and faces is None and possible @ same > _ALONE:

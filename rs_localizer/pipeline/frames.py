@@ -26,7 +26,7 @@ from rs_localizer.pipeline.landmarks import Landmarks
 from rs_localizer.pipeline.maps import read_landmarks
 from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
 from rs_localizer.pipeline.oddities import oddities
-from rs_localizer.pipeline.published import of_body, of_camera
+from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 from rs_localizer.pipeline.succession import Succession
@@ -219,7 +219,7 @@ class FrameLocalizer:
         else:
             time_ns = method.middle_row_ns(cloud.stamp_ns)
             if method.tracker is not None:
-                method.tracker.trusts_readout_time = not self.readout_watch.far_off
+                method.tracker.trusts_readout_time = self.readout_watch.trusted
                 method.tracker.readout_time_deviation = deviation
             method.follower.of_rest = self.readout_watch.of_rest
             result = self.imu.track(
@@ -227,9 +227,14 @@ class FrameLocalizer:
             )
         if not result:
             return Refusal(result.reason, result.detail)
-        localized = of_camera(cloud, result, method.config, method.camera, frame, deviation)
         self._watch_readout(cloud, result)
-        return self.mounted(localized)
+        watch, turned = self.readout_watch, self._method.camera.scan_direction
+        known = ReadoutKnown(
+            deviation,
+            watch.may_be_reversed or turned != method.camera.scan_direction,
+            watch.global_shutter,
+        )
+        return self.mounted(of_camera(cloud, result, method.config, method.camera, frame, known))
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""
@@ -240,7 +245,8 @@ class FrameLocalizer:
         time_ns = method.middle_row_ns(cloud.stamp_ns)
         config = self.readout_watch.add(method.config, method.camera, time_ns, estimate, cloud)
         if config is not method.config:
-            self._use(method.calibration, config)
+            self._method = Method.of(method.calibration, config)
+            self.readout_watch.restart()
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""

@@ -33,6 +33,7 @@ from dataclasses import replace
 import numpy as np
 
 from rs_localizer.config import Acceleration
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
@@ -90,6 +91,20 @@ def with_timing(
         replace(pose, covariance=pose.covariance + moved),
         replace(twist, covariance=twist.covariance + changed),
     )
+
+
+def either(pose: Pose, other: Pose) -> Pose:
+    """A pose with room for another that it may be as well."""
+    way = other.position - pose.position
+    turn = so3.log(np.ascontiguousarray(other.rotation @ pose.rotation.T))
+    step = np.concatenate([way, turn])
+    return replace(pose, covariance=pose.covariance + np.outer(step, step))
+
+
+def backwards(twist: Twist) -> Twist:
+    """A twist with room for the opposite."""
+    step = 2.0 * np.concatenate([twist.linear, twist.angular])
+    return replace(twist, covariance=twist.covariance + np.outer(step, step))
 
 
 def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from rs_localizer.config import NodeConfig, OrientationCovariance
 from rs_localizer.core.camera import Camera
@@ -13,10 +13,19 @@ from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms.rigid import NotYetError, TransformError, Transforms
 from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.clock import published_moment
-from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
+from rs_localizer.pipeline.moments import backwards, either, pose_at, twist_at, with_timing
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.pipeline.roll_pitch_yaw import about_angles
 from rs_localizer.solvers.table import find_solver
+
+
+@dataclass(frozen=True, slots=True)
+class ReadoutKnown:
+    """How well the readout time is known."""
+
+    deviation: float  # s
+    may_be_reversed: bool  # rows may run the other way
+    global_shutter: bool  # all rows are exposed at once, whatever is set
 
 
 def of_camera(
@@ -25,18 +34,24 @@ def of_camera(
     config: NodeConfig,
     camera: Camera,
     frame: str,
-    deviation: float,
+    known: ReadoutKnown,
 ) -> Localized:
     """Pose and twist of the camera's optical frame, of this name, at the published moment.
 
     Args:
-        deviation: s, of the readout time.
+        known: of the readout time.
     """
     readout_time = config.readout_time
     stamp_ns, tau = published_moment(config, camera, cloud.stamp_ns)
     moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
+    if known.global_shutter and estimate.turn is None:
+        moving = False  # an image says nothing of velocities
     pose = pose_at(estimate, tau)
     twist = twist_at(estimate, tau, readout_time) if moving else None
+    deviation = known.deviation
+    if twist is not None and known.may_be_reversed:
+        other = pose_at(estimate, -tau)
+        pose, twist = either(pose, other), backwards(twist)
     if twist is not None and deviation > 0.0:
         # The middle row comes later where the readout takes longer; the first one does not.
         delay = deviation * camera.first_row_time if tau == 0.0 else 0.0

@@ -29,6 +29,8 @@ _SHARE = 300
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
+# Of the odds for it (logarithm), what has to be there beside that.
+_SUPPORTED = 1.0
 # Of the setting: from here on frames that stand alone are better than tracked ones, and from here
 # on nothing tells the shutter from a global one.
 _FAR_OFF, _GLOBAL = 0.5, 0.2
@@ -59,14 +61,33 @@ class ReadoutWatch:
         self._said: set[_Kind] = set()
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
-        self.fault = ""  # how that contradicts the setting, in one sentence
-        self.error = 0.0  # s, how far it says that the setting is off; 0: not
+        self._contradiction = ""  # how that contradicts the setting, in one sentence
+        self._turned = ""  # why rows are taken to run against the setting
+        # s, how far it says that the setting is off, for velocities that divide by it; 0: not.
+        self.error = 0.0
         # Whether the setting is wrong by so much that what the camera does from frame to frame
-        # says nothing of what it does within them: a global shutter, or a reversed one. Once it
-        # was, doubts are not enough.
+        # says nothing of what it does within them: a global shutter. Once it was, doubts are not
+        # enough.
         self.far_off = False
         # Whether, of these, the shutter is a global one.
         self.global_shutter = False
+        # Whether the last frames move, but not as the setting says, and no measurement tells.
+        self.doubtful = False
+
+    @property
+    def fault(self) -> str:
+        """What is wrong about the setting, in one sentence."""
+        return self._contradiction or self._turned
+
+    @property
+    def trusted(self) -> bool:
+        """Whether what the camera does from frame to frame tells what it does within them."""
+        return not (self.far_off or self.doubtful)
+
+    @property
+    def may_be_reversed(self) -> bool:
+        """Whether rows may run the other way: then an image begins where it is said to end."""
+        return self.doubtful and self._monitor.odds.may_be_reversed
 
     @property
     def of_rest(self) -> float:
@@ -78,13 +99,18 @@ class ReadoutWatch:
         warm_up(camera)
 
     def reset(self) -> None:
-        """Forget all frames."""
+        """Forget all frames, and what became of the settings."""
+        self.restart()
+        self._turned = ""
+
+    def restart(self) -> None:
+        """Forget all frames, because :meth:`add` has returned other settings."""
         self._monitor.reset()
         self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
         self._said.clear()
-        self.measured, self.fault, self.error = None, "", 0.0
-        self.far_off = self.global_shutter = False
+        self.measured, self._contradiction, self.error = None, "", 0.0
+        self.far_off = self.global_shutter = self.doubtful = False
 
     def add(
         self,
@@ -97,7 +123,8 @@ class ReadoutWatch:
         """Take a localized frame whose middle row was exposed at ``time_ns``.
 
         Returns:
-            the settings, with the readout time that was found where they ask for it.
+            the settings, with the readout time that was found where they ask for it, and the
+            reverse scan direction where the frames leave no doubt of it.
         """
         estimates = config.estimate_readout_time and config.readout_time == 0.0
         wanted = estimates or config.readout_time > 0.0
@@ -109,34 +136,66 @@ class ReadoutWatch:
             self._monitor.reset()
             self._under_way = None
             return config
-        if found is None:
-            self._doubt(config)
-            return config
-        self.measured = found
-        if estimates:
-            return self._adopt(config, found)
-        self._judge(config, found)
-        return config
+        if found is not None:
+            self.measured = found
+            if estimates:
+                return self._adopt(config, found)
+            wrong = _wrong(config, found)
+            # Errors of the map may look like motion, but do not change as motion does.
+            if wrong is _Kind.REVERSED and self._monitor.odds.of_reversed > _SUPPORTED:
+                return self._turn_round(config)
+            self._judge(config, found, wrong)
+        return self._doubt(config)
 
-    def _doubt(self, config: NodeConfig) -> None:
+    def _doubt(self, config: NodeConfig) -> NodeConfig:
         """What a few frames tell, as long as a measurement says nothing else."""
-        silent = self.fault == "" and (self.measured is None or _may_be_none(config, self.measured))
-        if silent and self._monitor.global_shutter.certain:
+        odds = self._monitor.odds
+        silent = self._contradiction == "" and not _is_some(config, self.measured)
+        self.doubtful = silent and odds.doubtful
+        if silent and odds.certain:
             self.far_off = self.global_shutter = True
+            self.doubtful = False
+            self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
+        return self._turn_round(config) if silent and odds.reversed_ else config
 
-    def _judge(self, config: NodeConfig, found: MeasuredReadout) -> None:
-        wrong = _wrong(config, found)
-        self.fault = "" if wrong is None else _sentence(wrong, config, found)
+    def _turn_round(self, config: NodeConfig) -> NodeConfig:
+        """Take rows to run the other way: every pose of a moving camera would be wrong."""
+        given = ScanDirection(config.scan_direction)
+        found = self.measured
+        span = "" if found is None else _milliseconds(abs(found.readout_time), found.deviation)
+        text = (
+            f"the camera's motion says that the shutter moves against scan_direction {given}"
+            f"{span and f', in {span}'}: frames are localized as {REVERSED[given]} from now on; is "
+            f"it {REVERSED[given]}?"
+        )
+        self._notice(Notice.READOUT_TIME, text)
+        self._turned = "" if self._turned else text  # once more: as it is set
+        return replace(config, scan_direction=REVERSED[given].value)
+
+    def _judge(self, config: NodeConfig, found: MeasuredReadout, wrong: _Kind | None) -> None:
+        sure = self._monitor.odds.certain  # of a global one, whatever errors of the map look like
+        if wrong is None:
+            self._contradiction = ""
+        elif sure:
+            self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
+        else:
+            self._contradict(wrong, _sentence(wrong, config, found))
         off = math.hypot(found.readout_time - config.readout_time, found.deviation)
-        self.error = 0.0 if wrong is None else off
+        shorter = config.readout_time / max(
+            abs(found.readout_time), _GLOBAL * config.readout_time, found.deviation
+        )
+        self.error = 0.0 if wrong is None else off * max(shorter, 1.0)
         may_be = _may_be_none(config, found)
         self.far_off = may_be and (self.far_off or wrong is not None)
         self.global_shutter = self.far_off and (
-            self.global_shutter if wrong is None else wrong is _Kind.GLOBAL
+            self.global_shutter if wrong is None else sure or wrong is _Kind.GLOBAL
         )
-        if wrong is not None and wrong not in self._said:
-            self._said.add(wrong)
-            self._notice(Notice.READOUT_TIME, self.fault)
+
+    def _contradict(self, kind: _Kind, text: str) -> None:
+        self._contradiction = text
+        if kind not in self._said:
+            self._said.add(kind)
+            self._notice(Notice.READOUT_TIME, text)
 
     def _measure(
         self, camera: Camera, time_ns: int, estimate: Estimate, cloud: Correspondences
@@ -179,6 +238,13 @@ def _may_be_none(config: NodeConfig, found: MeasuredReadout) -> bool:
     return found.readout_time < _FAR_OFF * config.readout_time
 
 
+def _is_some(config: NodeConfig, found: MeasuredReadout | None) -> bool:
+    """Whether the readout time was measured, and nearer to the one that is set than to none."""
+    if found is None:
+        return False
+    return found.readout_time - _SURELY * found.deviation > _FAR_OFF * config.readout_time
+
+
 def _wrong(config: NodeConfig, found: MeasuredReadout) -> _Kind | None:
     if not found.contradicts(config.readout_time):
         return None
@@ -188,19 +254,12 @@ def _wrong(config: NodeConfig, found: MeasuredReadout) -> _Kind | None:
     return _Kind.REVERSED if reversed_ else _Kind.DURATION
 
 
-def _sentence(kind: _Kind, config: NodeConfig, found: MeasuredReadout) -> str:
-    if kind is _Kind.REVERSED:
-        given = ScanDirection(config.scan_direction)
-        span = _milliseconds(-found.readout_time, found.deviation)
-        return (
-            f"the camera's motion says that the shutter moves against scan_direction {given}, in "
-            f"{span}: is it {REVERSED[given]}?"
-        )
-    as_of = ", as of a global shutter" if kind is _Kind.GLOBAL else ""
+def _sentence(kind: _Kind, config: NodeConfig, found: MeasuredReadout | None) -> str:
+    span = "" if found is None else f"of {_milliseconds(found.readout_time, found.deviation)}"
+    parts = (span, "as of a global shutter" if kind is _Kind.GLOBAL else "")
+    said = ", ".join(part for part in parts if part)
     return (
-        "the camera's motion says a readout time of "
-        f"{_milliseconds(found.readout_time, found.deviation)}{as_of}; readout_time is "
-        f"{config.readout_time:g}"
+        f"the camera's motion says a readout time {said}; readout_time is {config.readout_time:g}"
     )
 
 

@@ -27,13 +27,14 @@ class MeasuredReadout:
     readout_time: float  # s; negative: against the scan direction that was assumed
     deviation: float  # s
     triples: int  # frames with two neighbours
+    telling: float  # effective number of them: those of one jolt alone make about 2
 
     def contradicts(self, readout_time: float) -> bool:
         """Whether this readout time (s, of the assumed direction) must be wrong."""
         off = abs(self.readout_time - readout_time)
         largest = max(abs(self.readout_time), readout_time)
         # Of few triples the deviation itself is uncertain: Student's t.
-        deviations = float(stdtrit(self.triples / _LAGS, 1.0 - _CHANCE))
+        deviations = float(stdtrit(min(self.triples, 4.0 * self.telling) / _LAGS, 1.0 - _CHANCE))
         return off > max(deviations * self.deviation, _LEAST_DIFFERENCE * largest)
 
     @property
@@ -91,4 +92,4 @@ def _measured(at: Score, value: float) -> MeasuredReadout:
     deviation = math.sqrt(
         max(variance / at.slope**2, 1.0 / at.slope) + value**2 * (systematic**2 + _MODEL_ERROR**2)
     )
-    return MeasuredReadout(value, deviation, len(at.terms))
+    return MeasuredReadout(value, deviation, len(at.terms), at.telling)

@@ -31,7 +31,7 @@ from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
 from rs_localizer.trajectory.image_alone import image_alone
 from rs_localizer.trajectory.measured_readout import MeasuredReadout, Measurement
-from rs_localizer.trajectory.online_kernels import SIDE, Equations, View, equation
+from rs_localizer.trajectory.online_kernels import SIDE, Equations, View, equation, jumps
 from rs_localizer.trajectory.shutter_odds import ShutterOdds
 
 REVERSED = {
@@ -116,14 +116,14 @@ class ReadoutMonitor:
         self._views: deque[tuple[int, View]] = deque(maxlen=3)
         self._window = _Window()
         self._in_a_row = 0  # triples, each one frame after the other
-        self.global_shutter = ShutterOdds()
+        self.odds = ShutterOdds()
 
     def reset(self) -> None:
         """Forget all frames: the camera, the map or the assumed direction has changed."""
         self._views.clear()
         self._window.clear()
         self._in_a_row = 0
-        self.global_shutter.reset()
+        self.odds.reset()
 
     def add(
         self, time_ns: int, camera: Camera, estimate: Estimate, points: Array, pixels: Array
@@ -170,15 +170,16 @@ class ReadoutMonitor:
     def _add_equation(self, readout_time: float) -> None:
         (before_ns, _), (now_ns, _), (after_ns, _) = self._views
         first, second = (now_ns - before_ns) * 1e-9, (after_ns - now_ns) * 1e-9
-        if max(first, second) > _LONGEST_INTERVAL or not (
-            1.0 / _MOST_UNLIKE < first / second < _MOST_UNLIKE
-        ):
+        before, now, after = (view for _, view in self._views)
+        alike = 1.0 / _MOST_UNLIKE < first / second < _MOST_UNLIKE
+        near = max(first, second) <= _LONGEST_INTERVAL
+        if not (alike and near) or jumps(before, now, after, first, second):
             self._in_a_row = 0
             return
-        self._window.add(now_ns, [view for _, view in self._views], first, second)
+        self._window.add(now_ns, (before, now, after), first, second)
         self._in_a_row += 1
         if self._in_a_row > 1 and readout_time > 0.0:
-            self.global_shutter.add(self._window.newest(2), readout_time)
+            self.odds.add(self._window.newest(2), readout_time)
 
     def measure(self) -> MeasuredReadout | None:
         """What the window shows; None as long as the motion determines nothing.
@@ -203,6 +204,7 @@ def warm_up(camera: Camera) -> None:
     image_alone(camera, Motion(np.eye(3), *np.zeros((3, 3))), points, pixels)
     window, view = _Window(), View(np.eye(3), np.zeros(3), np.zeros(SIDE), np.eye(2 * SIDE))
     window.add(0, [view, view, view], 1.0, 1.0)
+    jumps(view, view, view, 1.0, 1.0)
     Measurement(window.equations()).finish()
     window.add(1, [view, view, view], 1.0, 1.0)
     ShutterOdds().add(window.newest(2), 1.0)

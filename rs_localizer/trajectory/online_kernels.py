@@ -23,6 +23,11 @@ _MOTION = np.square([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 _HUBER = 12.6  # squared length beyond which a triple counts less: 95 % of six degrees of freedom
 _MEDIAN = 5.35  # median of chi-squared of six degrees of freedom
 
+# What no camera does between its frames (rad/s^2, m/s^2): it is elsewhere all at once, as in
+# recordings that were cut. So many deviations of noise beside that.
+_JUMP = (75.0, 40.0)
+_NOISE = 5.0
+
 
 class View(NamedTuple):
     """One frame."""
@@ -49,6 +54,7 @@ class Score(NamedTuple):
     terms: Array  # (n,) of which the sum is zero at the solution
     slope: float  # of the sum, without the part of the noise; negated
     noise: float  # part of the noise that was taken away
+    telling: float  # effective number of triples: one that says all makes 1
 
 
 @kernel
@@ -74,7 +80,7 @@ def score(of: Equations, value: float) -> Score:
             for j in range(SIDE):
                 squared[n] += error[n, i] * weights[n, i, j] * error[n, j]
     scale = max(1.0, np.median(squared) / _MEDIAN)
-    slope, noise = 0.0, 0.0
+    slope, noise, squares = 0.0, 0.0, 0.0
     mixed, taken = np.empty((SIDE, SIDE)), np.empty((SIDE, SIDE))  # of the noise of x and the error
     left, way = np.empty((SIDE, SIDE)), np.empty(SIDE)
     for n in range(count):
@@ -100,6 +106,7 @@ def score(of: Equations, value: float) -> Score:
         for i in range(SIDE):
             for j in range(SIDE):
                 shrink[i, j] *= _MOTION[i]
+        own = 0.0
         for i in range(SIDE):
             likely = 0.0
             for j in range(SIDE):
@@ -107,12 +114,14 @@ def score(of: Equations, value: float) -> Score:
             for j in range(SIDE):
                 pulled = robust * weights[n, j, i] * likely
                 terms[n] += pulled * error[n, j]
-                slope += pulled * of.x[n, j]
+                own += pulled * of.x[n, j]
                 through = 0.0
                 for k in range(SIDE):
                     through += shrink[i, k] * left[k, j]
                 noise += robust * weights[n, j, i] * through
-    return Score(terms, slope - noise, noise)
+        slope += own
+        squares += own * own
+    return Score(terms, slope - noise, noise, slope * slope / max(squares, 1e-300))
 
 
 @kernel
@@ -151,3 +160,23 @@ def equation(
                 of.xx[place, i, j] += pace * pace * covariance[i, j]
                 of.yx[place, i, j] += pace * share * covariance[SIDE + i, j]
                 of.yy[place, i, j] += share * share * covariance[SIDE + i, SIDE + j]
+
+
+@kernel
+def jumps(before: View, now: View, after: View, first: float, second: float) -> bool:
+    """Whether three views cannot be of one way, whatever the shutter; arguments of
+    :func:`equation`.
+    """
+    back, on = np.ascontiguousarray(before.rotation.T), np.ascontiguousarray(now.rotation.T)
+    turn = log(on @ after.rotation) / second - log(back @ now.rotation) / first
+    way = (after.position - now.position) / second - (now.position - before.position) / first
+    views, paces = (before, now, after), (1.0 / first, 1.0 / first + 1.0 / second, 1.0 / second)
+    for part in range(2):
+        squared, noise = 0.0, 0.0
+        for i in range(3):
+            squared += way[i] * way[i] if part else turn[i] * turn[i]
+            for k in range(3):
+                noise += paces[k] * paces[k] * views[k].covariance[3 * part + i, 3 * part + i]
+        if np.sqrt(squared) > 0.5 * (first + second) * _JUMP[part] + _NOISE * np.sqrt(noise):
+            return True
+    return False

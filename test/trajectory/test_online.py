@@ -96,7 +96,7 @@ def test_the_window_forgets_and_time_that_goes_back_starts_afresh() -> None:
 
 
 def test_contradiction_needs_both_many_deviations_and_a_real_difference() -> None:
-    assert not MeasuredReadout(0.030, 1e-3, 100).contradicts(0.033)
-    assert not MeasuredReadout(0.030, 1e-6, 100).contradicts(0.031)
-    assert MeasuredReadout(0.030, 5e-4, 100).contradicts(0.033)
-    assert MeasuredReadout(-0.030, 5e-4, 100).contradicts(0.030)
+    assert not MeasuredReadout(0.030, 1e-3, 100, 100.0).contradicts(0.033)
+    assert not MeasuredReadout(0.030, 1e-6, 100, 100.0).contradicts(0.031)
+    assert MeasuredReadout(0.030, 5e-4, 100, 100.0).contradicts(0.033)
+    assert MeasuredReadout(-0.030, 5e-4, 100, 100.0).contradicts(0.030)

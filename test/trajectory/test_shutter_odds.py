@@ -61,3 +61,31 @@ def test_what_was_seen_is_forgotten() -> None:
     found.reset()
     assert found.logarithm == 0.0
     assert not found.certain
+
+
+def test_a_reversed_shutter_is_told_from_a_global_one() -> None:
+    found = odds(-SET, speed=1.0)
+    assert found.reversed_
+    assert not found.certain
+    assert not odds(SET, speed=1.0).reversed_
+    assert not odds(0.0, speed=1.0).reversed_
+
+
+@pytest.mark.parametrize("true", [0.0, -SET])
+def test_a_camera_that_moves_otherwise_than_is_set_is_doubted(true: float) -> None:
+    assert odds(true, speed=1.0).doubtful
+    assert not odds(SET, speed=1.0).doubtful
+    assert not odds(true, speed=0.0).doubtful
+
+
+def test_two_jolts_make_no_global_shutter() -> None:
+    found = odds(0.0, speed=0.0)
+    count = 2
+    x, y = np.zeros((count, SIDE)), np.full((count, SIDE), 0.01)
+    x[1] = 100.0
+    none = np.zeros((count, SIDE, SIDE))
+    of = Equations(x, y, none, none, np.broadcast_to(0.5 * NOISE**2 * np.eye(SIDE), none.shape))
+    found.add(of, SET)
+    found.add(of, SET)
+    assert found.doubtful
+    assert not found.certain

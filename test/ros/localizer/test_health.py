@@ -165,7 +165,7 @@ def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
 def test_the_readout_time_that_the_motion_shows() -> None:
     summary, name = Statistics(Refusals(print), tell).summary(), "Readout time seen (ms)"
     assert name not in diagnose(GOOD, summary).values
-    seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100))
+    seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100, 100.0))
     assert diagnose(seen, summary).values[name] == "-20.04 +- 0.12"
 
 
