@@ -14,7 +14,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation import motion_model, tone_search
+from rs_localizer.estimation import lookalike, motion_model, tone_search
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.assumptions import (
     assumptions,
@@ -73,6 +73,7 @@ class Localizer:
         """
         motion_model.warm_up()
         tone_search.warm_up()
+        lookalike.warm_up()
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
         count = max(160, self.config.min_inliers)
         pixels = np.random.default_rng(0).uniform(0.3, 0.7, (count, 2)) * self.camera.size

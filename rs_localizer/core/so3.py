@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
 
 # Below this angle the series of the coefficients are exact to double precision.
@@ -153,5 +152,5 @@ def exp_many(vectors: Array) -> Array:
 def _exp_many(vectors: Array) -> Array:
     matrices = np.empty((len(vectors), 3, 3))
     for i in range(len(vectors)):
-        write(matrices[i], exp(vectors[i]))
+        matrices[i] = exp(vectors[i])
     return matrices

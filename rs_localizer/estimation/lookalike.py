@@ -51,6 +51,13 @@ def holding_motion(modes: list[Mode], state: Array, covariance: Array) -> Array:
     return wider
 
 
+def warm_up() -> None:
+    """Compile what a plane needs that looks like rest."""
+    moment = _second_moment(np.eye(PARAMETERS), np.zeros(PARAMETERS))
+    longest_axis(moment)
+    _widened(np.eye(PARAMETERS), moment)
+
+
 def _second_moment(covariance: Array, step: Array) -> Array:
     """Of pose and velocities of a Gaussian (18,18) that is a step (18,) away."""
     second: Array = told_from(covariance, step[TURN]) + np.outer(step, step)

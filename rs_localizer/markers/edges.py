@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.markers.profiles import BLACK, CUT, SEEN, VARIANCE, WHITE, edge_points
 
@@ -145,10 +144,10 @@ def _side(
     cell = _depth(q, at) / cells
     levels = _levels(before, at, cell)
     half = min(max(_HALF_CELLS * cell, _HALF_LEAST), _HALF_MOST)
-    write(rises, edge_points(image, a, b, half, levels, s, e))
+    rises[:] = edge_points(image, a, b, half, levels, s, e)
     while rises[CUT] * rises[SEEN] > count // 2 and half < cell:
         half = min(_LONGER * half, cell)
-        write(rises, edge_points(image, a, b, half, levels, s, e))
+        rises[:] = edge_points(image, a, b, half, levels, s, e)
     return _fit_twice(s, e, length >= _PARABOLA_FROM, c)
 
 
@@ -219,12 +218,12 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
                 good[s] = _side(image, q, s, cells[m], most_points, before, rises[s], curves[s])
             for k in range(4):
                 found[m, k] = good[k] and good[(k + 3) % 4]
-                write(moved[k], q[k])
+                moved[k] = q[k]
                 if found[m, k]:
                     x, y = _corner(q, k, curves[(k + 3) % 4], curves[k])
                     moved[k, 0], moved[k, 1] = x, y
-            write(q, moved)
-            write(before, rises)
+            q[:] = moved
+            before[:] = rises
         dx, dy = quads[m, 1, 0] - quads[m, 0, 0], quads[m, 1, 1] - quads[m, 0, 1]
         most = max(_MOST_MOVE_PIXELS, _MOST_MOVE_CELLS * math.sqrt(dx * dx + dy * dy) / cells[m])
         for k in range(4):
@@ -232,5 +231,5 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
             # Comparison with NaN is false.
             found[m, k] = found[m, k] and dx * dx + dy * dy <= most * most
             if found[m, k]:
-                write(quads[m, k], q[k])
+                quads[m, k] = q[k]
     return found

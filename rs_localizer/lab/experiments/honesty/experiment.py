@@ -34,9 +34,11 @@ def run(context: Context) -> Result:
             {"tum_vi_room5": context.hand_motion, "tum_rgbd_fr1_xyz": context.slow_hand_motion},
             Path(folder),
         )
-        for name, bench in benches(recordings).items():
+        all_of_them = benches(recordings)
+        for name, judge in _JUDGE.items():
+            bench = all_of_them[name]
             found = _run(bench, context, frames)
-            judged += _JUDGE[name](found)
+            judged += judge(found)
             rows = [bench.row(condition, one) for condition, one in found.items()]
             tables[f"honesty_{name}"] = Table(bench.columns, rows)
     shares = {part: shares_at_stamp(tables["honesty_coverage"], part) for part in ("pose", "twist")}
