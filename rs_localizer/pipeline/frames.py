@@ -228,12 +228,8 @@ class FrameLocalizer:
         if not result:
             return Refusal(result.reason, result.detail)
         self._watch_readout(cloud, result)
-        watch, turned = self.readout_watch, self._method.camera.scan_direction
-        known = ReadoutKnown(
-            deviation,
-            watch.may_be_reversed or turned != method.camera.scan_direction,
-            watch.global_shutter,
-        )
+        watch = self.readout_watch
+        known = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
         return self.mounted(of_camera(cloud, result, method.config, method.camera, frame, known))
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
@@ -245,8 +241,7 @@ class FrameLocalizer:
         time_ns = method.middle_row_ns(cloud.stamp_ns)
         config = self.readout_watch.add(method.config, method.camera, time_ns, estimate, cloud)
         if config is not method.config:
-            self._method = Method.of(method.calibration, config)
-            self.readout_watch.restart()
+            self._use(method.calibration, config)
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""

@@ -29,8 +29,6 @@ _SHARE = 300
 _WELL_KNOWN, _ENOUGH = 0.02, 60
 # So many deviations below zero, rows run the other way.
 _SURELY = 4.0
-# Of the odds for it (logarithm), what has to be there beside that.
-_SUPPORTED = 1.0
 # Of the setting: from here on frames that stand alone are better than tracked ones, and from here
 # on nothing tells the shutter from a global one.
 _FAR_OFF, _GLOBAL = 0.5, 0.2
@@ -61,23 +59,20 @@ class ReadoutWatch:
         self._said: set[_Kind] = set()
         # What the last seconds of motion showed; None: nothing yet.
         self.measured: MeasuredReadout | None = None
-        self._contradiction = ""  # how that contradicts the setting, in one sentence
-        self._turned = ""  # why rows are taken to run against the setting
+        self.fault = ""  # how that contradicts the setting, in one sentence
         # s, how far it says that the setting is off, for velocities that divide by it; 0: not.
         self.error = 0.0
         # Whether the setting is wrong by so much that what the camera does from frame to frame
         # says nothing of what it does within them: a global shutter. Once it was, doubts are not
         # enough.
         self.far_off = False
-        # Whether, of these, the shutter is a global one.
-        self.global_shutter = False
+        # Whether, of these, the shutter is a global one; and whether this leaves nothing but noise:
+        # one that shakes by more than half the rate of its images looks like it otherwise.
+        self.global_shutter = self.surely_global = False
+        # Whether rows are measured to run the other way.
+        self._reversed = False
         # Whether the last frames move, but not as the setting says, and no measurement tells.
         self.doubtful = False
-
-    @property
-    def fault(self) -> str:
-        """What is wrong about the setting, in one sentence."""
-        return self._contradiction or self._turned
 
     @property
     def trusted(self) -> bool:
@@ -87,7 +82,7 @@ class ReadoutWatch:
     @property
     def may_be_reversed(self) -> bool:
         """Whether rows may run the other way: then an image begins where it is said to end."""
-        return self.doubtful and self._monitor.odds.may_be_reversed
+        return self._reversed or (self.doubtful and self._monitor.odds.may_be_reversed)
 
     @property
     def of_rest(self) -> float:
@@ -99,18 +94,14 @@ class ReadoutWatch:
         warm_up(camera)
 
     def reset(self) -> None:
-        """Forget all frames, and what became of the settings."""
-        self.restart()
-        self._turned = ""
-
-    def restart(self) -> None:
-        """Forget all frames, because :meth:`add` has returned other settings."""
+        """Forget all frames."""
         self._monitor.reset()
         self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
         self._said.clear()
-        self.measured, self._contradiction, self.error = None, "", 0.0
-        self.far_off = self.global_shutter = self.doubtful = False
+        self.measured, self.fault, self.error = None, "", 0.0
+        self.far_off = self.global_shutter = self.surely_global = False
+        self.doubtful = self._reversed = False
 
     def add(
         self,
@@ -123,8 +114,7 @@ class ReadoutWatch:
         """Take a localized frame whose middle row was exposed at ``time_ns``.
 
         Returns:
-            the settings, with the readout time that was found where they ask for it, and the
-            reverse scan direction where the frames leave no doubt of it.
+            the settings, with the readout time that was found where they ask for it.
         """
         estimates = config.estimate_readout_time and config.readout_time == 0.0
         wanted = estimates or config.readout_time > 0.0
@@ -134,48 +124,30 @@ class ReadoutWatch:
             found = self._measure(camera, time_ns, estimate, cloud)
         except np.linalg.LinAlgError:  # a frame that says nothing must not stop the next ones
             self._monitor.reset()
-            self._under_way = None
+            self._under_way, self.doubtful = None, False
             return config
         if found is not None:
             self.measured = found
             if estimates:
                 return self._adopt(config, found)
-            wrong = _wrong(config, found)
-            # Errors of the map may look like motion, but do not change as motion does.
-            if wrong is _Kind.REVERSED and self._monitor.odds.of_reversed > _SUPPORTED:
-                return self._turn_round(config)
-            self._judge(config, found, wrong)
-        return self._doubt(config)
+            self._judge(config, found, _wrong(config, found))
+        self._doubt(config)
+        return config
 
-    def _doubt(self, config: NodeConfig) -> NodeConfig:
+    def _doubt(self, config: NodeConfig) -> None:
         """What a few frames tell, as long as a measurement says nothing else."""
         odds = self._monitor.odds
-        silent = self._contradiction == "" and not _is_some(config, self.measured)
+        silent = self.fault == "" and not _is_some(config, self.measured)
         self.doubtful = silent and odds.doubtful
         if silent and odds.certain:
-            self.far_off = self.global_shutter = True
+            self.far_off = self.global_shutter = self.surely_global = True
             self.doubtful = False
             self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
-        return self._turn_round(config) if silent and odds.reversed_ else config
-
-    def _turn_round(self, config: NodeConfig) -> NodeConfig:
-        """Take rows to run the other way: every pose of a moving camera would be wrong."""
-        given = ScanDirection(config.scan_direction)
-        found = self.measured
-        span = "" if found is None else _milliseconds(abs(found.readout_time), found.deviation)
-        text = (
-            f"the camera's motion says that the shutter moves against scan_direction {given}"
-            f"{span and f', in {span}'}: frames are localized as {REVERSED[given]} from now on; is "
-            f"it {REVERSED[given]}?"
-        )
-        self._notice(Notice.READOUT_TIME, text)
-        self._turned = "" if self._turned else text  # once more: as it is set
-        return replace(config, scan_direction=REVERSED[given].value)
 
     def _judge(self, config: NodeConfig, found: MeasuredReadout, wrong: _Kind | None) -> None:
         sure = self._monitor.odds.certain  # of a global one, whatever errors of the map look like
         if wrong is None:
-            self._contradiction = ""
+            self.fault = ""
         elif sure:
             self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
         else:
@@ -190,9 +162,11 @@ class ReadoutWatch:
         self.global_shutter = self.far_off and (
             self.global_shutter if wrong is None else sure or wrong is _Kind.GLOBAL
         )
+        self.surely_global = self.global_shutter and (self.surely_global or sure)
+        self._reversed = wrong is _Kind.REVERSED and not sure
 
     def _contradict(self, kind: _Kind, text: str) -> None:
-        self._contradiction = text
+        self.fault = text
         if kind not in self._said:
             self._said.add(kind)
             self._notice(Notice.READOUT_TIME, text)
@@ -255,6 +229,12 @@ def _wrong(config: NodeConfig, found: MeasuredReadout) -> _Kind | None:
 
 
 def _sentence(kind: _Kind, config: NodeConfig, found: MeasuredReadout | None) -> str:
+    if kind is _Kind.REVERSED and found is not None:
+        given = ScanDirection(config.scan_direction)
+        return (
+            f"the camera's motion says that the shutter moves against scan_direction {given}, in "
+            f"{_milliseconds(-found.readout_time, found.deviation)}: is it {REVERSED[given]}?"
+        )
     span = "" if found is None else f"of {_milliseconds(found.readout_time, found.deviation)}"
     parts = (span, "as of a global shutter" if kind is _Kind.GLOBAL else "")
     said = ", ".join(part for part in parts if part)

@@ -29,7 +29,7 @@ _INDEPENDENT = 1.0 / 6.0
 _MOST = np.array([[3.9], [10.0]])
 # Mean square of what changes at no readout time, in variances of its noise, that noise alone makes.
 _MOST_SCATTER = 1.5
-_CERTAIN, _OVERWHELMING = math.log(100.0), math.log(1000.0)
+_CERTAIN = math.log(100.0)
 # A camera that moves so much that the odds should be this (logarithm), if the setting were right,
 # has to show at least a part of it.
 _TELLING, _LEAST_SHOWN = 0.7, 0.5
@@ -93,16 +93,6 @@ class ShutterOdds:
         scatter = float(self._left[0, _NONE]) / (SIDE * max(self._count, 1.0))
         against = min(self.logarithm, self._odds(_NONE, _REVERSED))
         return scatter < _MOST_SCATTER and against > _CERTAIN
-
-    @property
-    def of_reversed(self) -> float:
-        """Logarithm of the odds that rows run the other way rather than as is set, or at once."""
-        return min(self._odds(_REVERSED, _SET), self._odds(_REVERSED, _NONE))
-
-    @property
-    def reversed_(self) -> bool:
-        """Whether that is certain."""
-        return self.of_reversed > _OVERWHELMING
 
     @property
     def may_be_reversed(self) -> bool:

@@ -17,6 +17,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.lab.independent.rotations import logarithm
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.lab.simulation.scene import room
 from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
@@ -106,22 +107,29 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm() -> None:
 
 
 @pytest.mark.parametrize("tracking", [True, False])
-def test_a_reversed_scan_is_said_and_frames_go_on_as_they_say(tracking: bool) -> None:
+def test_a_reversed_scan_is_said_and_covariances_hold(tracking: bool) -> None:
     given = {"readout_time": READOUT, "tracking": tracking}
     frames, (text,) = watched(FRAMES - 1, scan_direction="bottom_to_top", **given)
     assert "against scan_direction bottom_to_top" in text
     assert text.endswith("is it top_to_bottom?")
-    assert frames.readout_watch.fault == text
+    assert frames.readout_watch.far_off
+    assert frames.readout_watch.may_be_reversed
     right, _ = watched(FRAMES - 1, **given)
     last, known = (of.localize(clouds()[-1]) for of in (frames, right))
     assert last
     assert known
-    assert np.linalg.norm(last.pose.position - known.pose.position) < 1e-3
+    way = known.pose.position - last.pose.position
+    turn = logarithm(known.pose.rotation @ last.pose.rotation.T)
+    assert np.linalg.norm(way) > 2e-3  # the first row is the last
+    assert within(np.r_[way, turn], last.pose.covariance)
     assert last.twist is not None
-    # Who sets anything gets what he sets.
-    frames.config = changed(frames.config, scan_direction="bottom_to_top")
-    assert frames.config.scan_direction == "bottom_to_top"
-    assert frames.readout_watch.fault == ""
+    assert known.twist is not None
+    twist = (known.twist.linear - last.twist.linear, known.twist.angular - last.twist.angular)
+    assert within(np.concatenate(twist), last.twist.covariance)
+
+
+def within(error: np.ndarray, covariance: np.ndarray) -> bool:
+    return bool(error @ np.linalg.solve(covariance, error) < 16.8)  # 99 % of six
 
 
 def test_a_global_shutter_has_no_twist() -> None:

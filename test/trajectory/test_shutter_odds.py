@@ -63,12 +63,11 @@ def test_what_was_seen_is_forgotten() -> None:
     assert not found.certain
 
 
-def test_a_reversed_shutter_is_told_from_a_global_one() -> None:
+def test_a_reversed_shutter_may_be_reversed_and_is_no_global_one() -> None:
     found = odds(-SET, speed=1.0)
-    assert found.reversed_
+    assert found.may_be_reversed
     assert not found.certain
-    assert not odds(SET, speed=1.0).reversed_
-    assert not odds(0.0, speed=1.0).reversed_
+    assert not odds(SET, speed=1.0).may_be_reversed
 
 
 @pytest.mark.parametrize("true", [0.0, -SET])
