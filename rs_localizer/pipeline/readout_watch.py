@@ -63,8 +63,8 @@ class ReadoutWatch:
         # s, how far it says that the setting is off, for velocities that divide by it; 0: not.
         self.error = 0.0
         # Whether the setting is wrong by so much that what the camera does from frame to frame
-        # says nothing of what it does within them: a global shutter. Once it was, doubts are not
-        # enough.
+        # says nothing of what it does within them: a global shutter, or a reversed one. Once it
+        # was, doubts are not enough.
         self.far_off = False
         # Whether, of these, the shutter is a global one; and whether this leaves nothing but noise:
         # one that shakes by more than half the rate of its images looks like it otherwise.
