@@ -177,7 +177,7 @@ def test_corners_lie_where_those_of_other_rows_say(recording):
             points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays),
             camera.row_time_gradient,
         )  # fmt: skip
-        errors, by_motion, _, _ = linearized(
+        errors, by_motion, *_ = linearized(
             observations.packed, len(points), state_of(found), camera.row_time_gradient, still
         )
         motion = found.joint_covariance[:18, :18]

@@ -14,6 +14,7 @@ from rs_localizer.core.shake import FIRST_DEGREE, legendre, shake_basis
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.residuals import Lines
 
 # Coefficients of the field: polynomials of the image up to the third degree, in two directions.
 _FIELD_DEGREE = 3
@@ -49,19 +50,20 @@ class Columns(NamedTuple):
 
 
 @kernel
-def columns_of(
-    errors: Array, by_motion: Array, by_turn: Array, tau: Array, rays: Array, inliers: BoolArray,
-    degrees: int, field: bool,
-) -> Columns:  # fmt: skip
-    """Multiply the columns of a frame (see :func:`rs_localizer.estimation.residuals.linearized`).
+def columns_of(lines: Lines, inliers: BoolArray, degrees: int, field: bool) -> Columns:
+    """Multiply the columns of a frame.
+
+    The field is that of the places where the motion *sees* the points: taken where they were
+    measured, it would have their noise in it, as the errors have, but not the derivatives by the
+    motion, from which some fields differ by that alone.
 
     Args:
-        errors, by_motion, by_turn, tau: of the points, at the motion.
-        rays: (n,2) of the points, to say where in the image they are.
+        lines: of the points, at the motion; of the derivatives by it, the first 18 count.
         inliers: (n,) the points that count.
         degrees: of the polynomials of the shaking; 0: none.
         field: whether to add the columns of the field.
     """
+    errors, by_motion, by_turn, tau, image = lines
     chosen = np.flatnonzero(inliers)
     polynomials = max(degrees - FIRST_DEGREE + 1, 0)
     shake = 3 * polynomials
@@ -81,7 +83,7 @@ def columns_of(
         _fill_dense(dense, errors, by_motion, by_turn, tau, part, degrees)
         _add_products(dense, dense, True, products)
         if field:
-            _fill_smooth(smooth, rays, chosen, part)
+            _fill_smooth(smooth, image, chosen, part)
             _add_products(smooth, dense[:, :blocks], False, first)
             _add_products(smooth, dense[:, blocks:], False, second)
             _add_products(smooth, smooth, True, of_terms)
@@ -119,19 +121,19 @@ def _fill_dense(
 
 
 @inlined
-def _fill_smooth(smooth: Array, rays: Array, inliers: IntArray, chosen: IntArray) -> None:
+def _fill_smooth(smooth: Array, image: Array, inliers: IntArray, chosen: IntArray) -> None:
     """The field's terms of the chosen points among the inliers, in tiles and lanes."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for i in inliers:
         for k in range(2):
-            low[k], high[k] = min(low[k], rays[i, k]), max(high[k], rays[i, k])
+            low[k], high[k] = min(low[k], image[i, k]), max(high[k], image[i, k])
     scale = (2.0 / max(high[0] - low[0], 1e-12), 2.0 / max(high[1] - low[1], 1e-12))
     middle = (0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]))
     terms, x, y = np.empty(_FIELD_TERMS), np.empty(_FIELD_DEGREE + 1), np.empty(_FIELD_DEGREE + 1)
     for place in range(len(chosen)):
         i = chosen[place]
-        legendre(scale[0] * (rays[i, 0] - middle[0]), x)
-        legendre(scale[1] * (rays[i, 1] - middle[1]), y)
+        legendre(scale[0] * (image[i, 0] - middle[0]), x)
+        legendre(scale[1] * (image[i, 1] - middle[1]), y)
         _field_terms(x, y, terms)
         block, lane = place // LANES, place % LANES
         for k in range(_FIELD_TERMS):

@@ -76,7 +76,7 @@ def _costs(
 ) -> Array:
     """What delays (k,) leave, in noise variances."""
     count = len(observations)
-    errors, by_motion, by_turn, tau = linearized(
+    errors, by_motion, by_turn, tau, _ = linearized(
         observations.packed,
         count,
         posterior.state,

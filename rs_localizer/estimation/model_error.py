@@ -192,8 +192,8 @@ def examine(
     """
     count = len(rays)
     still = np.zeros((count, 6))
-    errors, by_motion, by_turn, tau = linearized(data, count, state, gradient, still)
-    columns = columns_of(errors, by_motion, by_turn, tau, rays, inliers, degrees, True)
+    lines = linearized(data, count, state, gradient, still)
+    columns = columns_of(lines, inliers, degrees, True)
     found = judged(
         columns, prior, state, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
     )
@@ -203,9 +203,9 @@ def examine(
     seen = found.sizes.no_field < _NO_FIELD
     return Examined(
         found.step, found.covariance, found.sizes,
-        neighbours_agree(errors, measured_tau, rays, inliers),
-        shared_errors(errors, rays, inliers) if seen else 0.0,
-        powers(errors, by_turn, measured_tau, inliers),
+        neighbours_agree(lines.errors, measured_tau, rays, inliers),
+        shared_errors(lines.errors, rays, inliers) if seen else 0.0,
+        powers(lines.errors, lines.by_turn, measured_tau, inliers),
         found.determined, found.cost, found.finite, columns,
     )  # fmt: skip
 
@@ -234,8 +234,8 @@ def judged(
 
 @kernel
 def gain_of_shaking(
-    data: Array, state: Array, gradient: Array, rays: Array, inliers: BoolArray,
-    prior: PriorTerms, degrees: int, freedom: float, noise: float,
+    data: Array, state: Array, gradient: Array, inliers: BoolArray, prior: PriorTerms,
+    degrees: int, freedom: float, noise: float,
 ) -> float:  # fmt: skip
     """How much better shaking of some size, alike at all degrees, explains the errors than none.
 
@@ -245,9 +245,9 @@ def gain_of_shaking(
     Args:
         data, state, ...: as of :func:`examine`; degrees of the shaking, 2 at least.
     """
-    count = len(rays)
-    errors, by_motion, by_turn, tau = linearized(data, count, state, gradient, np.zeros((count, 6)))
-    columns = columns_of(errors, by_motion, by_turn, tau, rays, inliers, degrees, False)
+    count = len(inliers)
+    lines = linearized(data, count, state, gradient, np.zeros((count, 6)))
+    columns = columns_of(lines, inliers, degrees, False)
     columns = with_prior(columns, prior, state, noise)
     found = project_out(
         columns.products, columns.with_errors, columns.squared_errors, columns.shake

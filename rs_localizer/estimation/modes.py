@@ -118,8 +118,8 @@ class Inliers:
         """Logarithm of how much better shaking, up to a degree, explains the errors than none."""
         observations = self.observations
         gain: float = gain_of_shaking(
-            observations.packed, state, observations.row_time_gradient, observations.rays,
-            self.inliers, terms, degree, self.freedom, self.noise,
+            observations.packed, state, observations.row_time_gradient, self.inliers, terms, degree,
+            self.freedom, self.noise,
         )  # fmt: skip
         return gain
 

@@ -8,7 +8,7 @@ Points lie in lanes (:mod:`rs_localizer.estimation.packing`); a motion is a stat
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,7 +44,7 @@ _TILES, _CLOSER_TILES = _tiles(MOTION_PARAMETERS), _tiles(PARAMETERS)
 _PAIRS = np.array([pair for tile in _TILES for pair in tile])
 _CLOSER_PAIRS = np.array([pair for tile in _CLOSER_TILES for pair in tile])
 # What :func:`linearized` says of a point: twice the error, its derivatives by the parameters and by
-# a turn at its row; and the row time.
+# a turn at its row; where on the image it is seen, and the row time.
 _LINE = 1 + PARAMETERS + 3
 
 
@@ -74,7 +74,7 @@ def _rows(looks: int, values: list[Lanes]) -> Vector:
 def _lines(values: list[Lanes]) -> Vector:
     view = View(values, looks=2, shaking=True)
     lines = zip(view.error, view.jacobian(), view.by_shake(), strict=True)
-    return [x for error, row, turn in lines for x in (error, *row, *turn)] + [view.tau]
+    return [x for error, row, turn in lines for x in (error, *row, *turn)] + [*view.image, view.tau]
 
 
 def _products(columns: int, tile: list[tuple[int, int]], values: list[Lanes]) -> Vector:
@@ -216,27 +216,31 @@ def normal_equations(
     return cost
 
 
+class Lines(NamedTuple):
+    """The points of an image, linearized at a motion."""
+
+    errors: Array  # (n,2) px
+    by_motion: Array  # (n,2,18) derivatives by the parameters
+    by_turn: Array  # (n,2,3) and by a turn of the camera at this row alone
+    tau: Array  # (n,) row times
+    image: Array  # (n,2) where the motion sees them, as rays
+
+
 @kernel
-def linearized(
-    data: Array, count: int, state: Array, gradient: Array, shake: Array
-) -> tuple[Array, Array, Array, Array]:
+def linearized(data: Array, count: int, state: Array, gradient: Array, shake: Array) -> Lines:
     """Each point's error and its derivatives at a motion and what the camera turns beside it.
 
     Args:
         data: packed points, ``count`` of them; weights are ignored.
         state, gradient: as above.
         shake: (count,6) the camera's turn at each measured row, in its own axes, and the rate.
-
-    Returns:
-        errors (count,2) px, derivatives (count,2,18) by the parameters and (count,2,3) by a turn
-        of the camera at this row alone, row times (count,).
     """
     uniform = np.empty(UNIFORM_SIZE * LANES)
     spread_state(state, gradient, 1.0, 0.0, uniform)
     block_data = np.zeros((POINT_SIZE + SHAKE_SIZE) * LANES)
-    lines = np.empty((2 * _LINE + 1) * LANES)
+    lines = np.empty((2 * _LINE + 3) * LANES)
     errors, by_motion = np.empty((count, 2)), np.empty((count, 2, PARAMETERS))
-    by_turn, tau = np.empty((count, 2, 3)), np.empty(count)
+    by_turn, tau, image = np.empty((count, 2, 3)), np.empty(count), np.empty((count, 2))
     for block in range(len(data)):
         first = block * LANES
         write(block_data[: POINT_SIZE * LANES], data[block])
@@ -254,5 +258,6 @@ def linearized(
                     by_motion[i, row, k] = lines[(at + 1 + k) * LANES + lane]
                 for k in range(3):
                     by_turn[i, row, k] = lines[(at + 1 + PARAMETERS + k) * LANES + lane]
-            tau[i] = lines[2 * _LINE * LANES + lane]
-    return errors, by_motion, by_turn, tau
+                image[i, row] = lines[(2 * _LINE + row) * LANES + lane]
+            tau[i] = lines[(2 * _LINE + 2) * LANES + lane]
+    return Lines(errors, by_motion, by_turn, tau, image)

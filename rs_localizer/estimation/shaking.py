@@ -121,16 +121,14 @@ def _fit(
     count = len(observations)
     covariance = np.empty((0, 0))
     for _ in range(steps):
-        errors, by_motion, by_turn, tau = linearized(
+        lines = linearized(
             observations.packed,
             count,
             state,
             observations.row_time_gradient,
             shake_at(observations.tau, coefficients),
         )
-        columns = columns_of(
-            errors, by_motion, by_turn, tau, observations.rays, inliers, degrees, False
-        )
+        columns = columns_of(lines, inliers, degrees, False)
         if not np.all(np.isfinite(columns.products)) or np.count_nonzero(inliers) < _FEWEST:
             return None
         information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)

@@ -14,6 +14,7 @@ from rs_localizer.estimation.evidence import evidence_of_sizes, project_out
 from rs_localizer.estimation.modes import Inliers
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior_kernels import add_prior
+from rs_localizer.estimation.residuals import Lines
 from rs_localizer.estimation.spectrum import CYCLES, spectrum
 from rs_localizer.estimation.tone_memory import leaning
 from rs_localizer.estimation.tones import Fit, Seen, Tones, products_of
@@ -85,10 +86,8 @@ def gain_of_field(
     frame: Inliers, state: Array, seen: Seen, chosen: BoolArray, noise: float
 ) -> float:
     """Logarithm of how much better a smooth field of errors explains the points."""
-    columns = columns_of(
-        seen.errors, seen.columns, seen.by_turn, seen.tau, frame.observations.rays, chosen,
-        0, True,
-    )  # fmt: skip
+    lines = Lines(seen.errors, seen.columns, seen.by_turn, seen.tau, seen.image)
+    columns = columns_of(lines, chosen, 0, True)
     columns = with_prior(columns, frame.terms, state, noise)
     field = project_out(
         columns.products, columns.with_errors, columns.squared_errors,

@@ -116,6 +116,7 @@ class Seen(NamedTuple):
     columns: Array  # (n,2,18 + 7 q) derivatives by the parameters
     by_turn: Array  # (n,2,3)
     tau: Array  # (n,)
+    image: Array  # (n,2) where they are seen, as rays
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +134,7 @@ class Fit:
 def seen_at(observations: Observations, tones: Tones) -> Seen:
     """The errors that tones leave, and their derivatives."""
     shake = shake_at(observations.tau, tones.coefficients(tones.degrees))
-    errors, by_motion, by_turn, tau = linearized(
+    errors, by_motion, by_turn, tau, image = linearized(
         observations.packed,
         len(observations),
         tones.state,
@@ -144,7 +145,7 @@ def seen_at(observations: Observations, tones: Tones) -> Seen:
     errors[behind] = _BEHIND
     squared = np.where(behind, np.inf, np.einsum("ni,ni->n", errors, errors))
     if len(tones.cycles) == 0:
-        return Seen(errors, squared, by_motion, by_turn, tau)
+        return Seen(errors, squared, by_motion, by_turn, tau, image)
     angle = 2.0 * math.pi * np.outer(tau, tones.cycles)
     waves = np.stack([np.cos(angle), np.sin(angle)], axis=2)  # (n,q,2)
     by_swings = np.einsum("nqw,nia->niqwa", waves, by_turn).reshape(*errors.shape, -1)
@@ -153,7 +154,7 @@ def seen_at(observations: Observations, tones: Tones) -> Seen:
     )
     by_cycles = np.einsum("nqw,qwa,nia->niq", slopes, tones.swings, by_turn)
     columns = np.concatenate([by_motion, by_swings, by_cycles], axis=2)
-    return Seen(errors, squared, columns, by_turn, tau)
+    return Seen(errors, squared, columns, by_turn, tau, image)
 
 
 def products_of(

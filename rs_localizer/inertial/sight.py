@@ -57,7 +57,7 @@ def sight_of(
     usable = find_usable(camera, *given, found.turn)
     seen = packed(camera, given[0], usable)
     count, motion = len(seen), found.beside_turn()
-    errors, by_motion, by_turn, tau = linearized(
+    errors, by_motion, by_turn, tau, _ = linearized(
         seen.packed, count, state_in(motion, usable.centre), seen.row_time_gradient,
         np.zeros((count, 6)),
     )  # fmt: skip

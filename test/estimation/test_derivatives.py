@@ -74,11 +74,12 @@ def test_lines_are_those_of_the_forward_projection(direction, coefficients):
     h = 1e-5
     rates = (shake(tau + h, coefficients) - shake(tau - h, coefficients)) / (2 * h)
     turns = np.column_stack([shake(tau, coefficients), rates])
-    errors, by_motion, by_turn, seen = residuals.linearized(
+    errors, by_motion, by_turn, seen, image = residuals.linearized(
         data, len(points), state, gradient(direction), turns
     )
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)
     np.testing.assert_allclose(seen, tau, atol=1e-9)
+    np.testing.assert_allclose(image, rays, atol=1e-9)
     expected = numerical(state, points, direction, coefficients)
     scale = np.abs(expected).max(axis=(0, 1))
     # The rate of the shaking stands for the body rate that it makes.

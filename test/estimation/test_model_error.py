@@ -19,6 +19,7 @@ from rs_localizer.estimation.evidence import (
 )
 from rs_localizer.estimation.model_error import neighbours_agree, shared_errors, with_model_error
 from rs_localizer.estimation.prior_terms import motion_terms
+from rs_localizer.estimation.residuals import Lines
 
 from .projection import polynomials
 
@@ -58,20 +59,21 @@ def test_the_shaking_of_many_rows_and_what_is_taken_away_in_the_middle():
 
 
 def frame(seed=0, count=COUNT):
-    """Random lines of a frame: errors, by_motion, by_turn, tau, rays, inliers."""
+    """Random lines of a frame, and the inliers."""
     rng = np.random.default_rng(seed)
-    return (
+    lines = Lines(
         DEVIATION * rng.normal(size=(count, 2)),
         rng.normal(size=(count, 2, 18)) * 10.0 ** rng.uniform(0, 3, 18),
         600.0 * rng.normal(size=(count, 2, 3)),
         rng.uniform(-0.5, 0.5, count),
         rng.uniform(-0.5, 0.6, (count, 2)),
-        rng.uniform(size=count) < 0.9,
     )
+    return lines, rng.uniform(size=count) < 0.9
 
 
-def design(errors, by_motion, by_turn, tau, rays, inliers, shake=True, field=True):
+def design(lines, inliers, shake=True, field=True):
     """All columns as a plain matrix (2 n, m), and the errors (2 n,)."""
+    errors, by_motion, by_turn, tau, rays = lines
     parts = [by_motion]
     if shake:
         turned = np.einsum("nk,nca->ncka", polynomials(tau, DEGREES - 1), by_turn)
@@ -110,7 +112,7 @@ def test_a_field_has_a_mean_square_of_one_over_the_image():
     rays = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     many = len(rays)
     nothing = np.zeros((many, 2)), np.zeros((many, 2, 18)), np.zeros((many, 2, 3)), np.zeros(many)
-    found = columns_of(*nothing, rays, np.ones(many, dtype=bool), 0, True)
+    found = columns_of(Lines(*nothing, rays), np.ones(many, dtype=bool), 0, True)
     mean = found.products[18:, 18:] / many
     assert np.trace(mean) == pytest.approx(2.0, rel=0.03)  # two directions
     degrees = np.tile([sum(place) for place in PLACES], 2)
@@ -215,11 +217,11 @@ def log_odds(probability):
 
 @pytest.mark.parametrize("kind", ["shake", "field"])
 def test_what_explains_more_is_weighed_first_and_the_other_beside_it(kind):
-    lines = list(frame(3))
+    lines = frame(3)
     matrix, errors = design(*lines)
     group, size = (SHAKING, 1e-3) if kind == "shake" else (FIELDS, 1.0)
     coefficients = np.random.default_rng(8).normal(size=len(group))
-    lines[0][lines[5]] += (size * matrix[:, group] @ coefficients).reshape(-1, 2)
+    lines[0].errors[lines[1]] += (size * matrix[:, group] @ coefficients).reshape(-1, 2)
     _, errors = design(*lines)
     columns = with_prior(columns_of(*lines, DEGREES, True), TERMS, STATE, DEVIATION)
     freedom = len(errors) - 6.0
@@ -306,11 +308,11 @@ def test_neighbours_agree_where_errors_are_shared_and_not_where_they_are_noise()
 @pytest.mark.parametrize("kind", ["shake", "field"])
 def test_what_a_frame_says_of_sizes_are_its_likelihoods(kind):
     """Logarithms, less that of the first: of what explains more by itself, and the other beside."""
-    lines = list(frame(3))
+    lines = frame(3)
     matrix, _ = design(*lines)
     group, size = (SHAKING, 1e-3) if kind == "shake" else (FIELDS, 1.0)
     coefficients = np.random.default_rng(8).normal(size=len(group))
-    lines[0][lines[5]] += (size * matrix[:, group] @ coefficients).reshape(-1, 2)
+    lines[0].errors[lines[1]] += (size * matrix[:, group] @ coefficients).reshape(-1, 2)
     _, errors = design(*lines)
     columns = with_prior(columns_of(*lines, DEGREES, True), TERMS, STATE, DEVIATION)
     sizes, freedom = np.array([1e-5, 1e-4, 1e-3]) * 10.0 ** (3 * (kind == "field")), 70.0

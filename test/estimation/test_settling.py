@@ -78,6 +78,16 @@ def test_the_covariance_covers_a_moving_camera(speed, acceleration):
     assert np.mean(squared < chi2.ppf(0.95, 12)) > 0.88
 
 
+@pytest.mark.parametrize("noise", [0.1, 1.0])
+@pytest.mark.parametrize("speed", [0.01, 0.1])
+def test_thousands_of_points_of_a_right_map_show_no_error_of_map_or_lens(speed, noise):
+    """What a field has of the points' noise, and their errors, too, grows with their number."""
+    for seed in range(3):
+        found, truth = settled(seed, speed, noise, count=2500)
+        assert found.model_error < 0.25 * noise + 0.02  # up to 1 px once
+        assert distance(found, truth, slice(0, 12)) < chi2.ppf(0.9999, 12)
+
+
 @pytest.fixture(scope="module")
 def resting():
     """Frames at rest: what is settled, the moving and the resting optimum, and the truth."""

@@ -127,7 +127,7 @@ def test_sizes_are_shared_among_neighbouring_degrees(count):
 
 def gain(observations, state):
     return gain_of_shaking(
-        observations.packed, state, observations.row_time_gradient, observations.rays,
+        observations.packed, state, observations.row_time_gradient,
         np.ones(len(observations), dtype=bool), TERMS, 22, 2.0 * len(observations) - 12.0, NOISE,
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
 from rs_localizer.lab.simulation.landmarks import random_descriptors
 from rs_localizer.lab.simulation.recording import write_simulated
 from rs_localizer.lab.simulation.scene import room
@@ -51,6 +51,7 @@ class Recording:
     info: CameraInfo
     clouds: list[PointCloud2]
     truth: list[np.ndarray]
+    exact: PointCloud2  # the first frame without noise
 
 
 def record(path: Path) -> Recording:
@@ -58,7 +59,21 @@ def record(path: Path) -> Recording:
     camera = Camera(640, 480, K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=READOUT_TIME)
     motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
-    frames = list(simulate_frames(camera, motion, world, FrameSettings(points=100, noise=0.7)))
+    settings = FrameSettings(points=100, noise=0.7)
+    frames = list(simulate_frames(camera, motion, world, settings))
+    first = next(simulate_frames(camera, motion, world, replace(settings, noise=0.0)))
+    info, clouds = _written(path, camera, frames)
+    return Recording(
+        info=info,
+        clouds=clouds,
+        truth=[frame.first_row.positions[0] for frame in frames],
+        exact=_written(path.with_name("exact"), camera, [first])[1][0],
+    )
+
+
+def _written(
+    path: Path, camera: Camera, frames: list[SimulatedFrame]
+) -> tuple[CameraInfo, list[PointCloud2]]:
     with BagWriter(path) as bag:
         for frame in frames:
             write_simulated(bag, camera, frame)
@@ -66,11 +81,7 @@ def record(path: Path) -> Recording:
     with open_bag(path) as bag:
         for topic, _, message in bag.messages(tuple(found)):
             found[topic].append(copy_message(message, message.__msgtype__))
-    return Recording(
-        info=found["/camera_info"][0],
-        clouds=found["/correspondences"],
-        truth=[frame.first_row.positions[0] for frame in frames],
-    )
+    return found["/camera_info"][0], found["/correspondences"]
 
 
 class World:
