@@ -30,9 +30,9 @@ class Observations:
         packed = pack(points, rays, tau, by_ray)
         return cls(points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed)
 
-    def thinned(self, every: int) -> Observations:
-        """Every so many points."""
-        chosen = np.arange(0, len(self), every)
+    def thinned(self, count: int) -> Observations:
+        """So many of the points, evenly taken."""
+        chosen = np.linspace(0, len(self) - 1, count).astype(np.int64)
         packed = thin(self.packed, chosen)
         return Observations(
             self.points[chosen], self.rays[chosen], self.tau[chosen], self.row_range,

@@ -74,12 +74,11 @@ def settle(
         threshold: px, of inliers.
         assumed: of the camera.
     """
-    every = -(-len(observations) // _MOST_POINTS)
-    if every <= 1:
+    if len(observations) <= _MOST_POINTS:
         found = _settled(observations, start, terms, threshold, assumed)
         shakes = assumed.rolling and assumed.turn is None
         return replace(found, strangers=_strangers(found, threshold)) if shakes else found
-    found = _settled(observations.thinned(every), start, terms, threshold, assumed)
+    found = _settled(observations.thinned(_MOST_POINTS), start, terms, threshold, assumed)
     gate = np.sqrt(found.squared_errors[found.inliers].max(initial=0.0))
     errors = observations.squared_errors(found.state)
     return replace(found, squared_errors=errors, inliers=errors <= gate**2)

@@ -11,7 +11,6 @@ from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.lab.independent.motions import IntArray, Motions, directions
 from rs_localizer.lab.independent.rotations import Array, BoolArray, exponential
 
-_POINTS = 80
 _DEPTHS = (1.0, 5.0)  # m
 _WALL_DISTANCE, _WALL_TILT = 2.5, math.radians(20.0)
 _MARGIN = 12.0  # px that noise may not carry a point over
@@ -21,10 +20,14 @@ _MARGIN = 12.0  # px that noise may not carry a point over
 class Rich:
     """Points at all depths, other ones in every frame."""
 
+    points: int = 80
+
 
 @dataclass(frozen=True, slots=True)
 class Wall:
     """Points on a wall that fills the image, other ones in every frame."""
+
+    points: int = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +90,7 @@ def _in_view(
     rng: np.random.Generator,
 ) -> Array:
     """Points behind random pixels of the middle row's instant."""
-    shape = (len(which), _POINTS)
+    shape = (len(which), scene.points)
     size = np.array([camera.width, camera.height]) - 1.0
     pixels = rng.uniform(_MARGIN, size - _MARGIN, (*shape, 2))
     rays = np.concatenate([camera.bearings(pixels), np.ones((*shape, 1))], axis=-1)

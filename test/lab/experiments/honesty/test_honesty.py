@@ -127,7 +127,7 @@ def test_conditions_have_names_of_their_own() -> None:
     assert [one.name for one in chosen] == ["hand/rich/3px/single", "hand/rich/3px/tracked"]
 
 
-@pytest.mark.parametrize("name", ["coverage", "p3p", "vibration", "few", "planes"])
+@pytest.mark.parametrize("name", ["coverage", "p3p", "vibration", "few", "many", "planes"])
 def test_a_condition_of_each_bench(name: str) -> None:
     bench = BENCHES[name]
     condition = bench.conditions[-1]
