@@ -28,6 +28,7 @@ from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.prior_terms import PriorTerms, with_motion
 from rs_localizer.estimation.ransac import Candidate
+from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import MotionSearch
@@ -211,7 +212,8 @@ class Localizer:
         if may_rest != assumed.may_rest:
             assumed = replace(assumed, may_rest=may_rest)
         threshold = self.config.inlier_threshold
-        return settle(observed.observations, best.state, terms, threshold, assumed)
+        observations = relinearized(self.camera, observed.observations, best.state, observed.turn)
+        return settle(observations, best.state, terms, threshold, assumed)
 
     def _accept(
         self, observed: Observed, start: Candidate, best: Candidate, posterior: Posterior

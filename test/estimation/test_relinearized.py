@@ -1,0 +1,85 @@
+"""Derivatives of pixels where a motion sees the points: without the noise of the points."""
+
+import numpy as np
+import pytest
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lanes.simd import LANES
+from rs_localizer.core.types import Motion
+from rs_localizer.estimation.observing import find_usable, packed
+from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.relinearized import relinearized
+from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.lab.simulation.scene import room
+from rs_localizer.lab.simulation.true_motion import ConstantVelocity
+from rs_localizer.localizer import Localizer
+
+K = np.array([[250.0, 0.0, 319.5], [0.0, 250.0, 239.5], [0.0, 0.0, 1.0]])
+FISHEYE = Camera(
+    640, 480, K, np.array([0.02, -0.01, 0.0, 0.0]), distortion_model="equidistant",
+    readout_time=0.03,
+)  # fmt: skip
+STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+TAU = np.linspace(-0.7, 0.7, 29)
+TURN = KnownTurn.of(TAU, np.tile([0.1, -0.2, 0.15], (29, 1)), 1e-8 * np.eye(6))
+
+
+def seen(count, turn=None, seed=0):
+    """Points (n,3) and exact pixels (n,2) of a camera that does nothing but the turn."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform(20.0, FISHEYE.size - np.array(20.0), (count, 2))
+    local = np.column_stack([FISHEYE.rays(pixels), np.ones(count)])
+    if turn is not None:
+        local = np.einsum("nji,nj->ni", turn.at_rows(FISHEYE.row_time(pixels))[0], local)
+    # On the walls of a room.
+    return 1.8 * local / np.abs(local).max(axis=1, keepdims=True), pixels
+
+
+def by_ray(observations):
+    """(n,4) of packed points."""
+    lanes = observations.packed.reshape(len(observations.packed), -1, LANES)
+    return np.moveaxis(lanes[:, 6:10], 1, 2).reshape(-1, 4)[: len(observations)]
+
+
+@pytest.mark.parametrize("turn", [None, TURN], ids=["fisheye", "and a known turn"])
+def test_derivatives_are_those_of_exact_points(turn):
+    points, pixels = seen(400, turn)
+    noisy = pixels + np.random.default_rng(1).normal(size=pixels.shape)
+
+    def observed(measured):
+        usable = find_usable(FISHEYE, points, measured, turn)
+        assert len(usable.indices) == len(points)
+        return packed(FISHEYE, points, usable), usable.centre
+
+    exact, _ = observed(pixels)
+    measured, centre = observed(noisy)
+    found = relinearized(FISHEYE, measured, state_in(STILL, centre), turn)
+    before = np.abs(by_ray(measured) - by_ray(exact)).max()
+    after = np.abs(by_ray(found) - by_ray(exact)).max()
+    assert after < 0.1 * before
+    np.testing.assert_array_equal(found.rays, measured.rays)
+    np.testing.assert_array_equal(found.tau, measured.tau)
+
+
+def test_few_points_and_lost_ones_keep_their_derivatives():
+    points, pixels = seen(400)
+    usable = find_usable(FISHEYE, points, pixels, None)
+    few = packed(FISHEYE, points[:100], find_usable(FISHEYE, points[:100], pixels[:100], None))
+    assert relinearized(FISHEYE, few, np.zeros(24), None) is few
+    far = Motion(np.eye(3), np.array([5.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+    observations = packed(FISHEYE, points, usable)
+    found = relinearized(FISHEYE, observations, state_in(far, usable.centre), None)
+    np.testing.assert_allclose(by_ray(found), by_ray(observations), rtol=1e-6)
+
+
+def test_thousands_of_points_of_a_fisheye_show_no_error_of_its_lens():
+    """Once these frames were refused for errors of 1 px."""
+    motion = ConstantVelocity(np.array([0.05, -0.1, 0.15]), np.array([0.5, 0.02, -0.3]), 0.1)
+    points = room(np.zeros((1, 3)), np.random.default_rng(0), count=20_000)
+    settings = FrameSettings(points=2500, noise=1.0, outliers=0.0)
+    for frame in simulate_frames(FISHEYE, motion, points, settings):
+        found = Localizer(FISHEYE).localize(frame.points, frame.pixels)
+        assert found, found
+        assert found.model_error < 0.25
+        assert np.linalg.norm(found.position - frame.middle_row.positions[0]) < 0.005
