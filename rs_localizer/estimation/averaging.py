@@ -13,13 +13,13 @@ from rs_localizer.core.state import PARAMETERS, TURN, step_between
 from rs_localizer.estimation.curvature import told_from
 from rs_localizer.estimation.model_error import Examined
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.refine import apply_step, solve_positive
 
 _LEAST_PROBABLE = 1e-200  # of which there still is a logarithm
 # Probabilities that have no part in the covariance.
 _NO_PART = 1e-5
-# Squared distance, in variances, of what is the same.
-_ALIKE = 1e-4
+# Squared distance, in variances, of what is the same; and of what ends in the same place.
+_ALIKE, _ON_THE_WAY = 1e-4, 1.0
 
 
 @kernel
@@ -62,6 +62,14 @@ def alike(state: Array, other: Array, covariance: Array) -> bool:
         if not squared <= _ALIKE * spread:
             return False
     return True
+
+
+@kernel
+def on_the_way(state: Array, other: Array, covariance: Array) -> bool:
+    """Whether a state is so near another one, the best of those around, that it would end there."""
+    step = step_between(state, other)
+    solution, solved = solve_positive(covariance, step)
+    return solved and np.sum(step * solution) < _ON_THE_WAY
 
 
 @kernel

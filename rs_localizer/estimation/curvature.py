@@ -22,7 +22,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
-from rs_localizer.core.state import MOVE, TURN
+from rs_localizer.core.state import MOVE
 
 
 @kernel
@@ -85,8 +85,25 @@ def told_from(covariance: Array, turn: Array) -> Array:
     second = 1.0 / 12.0
     if angle > 1e-3:
         second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
-    by_step = np.eye(len(covariance))
-    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    by_step[TURN, TURN] += 0.5 * hat + second * hat @ hat
-    by_step[MOVE, MOVE] = exp(turn)
-    return by_step @ covariance @ by_step.T
+    # Of the Jacobian only two blocks are not those of the identity.
+    blocks = np.zeros((2, 3, 3))
+    part = np.array([x, y, z])
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        blocks[0, i, i] = 1.0 - second * squared
+        blocks[0, j, k], blocks[0, k, j] = -0.5 * part[i], 0.5 * part[i]
+    for i in range(3):
+        for j in range(3):
+            blocks[0, i, j] += second * part[i] * part[j]
+    blocks[1] = exp(turn)
+    told = covariance
+    for _ in range(2):  # the rows, then those of the transpose
+        rows = told.copy()
+        for i in range(6):
+            block, first = blocks[i // 3, i % 3], i // 3 * 3
+            for j in range(len(covariance)):
+                rows[i, j] = 0.0
+                for k in range(3):
+                    rows[i, j] += block[k] * told[first + k, j]
+        told = rows.T.copy()
+    return told

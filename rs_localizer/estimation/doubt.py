@@ -46,11 +46,13 @@ def may_face(frame: Inliers, modes: list[Mode], state: Array, covariance: Array)
 def pieces_of(frame: Inliers, modes: list[Mode], least: float) -> list[Mode]:
     """Pieces of a speed's Gaussians along the lean, while their evidence is within ``least``."""
     best = min(modes, key=lambda mode: mode.cost)
-    terms = terms_at(frame.terms, best.speed, frame.assumed.turn is not None)
     pieces: list[Mode] = []
     points = frame.observations.points
     for window in windows(points, frame.inliers, best.state, best.covariance):
-        piece = frame.mode(window.state, window.times(terms), best.speed)
+        terms = terms_at(frame.terms, best.speed, frame.assumed.turn is not None)
+        within = window.times(terms)
+        fitted = frame.fitted(window.state, within)
+        piece = frame.gaussian(fitted, within, best.speed, window.state)
         pieces.append(replace(piece, evidence=piece.evidence - OVERLAP))
         if piece.evidence < max(one.evidence for one in pieces) - least:
             break

@@ -71,13 +71,13 @@ def windows(points: Array, inliers: BoolArray, state: Array, covariance: Array) 
     Returns:
         none where that Gaussian says enough, or the points are no plane.
     """
-    if np.trace(covariance[TURN, TURN]) < _LEAST_SPREAD**2:
+    if covariance[0, 0] + covariance[1, 1] + covariance[2, 2] < _LEAST_SPREAD**2:
         return []
     other = mirrored(points, inliers, state)
     if other is None:
         return []
     step = step_between(state, other)
-    angle = float(np.linalg.norm(step[TURN]))
+    angle = math.hypot(*step[TURN])
     axis, lean = step[TURN] / angle, 0.5 * angle
     spread = math.sqrt(axis @ covariance[TURN, TURN] @ axis)
     if spread < _LEAST_SPREAD or lean > min(_MOST_LEAN, _MOST_SPREADS * spread):

@@ -11,26 +11,32 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.columns import Columns
+from rs_localizer.estimation.columns import Columns, with_prior
+from rs_localizer.estimation.evidence import Sizes
 from rs_localizer.estimation.model_error import Examined, judged
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.refine import apply_step, solve_positive
+from rs_localizer.estimation.spectrum import Powers
 
-# Errors of second order, as parts of the noise, that are small.
-_SMALL = 0.02
+# Errors of second order, as parts of the noise, that are small; and beyond which a fit had better
+# not start where the linearized points lead.
+_SMALL, _LARGE = 0.02, 1.0
 
 
 @kernel
 def foreseen(
-    state: Array, columns: Columns, terms: PriorTerms, freedom: float, noise: float,
+    state: Array, columns: Columns, given: Array, terms: PriorTerms, freedom: float, noise: float,
     shake_sizes: Array, shake_prior: Array, field_sizes: Array, field_prior: Array,
     focal_length: float, depth: float,
 ) -> tuple[bool, Array, float, Examined]:  # fmt: skip
     """Whether the best motion under another prior is near, its state, cost (px^2), and the rest.
 
+    Where it is not, the state is one to start a fit from, and the rest nothing.
+
     Args:
         state: (24,) at which the points are linearized.
         columns: of motion, shaking and field there, without a prior.
+        given: (24,) where a fit would start that knows of no linearized points.
         terms: the other prior.
         freedom, noise, ...: see :func:`rs_localizer.estimation.model_error.examine`.
         focal_length: px.
@@ -38,11 +44,10 @@ def foreseen(
     """
     still, back = _still(state, columns)
     start = apply_step(state, back)
-    examined = judged(
-        still, terms, start, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
-    )
-    step = examined.step
-    reach = 0.0
+    known = with_prior(still, terms, start, noise)
+    motion = known.products[:PARAMETERS, :PARAMETERS]
+    step, solved = solve_positive(motion, known.with_errors[:PARAMETERS])
+    reach = 0.0 if solved else np.inf
     for part in range(6):
         square = 0.0
         for k in range(3 * part, 3 * part + 3):
@@ -50,8 +55,17 @@ def foreseen(
         # Over half a readout; turns and moves take turns.
         weight = 1.0 / (1.0, 2.0, 8.0)[part // 2]
         reach += weight * np.sqrt(square) / (depth if part % 2 == 1 else 1.0)
-    near = 0.5 * focal_length * reach * reach < _SMALL * noise
-    return near, apply_step(start, step), examined.cost, examined
+    second = 0.5 * focal_length * reach * reach / noise
+    if not second < _SMALL:
+        nothing = Sizes(0.0, 0.0, noise, 1.0, 1.0, 0.0, shake_sizes, field_sizes)
+        no_tones = Powers(0.0, np.zeros((0, 0)))
+        return False, apply_step(start, step) if second < _LARGE else given, 0.0, Examined(
+            step, still.products, nothing, 0.0, 0.0, no_tones, 0.0, 0.0, False, still
+        )  # fmt: skip
+    examined = judged(
+        still, terms, start, freedom, noise, shake_sizes, shake_prior, field_sizes, field_prior
+    )
+    return True, apply_step(start, examined.step), examined.cost, examined
 
 
 @inlined

@@ -35,6 +35,9 @@ _FAR_LESS_PROBABLE = 7.0
 _HARDLY_COUNTS = 3.0
 # Likewise, beyond which a mirrored pose at rest is not there at any speed.
 _OUT_OF_QUESTION = 20.0
+# So many noise variances more than another pose, where some of the points fit best, and no fit to
+# all of them is needed to rule a pose out.
+_HARDLY_THERE = 200.0
 
 
 def weighed(frame: Inliers, found: Posterior, planar: bool) -> Posterior:
@@ -99,7 +102,10 @@ def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
     other, one = mirrored(points, frame.inliers, near) if planar else None, False
     for speed in _SPEEDS if may_rest else (1.0,):
         chosen = terms_at(frame.terms, speed, turn_known)
-        mode = frame.mode(near, chosen, speed)
+        if speed == 1.0 and frame.only is not None:
+            mode = frame.gaussian(frame.only, chosen, speed, near)
+        else:
+            mode = frame.mode(near, chosen, speed)
         modes.append(mode)
         near = mode.state
         if planar and other is None:
@@ -117,7 +123,19 @@ def _modes(frame: Inliers, found: Posterior, planar: bool) -> list[Mode]:
 
 def _twin(frame: Inliers, mode: Mode, other: Array, terms: PriorTerms) -> Mode:
     """The Gaussian that a mirrored start (24,) leads to; the mode itself where they meet."""
-    fitted = frame.fitted_from_afar(other, terms)
+    nearer, cost = frame.fitted_to_some(other, terms)
+    if cost > (mode.cost + _HARDLY_THERE) * frame.noise**2:
+        twin = frame.gaussian((nearer, cost), terms, mode.speed, other)
+        if -math.inf < twin.evidence < mode.evidence - 2.0 * _OUT_OF_QUESTION:
+            return twin
+    rough = frame.fitted_roughly(nearer, terms)
+    best = mode.state, mode.cost * frame.noise**2
+    if frame.leads_to(rough, best, mode.covariance):
+        return mode
+    twin = frame.gaussian(rough, terms, mode.speed, other)
+    if -math.inf < twin.evidence < mode.evidence - _OUT_OF_QUESTION:
+        return twin
+    fitted = frame.fitted(nearer, terms)
     if alike(mode.state, fitted[0], mode.covariance):
         return mode
     return frame.gaussian(fitted, terms, mode.speed, other)
@@ -129,7 +147,8 @@ def _out_of_question(frame: Inliers, mode: Mode, twin: Mode) -> bool:
     At full speed there is none but the best one, and this mode explains the points nearly as well.
     """
     return (
-        mode.cost < frame.only_cost + 2.0 * _OUT_OF_QUESTION
+        frame.only is not None
+        and mode.cost < frame.only[1] / frame.noise**2 + 2.0 * _OUT_OF_QUESTION
         and twin.cost > mode.cost + 2.0 * _OUT_OF_QUESTION
         and twin.evidence < mode.evidence - _OUT_OF_QUESTION
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.estimation.assumptions import FIELD_PRIOR, SHAKE_PRIOR, SHAKE_SIZES, Assumed
-from rs_localizer.estimation.averaging import more_probable, volume_of
+from rs_localizer.estimation.averaging import more_probable, on_the_way, volume_of
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.linear import foreseen
@@ -22,6 +22,12 @@ from rs_localizer.estimation.prior_terms import PriorTerms
 
 # Along the flat valleys of small planes a fit may end before its steps do.
 _FITS = 4
+# Gain of the last step, noise variances: of a fit, which may be on its way along such a valley; of
+# one that only tells where it leads; and of one to a part of the points, whose best is not theirs.
+_FINE, _ROUGH, _NEARER = 1e-6, 0.1, 1.0
+# A fit that costs so little more than another one (noise variances), and is on the way there, ends
+# there.
+_HARDLY_WORSE = 1.0
 # So many points lead a fit to where all of them end it.
 _ENOUGH = 48
 # Odds by which motion must explain the points better than rest, to count in the estimate. Where a
@@ -73,8 +79,8 @@ class Inliers:
         # What a point is worth beside one whose error is its own (an effective number of points).
         self.worth = 1.0
         self.odds = math.log(_ODDS_AGAINST_MOTION) + assumed.of_rest  # logarithm
-        # Cost (noise variances) of the best motion if the mirrored pose leads back to it.
-        self.only_cost = -math.inf
+        # The best motion and its cost if the mirrored pose leads back to it.
+        self.only: tuple[Array, float] | None = None
         # What tones that hide in the noise add to the covariance of a camera that moves.
         self.unheard: Array | None = None
         self.shake_prior = more_probable(SHAKE_PRIOR, assumed.of_shake_sizes)
@@ -84,22 +90,41 @@ class Inliers:
         """State (24,) and cost of the best motion near a state."""
         for _ in range(_FITS):
             start, cost, converged = fit(
-                self._data, start, self.observations.row_time_gradient, terms, self.noise
+                self._data, start, self.observations.row_time_gradient, terms, self.noise, _FINE
             )
             if converged:
                 break
         return start, cost
 
-    def fitted_from_afar(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
-        """The same from a start that may lead along a valley: a part of the points goes first."""
+    def fitted_to_some(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
+        """State (24,) to which some of the points lead from afar, perhaps along a valley.
+
+        And its cost, as if the others had as much of it. Few points lead nowhere, at no cost.
+        """
         chosen = np.flatnonzero(self.inliers)
         part = chosen[:: len(chosen) // _ENOUGH] if len(chosen) >= 2 * _ENOUGH else chosen
-        if len(part) < len(chosen):
-            start, _, _ = fit(
-                thin(self._data, part), start, self.observations.row_time_gradient, terms,
-                self.noise * math.sqrt(len(part) / len(chosen)),
-            )  # fmt: skip
-        return self.fitted(start, terms)
+        if len(part) == len(chosen):
+            return start, 0.0
+        share = len(part) / len(chosen)
+        state, cost, _ = fit(
+            thin(self._data, part), start, self.observations.row_time_gradient, terms,
+            self.noise * math.sqrt(share), _NEARER,
+        )  # fmt: skip
+        return state, cost / share
+
+    def fitted_roughly(self, start: Array, terms: PriorTerms) -> tuple[Array, float]:
+        """State (24,) and cost of a motion that is on its way to the best one near a state."""
+        state, cost, _ = fit(
+            self._data, start, self.observations.row_time_gradient, terms, self.noise, _ROUGH
+        )
+        return state, cost
+
+    def leads_to(
+        self, rough: tuple[Array, float], best: tuple[Array, float], covariance: Array
+    ) -> bool:
+        """Whether a rough fit is on its way to a motion, of these costs, whose covariance it is."""
+        near: bool = on_the_way(rough[0], best[0], covariance)
+        return near and abs(rough[1] - best[1]) < _HARDLY_WORSE * self.noise**2
 
     def examined(
         self, state: Array, terms: PriorTerms, degree: int, neighbours: bool = True
@@ -124,15 +149,19 @@ class Inliers:
         return gain
 
     def mode(self, start: Array, terms: PriorTerms, speed: float) -> Mode:
-        """The Gaussian about the best motion of a typical speed."""
+        """The Gaussian about the best motion of a typical speed, which may foresee the next one."""
         if self.linear is not None:
             near, state, cost, examined = foreseen(
-                *self.linear, terms, self.freedom, self.noise, SHAKE_SIZES, self.shake_prior,
+                *self.linear, start, terms, self.freedom, self.noise, SHAKE_SIZES, self.shake_prior,
                 self.field_sizes, self.field_prior, self.assumed.focal_length, self._depth,
             )  # fmt: skip
             if near:
                 return self._gaussian((state, cost), examined, terms, speed, start)
-        return self.gaussian(self.fitted(start, terms), terms, speed, start)
+            start = state
+        fitted = self.fitted(start, terms)
+        examined = self.examined(fitted[0], terms, 0, neighbours=False)
+        self.linear = (fitted[0], examined.columns) if examined.finite else None
+        return self._gaussian(fitted, examined, terms, speed, start)
 
     def gaussian(
         self, fitted: tuple[Array, float], terms: PriorTerms, speed: float, start: Array

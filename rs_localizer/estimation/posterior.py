@@ -29,9 +29,9 @@ GATE = 3.5
 WIDEST_GATE = 2.0
 _ROUNDS = 3
 _ITERATIONS = 50
-# Gain of a last step, noise variances: while the inliers are chosen, and of a fit to those that
-# are, which may be on its way along the flat valley of a small plane.
-_ROUGH, _FINE = 1e-4, 1e-6
+# Gain of a last step, noise variances: of the first round, whose inliers are not the last ones, and
+# of the others.
+_FIRST, _LATER = 1e-2, 1e-4
 # A truncation that truncates nothing, px.
 _NO_SCALE = 1e6
 # Of the information matrix scaled to a unit diagonal.
@@ -180,7 +180,7 @@ def _rounds(
     weights = np.empty(count)
     information = np.empty((PARAMETERS, PARAMETERS))
     inverse = information
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         for i in range(count):
             weights[i] = 1.0 if errors[i] < gate * gate else 0.0
         state, information, cost, _ = refine(
@@ -193,7 +193,7 @@ def _rounds(
             noise,
             2,
             _ITERATIONS,
-            _ROUGH,
+            _FIRST if turn == 0 else _LATER,
         )
         errors = squared_errors(data, count, state, gradient)
         inverse = inverted(information)
@@ -231,7 +231,7 @@ def maximum_a_posteriori(
 
 @kernel
 def fit(
-    data: Array, start: Array, gradient: Array, terms: PriorTerms, noise: float
+    data: Array, start: Array, gradient: Array, terms: PriorTerms, noise: float, tolerance: float
 ) -> tuple[Array, float, bool]:
     """State (24,), cost and convergence of a fit to some of the points (see :func:`.refine`).
 
@@ -241,8 +241,9 @@ def fit(
         gradient: (2,) row time by pixel.
         terms: of the prior.
         noise: px.
+        tolerance: gain of the last step, noise variances.
     """
     state, _, cost, converged = refine(
-        data, start, gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
+        data, start, gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, tolerance
     )
     return state, cost, converged

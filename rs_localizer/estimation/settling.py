@@ -98,12 +98,15 @@ def _settled(
     other = mirrored(observations.points, best.inliers, best.state)
     mirrored_fits = False
     if other is not None:
-        state, cost = frame.fitted_from_afar(other, terms)
-        again, better = frame.fitted(best.state, terms)
-        better -= cost
+        nearer, _ = frame.fitted_to_some(other, terms)
+        rough = frame.fitted_roughly(nearer, terms)
+        again = frame.fitted(best.state, terms)
+        only = frame.leads_to(rough, again, best.covariance)
+        state, cost = again if only else frame.fitted(nearer, terms)
+        better = again[1] - cost
         mirrored_fits = abs(better) < CLEARLY_WORSE * best.noise**2
-        if alike(again, state, best.covariance):
-            frame.only_cost = cost / best.noise**2
+        if only or alike(again[0], state, best.covariance):
+            frame.only = again
         if better > best.noise**2:
             best = maximum_a_posteriori(observations, state, terms, threshold)
             if not best.determined:

@@ -228,6 +228,7 @@ def test_a_motion_that_leaves_all_points_behind_counts_for_nothing():
     assert np.all(np.isfinite(lost.covariance))
     assert inside.mode(truth, PRIOR, 1.0).evidence > -np.inf
     # Where nothing else is left, nothing is determined.
+    inside = Inliers(observations, best, PRIOR, ASSUMED)  # which foresees nothing yet
     assert not weighed(inside, replace(best, state=away), planar=False).determined
 
 
