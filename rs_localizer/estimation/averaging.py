@@ -69,7 +69,7 @@ def on_the_way(state: Array, other: Array, covariance: Array) -> bool:
     """Whether a state is so near another one, the best of those around, that it would end there."""
     step = step_between(state, other)
     solution, solved = solve_positive(covariance, step)
-    return solved and np.sum(step * solution) < _ON_THE_WAY
+    return bool(solved and np.sum(step * solution) < _ON_THE_WAY)
 
 
 @kernel
