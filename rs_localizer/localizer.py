@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, localizer_config
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lens import LensError, with_distortion
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import step_between
@@ -23,7 +26,8 @@ from rs_localizer.estimation.assumptions import (
     with_experience,
 )
 from rs_localizer.estimation.inputs import checked, unfit
-from rs_localizer.estimation.observing import Observed, find_usable, packed
+from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, told_of_lens
+from rs_localizer.estimation.observing import Observed, Sighted, find_usable, packed
 from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.prior_terms import PriorTerms, with_motion
@@ -42,6 +46,17 @@ _PREDICTION_SCALE = 16.0
 _MOST_INNOVATION = 62.0
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
+
+
+class _Given(NamedTuple):
+    """What :meth:`Localizer.find` is given."""
+
+    points: Array
+    pixels: Array
+    scores: Array | None
+    prior: Prior | None
+    expected_share: float
+    turn: KnownTurn | None
 
 
 class Localizer:
@@ -89,6 +104,9 @@ class Localizer:
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
+        # And through a lens that is off.
+        bent = with_distortion(self.camera, np.array([-0.02, 0.0]))
+        self.localize(points, bent.distort(rays)[0], prior=Prior(asks_lens=True))
         # And before a plane whose points agree with nothing.
         flat = points * (2.0 / points @ [0.1, 0.0, 1.0])[:, None]
         strewn = np.random.default_rng(1).normal(size=(count, 2))
@@ -150,13 +168,24 @@ class Localizer:
         points, pixels, scores = checked(points, pixels, scores)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
+        given = _Given(points, pixels, scores, prior, expected_share, turn)
+        if prior is not None and prior.lens is not None:
+            found = self._found(given, prior.lens)
+            if found:
+                return found
+        return self._found(given, None)
+
+    def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
+        """What there is to find by a lens that other frames tell of, or by the calibration's."""
+        points, pixels, scores, prior, expected_share, turn = given
+        camera = self.camera if lens is None else lens.mended(self.camera)
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
-        usable = find_usable(self.camera, points, pixels, turn)
-        failure = unfit(self.camera, pixels, usable.indices, usable.shown, self.config.min_inliers)
+        usable = find_usable(camera, points, pixels, turn)
+        failure = unfit(camera, pixels, usable.indices, usable.shown, self.config.min_inliers)
         if failure is not None:
             return failure
         observed = Observed(
-            packed(self.camera, points, usable),
+            packed(camera, points, usable),
             usable.indices,
             len(points),
             usable.centre,
@@ -164,7 +193,9 @@ class Localizer:
             known_terms(self._terms, prior, turn),
             generator(self.config.seed),
             with_experience(self._assumed, prior, turn_seen(self._terms, turn)),
-            turn,
+            Sighted(camera, points, pixels, usable, turn),
+            lens,
+            prior is not None and prior.asks_lens,
         )
         # 2. Near the predicted motion, if the points agree with it (tracking).
         if prior is not None and prior.motion is not None:
@@ -178,14 +209,43 @@ class Localizer:
         # 4. Maximum a posteriori on the inliers; rest or motion; the mirrored pose of a plane.
         posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
-        return self._accept(observed, start, best, posterior)
+        found = self._accept(observed, start, best, posterior)
+        return self._by_lens(observed, start, best, posterior, found)
+
+    def _by_lens(
+        self, observed: Observed, start: Candidate, best: Candidate, posterior: Posterior,
+        found: Estimate | Failure,
+    ) -> Estimate | Failure:  # fmt: skip
+        """The same, or if a lens that is off explains the points decidedly better, by that lens."""
+        threshold = self.config.inlier_threshold
+        if (
+            observed.lens is not None
+            or not self._solver.rolling_shutter
+            or not may_be_lens(found, posterior, threshold)
+        ):
+            return found
+        mended = find_lens(observed, posterior, threshold)
+        if mended is None:
+            return found
+        again = replace(
+            observed, observations=mended.observations, sighted=mended.sighted, lens=mended.lens
+        )
+        settled = self._settle(again, Candidate(mended.state, 0.0), observed.terms)
+        if not decided(posterior, settled, mended.lens, threshold):
+            return found
+        result = self._accept(again, start, best, settled)
+        if not result:
+            return found
+        return result if result.of_lens else replace(result, of_lens=mended.lens)
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""
         assert prior.motion is not None
         threshold = self.config.inlier_threshold
         predicted = state_in(prior.motion, observed.centre)
-        terms = with_motion(observed.terms, prior, observed.centre, observed.turn is not None)
+        terms = with_motion(
+            observed.terms, prior, observed.centre, observed.sighted.turn is not None
+        )
         best = self._search.optimize(observed, predicted, _PREDICTION_SCALE * threshold, terms)
         start = Candidate(predicted, best.cost)
         posterior = self._settle(observed, best, terms)
@@ -212,7 +272,8 @@ class Localizer:
         if may_rest != assumed.may_rest:
             assumed = replace(assumed, may_rest=may_rest)
         threshold = self.config.inlier_threshold
-        observations = relinearized(self.camera, observed.observations, best.state, observed.turn)
+        sighted = observed.sighted
+        observations = relinearized(sighted.camera, observed.observations, best.state, sighted.turn)
         return settle(observations, best.state, terms, threshold, assumed)
 
     def _accept(
@@ -230,4 +291,8 @@ class Localizer:
         if failure is not None:
             return failure
         still = self._search.global_shutter_inliers(observed, start)
-        return estimate_of(observed, posterior, still, best.samples)
+        if observed.lens is None and not observed.asks_lens:
+            return estimate_of(observed, posterior, still, best.samples)
+        posterior, lens = told_of_lens(observed, posterior)
+        estimate = estimate_of(observed, posterior, still, best.samples)
+        return replace(estimate, lens=observed.lens, of_lens=lens)

@@ -184,6 +184,8 @@ class Tracker:
                     rest = self.of_rest if turn is None else 0.0
                     prior = replace(prior, covariance=_UNKNOWN, of_rest=rest, of_tones=None)
                 prior = prior if turn is None else _beside(prior, turn)
+            if self._track is not None:
+                prior = self._track.experience.with_lens(prior)
             return self.localizer.find(points, pixels, scores, prior, share, turn), prior
 
         if self._aid is None:
@@ -200,7 +202,8 @@ class Tracker:
             return result
         self._track = _followed(self._track, prior, result, time_ns)
         if self._aid is not None and imu is not None and self._aid.wants_sight():
-            camera = self.localizer.camera
+            lens, camera = result.lens, self.localizer.camera
+            camera = camera if lens is None else lens.mended(camera)
             self._aid.seek(sight_of(camera, points, pixels, result, time_ns))
         return self.localizer.accepted(result)
 

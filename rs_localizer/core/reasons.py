@@ -66,6 +66,7 @@ class Notice(StrEnum):
     COARSE_COORDINATES = "coarse_coordinates"
     PIXELS_OUTSIDE = "pixels_outside"
     READOUT_TIME = "readout_time"
+    LENS = "lens"
     # Of maps and keypoints.
     MAP_REPLACED = "map_replaced"
     MAP_INCOMPLETE = "map_incomplete"

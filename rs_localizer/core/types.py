@@ -11,6 +11,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Motion
@@ -47,6 +48,9 @@ class Estimate(Motion):
     turn: KnownTurn | None = None
     # By how many readouts the points would delay the known turn, and the variance of that
     delay: tuple[float, float] = (0.0, math.inf)
+    # Distortion that the calibration lacks, where the motion was found with it; None: it lacks none
+    lens: LensError | None = None
+    of_lens: LensError | None = None  # what the frame says of that; None: not asked
 
     @property
     def covariance(self) -> Array:

@@ -23,8 +23,9 @@ _MOST_NOISE, _MOST_NOISE_GLOBAL_SHUTTER = 0.75, 1.0
 _MOST_AGREEMENT = 4.2
 # Less than this, in inlier thresholds, makes the covariance larger and refuses nothing.
 _LEAST_MODEL_ERROR = 0.05
-# Errors of map and lens, root mean square, in inlier thresholds.
-_MOST_MODEL_ERROR = 0.4
+# Errors of map and lens, root mean square, in inlier thresholds: by default most of the probability
+# (0.8) is then that of 1 px, the largest that is tried, which stands for all that are larger.
+_MOST_MODEL_ERROR = 0.45
 # An image that moves along with the rows is one moment of the scene, drawn out: any motion that
 # does so fits anything. See :meth:`Observations.row_paces`.
 _LEAST_PACE = 0.25

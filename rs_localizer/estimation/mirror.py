@@ -40,6 +40,11 @@ def facing(points: Array, inliers: BoolArray, state: Array) -> Array | None:
     return other if found else None
 
 
+def is_plane(points: Array, inliers: BoolArray) -> bool:
+    """Whether the points (n,3) that count lie on a plane."""
+    return bool(_plane(points, inliers)[0])
+
+
 @kernel
 def _leaning_less(
     points: Array, inliers: BoolArray, state: Array, leans: float

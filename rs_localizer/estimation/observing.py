@@ -12,6 +12,7 @@ from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lens import LensError
 from rs_localizer.core.steadied import steadied
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.inputs import distinct, near_image
@@ -23,6 +24,35 @@ from rs_localizer.estimation.sampling import Random
 
 # Points farther away than this (m) are faults, and their squares would be infinite.
 _FARTHEST_POINT = 1e9
+
+
+class Usable(NamedTuple):
+    """What can be used of the points."""
+
+    indices: IntArray  # of those that are finite, distinct and inside the image
+    shown: BoolArray  # (n,) which lie in the image
+    centre: Array  # (3,) map frame: the median of the points
+    rays: Array  # (n,2), steadied
+    by_ray: Array  # (n,2,2) derivatives of the pixels by them
+    tau: Array  # (n,) row times
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighted:
+    """The points of one image as they were given, and what of them can be used."""
+
+    camera: Camera
+    points: Array  # (n,3)
+    pixels: Array  # (n,2)
+    usable: Usable
+    turn: KnownTurn | None  # what the rays are steadied by
+
+    def by(self, camera: Camera) -> Observations | None:
+        """The same points through another lens; None where it has no bearing for one."""
+        rays, by_ray = _rays(camera, self.pixels, self.usable.tau, self.turn)
+        if not np.all(np.isfinite(rays[self.usable.indices])):
+            return None
+        return packed(camera, self.points, self.usable._replace(rays=rays, by_ray=by_ray))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,30 +67,27 @@ class Observed:
     terms: PriorTerms  # velocity prior and whatever else is known but the pose
     random: Random
     assumed: Assumed
-    turn: KnownTurn | None  # what the observations are steadied by
-
-
-class Usable(NamedTuple):
-    """What can be used of the points."""
-
-    indices: IntArray  # of those that are finite, distinct and inside the image
-    shown: BoolArray  # (n,) which lie in the image
-    centre: Array  # (3,) map frame: the median of the points
-    rays: Array  # (n,2), steadied
-    by_ray: Array  # (n,2,2) derivatives of the pixels by them
-    tau: Array  # (n,) row times
+    sighted: Sighted
+    lens: LensError | None = None  # what its camera lacked
+    asks_lens: bool = False  # what the frame says of that
 
 
 def find_usable(camera: Camera, points: Array, pixels: Array, turn: KnownTurn | None) -> Usable:
     """Find the usable ones of points (n,3) and pixels (n,2); a known turn is taken out of these."""
-    rays, by_ray = bearings(camera, pixels)
     tau = camera.row_time(pixels)
-    if turn is not None:
-        rays, by_ray = steadied(rays, tau, by_ray, camera.row_time_gradient, turn)
+    rays, by_ray = _rays(camera, pixels, tau, turn)
     width, height = camera.size
     shown = near_image(pixels, float(width), float(height))
     centre, candidates = _candidates(points, rays, shown)
     return Usable(distinct(points, pixels, candidates), shown, centre, rays, by_ray, tau)
+
+
+def _rays(camera: Camera, pixels: Array, tau: Array, turn: KnownTurn | None) -> tuple[Array, Array]:
+    """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, steadied."""
+    rays, by_ray = bearings(camera, pixels)
+    if turn is None:
+        return rays, by_ray
+    return steadied(rays, tau, by_ray, camera.row_time_gradient, turn)
 
 
 @kernel

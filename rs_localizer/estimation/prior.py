@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.lens import LensError
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior_checks import check_covariance, check_motion
 
@@ -31,6 +32,8 @@ class Prior:
             :mod:`rs_localizer.estimation.tone_memory`.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
+        lens: radial distortion that the calibration lacks, by other frames; None: it lacks none.
+        asks_lens: whether the frame shall say what it lacks.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
             along ``gravity_in_map``, of any length, and the standard deviation of its direction
             in rad.
@@ -50,6 +53,8 @@ class Prior:
     of_field_sizes: Array | None = None
     of_tones: Array | None = None
     of_rest: float = 0.0
+    lens: LensError | None = None
+    asks_lens: bool = False
 
     def __post_init__(self) -> None:
         if (self.motion is None) != (self.covariance is None):

@@ -29,7 +29,7 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         still: how many points a global shutter would explain.
         samples: minimal samples drawn.
     """
-    state, turn = posterior.state, observed.turn
+    state, turn = posterior.state, observed.sighted.turn
     rotation = rotation_of(state)
     residuals = np.full(observed.count, np.nan)
     residuals[observed.usable] = np.sqrt(posterior.squared_errors)

@@ -25,7 +25,7 @@ from rs_localizer.pipeline.imu import ImuInput
 from rs_localizer.pipeline.landmarks import Landmarks
 from rs_localizer.pipeline.maps import read_landmarks
 from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
-from rs_localizer.pipeline.oddities import oddities
+from rs_localizer.pipeline.oddities import lens_is_off, oddities
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
@@ -227,6 +227,8 @@ class FrameLocalizer:
             )
         if not result:
             return Refusal(result.reason, result.detail)
+        if result.lens is not None:
+            self._notice(Notice.LENS, lens_is_off(result.lens))
         self._watch_readout(cloud, result)
         watch = self.readout_watch
         known = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
@@ -239,7 +241,9 @@ class FrameLocalizer:
     def _watch_readout(self, cloud: Correspondences, estimate: Estimate) -> None:
         method = self._method
         time_ns = method.middle_row_ns(cloud.stamp_ns)
-        config = self.readout_watch.add(method.config, method.camera, time_ns, estimate, cloud)
+        lens, camera = estimate.lens, method.camera
+        camera = camera if lens is None else lens.mended(camera)
+        config = self.readout_watch.add(method.config, camera, time_ns, estimate, cloud)
         if config is not method.config:
             self._use(method.calibration, config)
 

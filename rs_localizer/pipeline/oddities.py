@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.clouds import Correspondences
 
@@ -62,4 +63,13 @@ def _pixels(cloud: Correspondences, camera: Camera) -> str:
     return (
         f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
         f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
+    )
+
+
+def lens_is_off(lens: LensError) -> str:
+    """What to say of a calibration that lacks distortion."""
+    return (
+        f"the calibration looks off: residuals form a smooth field over the image, as of a lens "
+        f"that moves points by up to {lens.pixels:.1f} px; poses are found with the distortion "
+        "that it lacks; calibrate again"
     )

@@ -55,7 +55,8 @@ REASONS: dict[str, Meaning] = {
     Reason.MODEL_ERROR: Meaning(
         "the errors of neighbouring points agree, or few points shake out of the gate: vibration "
         "that the rows cannot tell, or a map or calibration that is too far off for any pose",
-        f"a stiffer mounting, the calibration, the map; {_TURNED}",
+        f"a stiffer mounting, the calibration (before a plane no frame tells its lens from a bent "
+        f"map: show points at several depths), the map; {_TURNED}",
     ),
     Reason.UNCERTAIN: Meaning(
         "the points tell the orientation less well than max_orientation_deviation, as those of a "

@@ -99,8 +99,8 @@ def test_points_that_inliers_swing_by(good):
 
 def test_errors_that_are_smooth_over_the_image(good):
     observations, posterior = good
-    assert reason(observations, replace(posterior, model_error=0.79)) is None
-    assert reason(observations, replace(posterior, model_error=0.81)) is Reason.MODEL_ERROR
+    assert reason(observations, replace(posterior, model_error=0.89)) is None
+    assert reason(observations, replace(posterior, model_error=0.91)) is Reason.MODEL_ERROR
 
 
 def test_motions_that_no_camera_makes(good):

@@ -18,7 +18,8 @@ SIZES = np.array([0.0, -1.0])
 
 def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset() -> None:
     priors: list[Any] = []
-    results: list[Any] = [SimpleNamespace(of_shake_sizes=SIZES, of_field_sizes=2.0 * SIZES)] * 3
+    said = {"of_shake_sizes": SIZES, "of_field_sizes": 2.0 * SIZES, "lens": None, "of_lens": None}
+    results: list[Any] = [SimpleNamespace(**said)] * 3
     results.insert(1, Failure(Reason.NO_HYPOTHESIS, ""))
 
     def localize(points: Any, pixels: Any, scores: Any, prior: Any) -> Any:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.core.lens import LensError
 from rs_localizer.io.clouds import Correspondences
-from rs_localizer.pipeline.oddities import oddities
+from rs_localizer.pipeline.oddities import lens_is_off, oddities
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)
@@ -60,3 +61,9 @@ def test_pixels_of_another_resolution() -> None:
     part = Camera(640, 480, K, binning=(2, 2), roi=Roi(100, 60, 400, 300))
     found = oddities(cloud(pixel=(300.0, 100.0)), part, "camera")
     assert "2 of 2 pixels lie outside the 200 x 150" in found["pixels_outside"]
+
+
+def test_a_lens_that_is_off_is_said_in_pixels() -> None:
+    text = lens_is_off(LensError(np.array([-0.02, 0.0]), np.eye(2), 400.0))
+    assert "calibration looks off" in text
+    assert "up to 8.0 px" in text

@@ -20,6 +20,7 @@ class Answer:
     model_error: float  # px, root mean square of what map, lens and motion leave beside the noise
     iterations: int
     tracked: bool
+    lens: float = 0.0  # px, how far the distortion that the calibration lacks moves image points
 
 
 def tell(frame: Localized) -> tuple[int, Answer]:
@@ -34,5 +35,6 @@ def tell(frame: Localized) -> tuple[int, Answer]:
         model_error=estimate.model_error,
         iterations=estimate.iterations,
         tracked=estimate.tracked,
+        lens=0.0 if estimate.lens is None else estimate.lens.pixels,
     )
     return frame.input_stamp_ns, answer

@@ -160,6 +160,7 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
             "Inliers with global shutter": str(summary.last.global_shutter_inliers),
             "Residual RMS (px)": f"{summary.last.residual:.3f}",
             "Model error (px)": f"{summary.last.model_error:.3f}",
+            "Lens error (px)": f"{summary.last.lens:.2f}",
             "Iterations": str(summary.last.iterations),
         }
     if condition.readout is not None:

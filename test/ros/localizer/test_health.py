@@ -33,6 +33,7 @@ def frame(stamp: float = 0.0, tracked: bool = False) -> Any:
         iterations=64,
         model_error=0.0,
         tracked=tracked,
+        lens=None,
     )
     return SimpleNamespace(input_stamp_ns=round(stamp * 1e9), estimate=estimate)
 
@@ -93,6 +94,7 @@ def test_numbers_of_a_working_node(world: World) -> None:
         "Inliers with global shutter": "2",
         "Residual RMS (px)": f"{np.sqrt(25.0 / 3.0):.3f}",
         "Model error (px)": "0.000",
+        "Lens error (px)": "0.00",
         "Iterations": "64",
         "Frames received": "100",
         "Poses published": "100",

@@ -21,7 +21,7 @@ from rs_localizer.lab.experiments.honesty.text import heading, line
 from rs_localizer.lab.experiments.results import Table
 from rs_localizer.process.arguments import integer
 
-_NAMES = ("coverage", "p3p", "vibration", "few", "many", "planes", "tags", "rendered")
+_NAMES = ("coverage", "p3p", "vibration", "few", "many", "lens", "planes", "tags", "rendered")
 
 
 def main() -> int:

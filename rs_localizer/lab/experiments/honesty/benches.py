@@ -12,6 +12,7 @@ from rs_localizer.lab.experiments.honesty import (
     against_p3p,
     coverage,
     few_points,
+    lens,
     many_points,
     rendered,
     small_planes,
@@ -89,6 +90,7 @@ def benches(recordings: Recordings) -> dict[str, Bench[Any, Any]]:
         ),
         "vibration": Bench("Vibration", vibration.conditions(), vibration.measure, *regions),
         "few": Bench("Few points, shaken", few_points.conditions(), few_points.measure, *regions),
+        "lens": Bench("A lens that is off", lens.conditions(), lens.measure, *regions),
         "many": Bench("Many points", many_points.conditions(), many_points.measure, *regions),
         "planes": Bench(
             "Small planes", small_planes.conditions(), small_planes.measure,

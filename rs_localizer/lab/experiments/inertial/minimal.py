@@ -25,7 +25,7 @@ from rs_localizer.estimation.assumptions import (
     turn_seen,
     with_experience,
 )
-from rs_localizer.estimation.observing import Observed, find_usable, packed
+from rs_localizer.estimation.observing import Observed, Sighted, find_usable, packed
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.sampling import generator
@@ -171,7 +171,7 @@ def _found(
         known_terms(terms, prior, turn),
         generator(config.seed),
         with_experience(assumed, prior, turn_seen(terms, turn)),
-        turn,
+        Sighted(camera, *given, usable, turn),
     )
     start, best = MotionSearch(camera, config, solver).find(observed)
     if not start.found:

@@ -1,0 +1,255 @@
+"""A calibration whose lens is off: its radial distortion, found with the motion.
+
+A smooth field of errors (:mod:`.model_error`) makes covariances larger and leaves the estimate as
+it is. Where it is large, a few coefficients of the lens explain the points to the noise, which
+neither shaking does, by which the points of a row move alike, nor a map that is bent, unless it is
+a plane.
+A lens stays what it is, so that frames are joined, as in the information filter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.lens import (
+    LensError,
+    by_distortion,
+    coefficients_of,
+    corner_of,
+    with_distortion,
+)
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.shake import shake_at
+from rs_localizer.core.state import PARAMETERS
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.mirror import is_plane
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.observing import Observed, Sighted
+from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, maximum_a_posteriori
+from rs_localizer.estimation.prior_kernels import add_prior
+from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.estimation.residuals import linearized
+
+# Standard deviations of the coefficients beforehand: radial ones of 20 px at the corners of an
+# image of 800 px across, as 30 % of the distortion of a plain lens; tangential ones, which hardly
+# differ from a turn of the camera, of a few tenths.
+_DEVIATIONS = np.array([0.05, 0.05, 5e-4, 5e-4])
+# Parts of them to try, of what many frames tell.
+_PARTS = (0.06, 0.2, 0.6)
+# Gates of the rounds, in inlier thresholds: at first the rim of the image is far off.
+_GATES = (4.0, 2.0, 1.0, 1.0, 1.0)
+# More points than this only take time.
+_MOST_POINTS = 2500
+_SMALL = 0.2  # of a step, in standard deviations
+# What a lens that is off makes of a frame that is refused, and of one that nearly is: errors around
+# the motion, in inlier thresholds, or a smooth field, whatever else explains it (logarithm of the
+# odds; shaking alone leaves less).
+_BY_LENS = (Reason.MODEL_ERROR, Reason.RESIDUAL)
+_MUCH_NOISE, _MUCH_MODEL_ERROR, _FIELD_ODDS = 0.6, 0.1, 12.0
+# Logarithm of the odds by which the lens must explain the points better than what was refused.
+_DECIDED = 20.0
+# Smooth errors that it may leave, in parts of the noise: a bent map leaves more.
+_MOST_LEFT = 1.0
+# Swing of the points by shaking, likewise, beyond which a frame says nothing of a lens.
+_SWING = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mended:
+    """The lens that fits an image, and the image as it shows it."""
+
+    sighted: Sighted
+    lens: LensError
+    observations: Observations
+    state: Array  # (24,)
+
+
+def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mended | None:
+    """Find motion and lens together, from the rim of the image inwards.
+
+    Args:
+        observed: the points, by the camera as it is calibrated.
+        refused: the best motion by that.
+        threshold: px, of inliers.
+
+    None where the points do not determine them. Those of a plane do, but one that is bent about one
+    axis, before a camera that comes nearer, looks like one that a lens bends about its middle.
+    """
+    sighted, terms = observed.sighted, observed.terms
+    if is_plane(observed.observations.points, refused.inliers):
+        return None
+    camera, state = sighted.camera, refused.state
+    coefficients = np.zeros(coefficients_of(camera))
+    for gate in _GATES:
+        mended = with_distortion(camera, coefficients)
+        observations = sighted.by(mended)
+        if observations is None:
+            return None
+        if len(observations) > _MOST_POINTS:
+            observations = observations.thinned(_MOST_POINTS)
+        best = maximum_a_posteriori(observations, state, terms, gate * threshold)
+        if not (best.determined and np.all(np.isfinite(best.state))):
+            return None
+        by_mended = replace(sighted, camera=mended)
+        step, lens, _ = _told(by_mended, observations, best, terms, coefficients)
+        if not np.all(np.isfinite(step)):
+            return None
+        change = lens.mean - coefficients
+        coefficients, state = lens.mean, apply_step(best.state, step)
+        if gate == _GATES[-1] and change @ np.linalg.solve(lens.covariance, change) < _SMALL**2:
+            break
+    mended = with_distortion(camera, coefficients)
+    observations = sighted.by(mended)
+    if observations is None:
+        return None
+    return Mended(replace(sighted, camera=mended), lens, observations, state)
+
+
+def told_of_lens(observed: Observed, posterior: Posterior) -> tuple[Posterior, LensError | None]:
+    """A posterior that knows how well its lens is known, and what its frame alone says of that.
+
+    Frames of a camera that shakes say nothing, because what the shaking leaves of them looks like a
+    lens; nor do planes, of which nobody knows that they are not bent, nor bent maps.
+    """
+    believed, count = observed.lens, coefficients_of(observed.sighted.camera)
+    silent = (
+        posterior.model_error > _MOST_LEFT * posterior.noise
+        or is_plane(observed.observations.points, posterior.inliers)
+        or _shakes(observed, posterior)
+    )
+    if silent and believed is None:
+        return posterior, None
+    _, lens, pull = _told(
+        observed.sighted, observed.observations, posterior, observed.terms,
+        np.zeros(count) if believed is None else believed.mean,
+    )  # fmt: skip
+    says = None if silent or not np.all(np.isfinite(lens.covariance)) else lens
+    if believed is None:
+        return posterior, says
+    covariance = posterior.covariance.copy()
+    spread = posterior.inflation * believed.covariance
+    covariance[:PARAMETERS, :PARAMETERS] += pull @ spread @ pull.T
+    return replace(posterior, covariance=covariance), says
+
+
+def _shakes(observed: Observed, posterior: Posterior) -> bool:
+    """Whether the points swing by more than a part of the noise."""
+    turns = shake_at(observed.observations.tau, posterior.shake)[:, :3]
+    swing = observed.sighted.camera.focal_length * math.sqrt(np.square(turns).sum(axis=1).mean())
+    return swing > _SWING * posterior.noise
+
+
+def may_be_lens(found: Estimate | Failure, posterior: Posterior, threshold: float) -> bool:
+    """Whether a lens that is off may be why a frame was refused, or nearly so."""
+    if not found:
+        return found.reason in _BY_LENS
+    return _odd(posterior, threshold) or bool(
+        posterior.of_field_sizes.max(initial=0.0) > _FIELD_ODDS
+    )
+
+
+def _odd(posterior: Posterior, threshold: float) -> bool:
+    return (
+        posterior.noise > _MUCH_NOISE * threshold
+        or posterior.model_error > _MUCH_MODEL_ERROR * threshold
+    )
+
+
+def decided(before: Posterior, after: Posterior, lens: LensError, threshold: float) -> bool:
+    """Whether a lens explains the points decidedly better than what a frame was refused for.
+
+    By the marginal likelihoods at unknown noise; of points that were no inliers the error counts
+    as that of the widest gate. A frame that is still odd has something else.
+    """
+    chosen = after.inliers
+    most = (WIDEST_GATE * threshold) ** 2
+    left = np.minimum(before.squared_errors[chosen], most).sum()
+    now = after.squared_errors[chosen].sum()
+    freedom = 2.0 * np.count_nonzero(chosen) - PARAMETERS
+    left_over = _odd(after, threshold) or after.model_error > _MOST_LEFT * after.noise
+    if left_over or not (freedom > 0.0 and now > 0.0):
+        return False
+    gain = freedom * math.log(left / now) - _known(lens, 1.0)
+    return bool(0.5 * gain > _DECIDED)
+
+
+def joined(before: LensError, newest: LensError, memory: float) -> LensError:
+    """What two groups of frames say together; the first fades by a factor."""
+    beforehand = _beforehand(before)
+    old, new = (np.linalg.inv(one.covariance) for one in (before, newest))
+    covariance = np.linalg.inv(memory * (old - beforehand) + new)
+    mean = covariance @ (memory * old @ before.mean + new @ newest.mean)
+    return replace(newest, mean=mean, covariance=covariance)
+
+
+def odds_of(lens: LensError) -> float:
+    """Logarithm of the odds for a lens that is off by some size, against the calibration's."""
+    precision, beforehand = np.linalg.inv(lens.covariance), _beforehand(lens)
+    pulled = precision @ lens.mean
+    gains = []
+    for part in _PARTS:
+        within = precision + (part**-2 - 1.0) * beforehand
+        gains.append(0.5 * (pulled @ np.linalg.solve(within, pulled) - _known(lens, part)))
+    return float(np.logaddexp.reduce(gains)) - math.log(len(_PARTS))
+
+
+def _beforehand(lens: LensError) -> Array:
+    """Information (k,k) on as many coefficients before any frame."""
+    information: Array = np.diag(_DEVIATIONS[: len(lens.mean)] ** -2)
+    return information
+
+
+def _known(lens: LensError, part: float) -> float:
+    """How much more is known than of a part of the deviations: logarithm of the determinants."""
+    beforehand = _beforehand(lens)
+    within = np.linalg.inv(lens.covariance) + (part**-2 - 1.0) * beforehand
+    return float(np.linalg.slogdet(within)[1] - np.linalg.slogdet(part**-2 * beforehand)[1])
+
+
+def _told(
+    sighted: Sighted, observations: Observations, best: Posterior, terms: PriorTerms,
+    coefficients: Array,
+) -> tuple[Array, LensError, Array]:  # fmt: skip
+    """Step (18,) to the best motion beside the lens, the lens, and how it pulls the motion (18,k).
+
+    Args:
+        sighted: by the camera with these coefficients (k,).
+    """
+    count, chosen = len(observations), best.inliers
+    lines = linearized(
+        observations.packed,
+        count,
+        best.state,
+        observations.row_time_gradient,
+        shake_at(observations.tau, best.shake),
+    )
+    seen, camera = lines.image[chosen], sighted.camera
+    if sighted.turn is not None:  # out of which the rays were turned
+        turned = sighted.turn.at_rows(observations.tau[chosen])[0]
+        local = np.einsum("nij,nj->ni", turned, np.column_stack([seen, np.ones(len(seen))]))
+        seen = local[:, :2] / local[:, 2:]
+    columns = by_distortion(camera, seen).reshape(-1, len(coefficients))
+    dense, left = lines.by_motion[chosen].reshape(-1, PARAMETERS), lines.errors[chosen].ravel()
+    variance = best.noise**2
+    information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    add_prior(*terms, best.state, variance, information, slope)
+    information += dense.T @ dense
+    inverse = inverted(information)
+    if not np.all(np.isfinite(inverse)):  # only the frames before determine it
+        inverse = best.covariance[:PARAMETERS, :PARAMETERS] / variance
+    crossed = dense.T @ columns
+    pull = -inverse @ crossed
+    plain = inverse @ (-dense.T @ left - slope)
+    beforehand = np.diag(variance / _DEVIATIONS[: len(coefficients)] ** 2)
+    precision = columns.T @ columns + crossed.T @ pull + beforehand
+    beside = -columns.T @ left - crossed.T @ plain - beforehand @ coefficients
+    covariance = inverted(precision)
+    step = covariance @ beside
+    corner = camera.focal_length * corner_of(camera)
+    lens = LensError(coefficients + step, variance * covariance, corner)
+    return plain + pull @ step, lens, pull

@@ -1,0 +1,132 @@
+"""A lens that is off is found with the motion, and nothing else is taken for one.
+
+Frames come from the independent simulator, which shares no line with the estimator.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rs_localizer.core.lens import LensError
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.experience import Experience
+from rs_localizer.estimation.lens import joined, odds_of
+from rs_localizer.lab.experiments.honesty.estimating import (
+    believed,
+    estimate,
+    frames_of,
+    scored,
+    truth_of,
+)
+from rs_localizer.lab.independent.cameras import Camera
+from rs_localizer.lab.independent.motions import hand, vibration
+from rs_localizer.lab.independent.rotations import logarithm
+from rs_localizer.lab.independent.scenes import Rich, Wall
+from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.moments import pose_at
+from rs_localizer.tracking import Tracker
+
+
+def frames(make_motions=hand, scene=None, seed=3, length=8):
+    return frames_of(Camera(), make_motions, scene or Rich(), 5, seed, length)
+
+
+def lacking(share):
+    """Localizer of a camera without that share of its distortion, and the coefficients."""
+    true = Camera()
+    corner = 0.5 * np.hypot(true.width, true.height) / true.focal
+    k1, k2, p1, p2, _ = true.distortion
+    lacks = share * np.array([k1 * corner**2, k2 * corner**4, p1 * corner, p2 * corner])
+    return Localizer(believed(true, distortion_off=share)), lacks
+
+
+@pytest.mark.parametrize("share", [0.03, 0.3])
+def test_single_frames_find_the_lens_and_their_poses_hold(share):
+    seen = frames()
+    localizer, lacks = lacking(share)
+    results = estimate(seen, localizer, 0.1, tracking=False)
+    for frame, found in results.items():
+        assert found, found
+        off = found.lens.mean - lacks
+        assert off @ np.linalg.solve(found.lens.covariance, off) < 18.5  # once in a thousand
+        pose, truth = pose_at(found, 0.0), truth_of(seen.middle, frame)
+        turn = np.degrees(np.linalg.norm(logarithm(truth.rotation @ pose.rotation.T)))
+        assert turn < 0.05  # 0.2 to 0.4 by a global shutter
+    found = scored(seen, results, localizer.camera)
+    assert found.stamp.inside("pose").sum() >= 4
+    assert found.middle.inside("twist").sum() >= 4
+
+
+def test_right_lenses_shaking_and_bent_walls_are_no_lens():
+    right, _ = lacking(0.0)
+    for motion, noise in ((hand, 1.0), (lambda n, rng: vibration(n, rng, 1.0, 100.0), 0.1)):
+        results = estimate(frames(motion), right, noise, tracking=False)
+        assert all(result and result.lens is None for result in results.values())
+    # A wall that a lens bends, and one that is rolled up: one looks like the other.
+    wall = frames(scene=Wall())
+    off, _ = lacking(0.1)
+    assert {r.reason for r in estimate(wall, off, 0.1, False).values()} == {Reason.MODEL_ERROR}
+    local = (wall.points - wall.middle.position[:, None]) @ wall.middle.rotation
+    local[..., 2] += 0.05 * (local[..., 0] / local[..., 2]) ** 2
+    bent = local @ np.swapaxes(wall.middle.rotation, 1, 2) + wall.middle.position[:, None]
+    results = estimate(replace(wall, points=bent), right, 0.1, False).values()
+    assert {r.reason for r in results} == {Reason.MODEL_ERROR}
+
+
+def test_a_tracker_learns_what_single_frames_do_not_tell():
+    seen = frames(length=24)
+    localizer, lacks = lacking(0.03)
+    tracker = Tracker(localizer)
+    found = [tracker.localize(seen.middle_ns(frame), *seen.seen(frame, 1.0)) for frame in range(24)]
+    assert found[0].lens is None
+    assert found[-1].lens is not None
+    # Where the two powers differ least: at the corners, to half a pixel of 400.
+    assert sum(found[-1].lens.mean[:2]) == pytest.approx(sum(lacks[:2]), abs=1.2e-3)
+
+
+def gaussian(mean, deviation):
+    return LensError(np.array(mean), np.diag(np.square(deviation)), 400.0)
+
+
+def test_frames_are_joined_by_their_information():
+    prior = np.eye(2) / 0.05**2
+    one, other = gaussian([0.01, 0.0], [0.01, 0.02]), gaussian([0.03, 0.01], [0.02, 0.01])
+    both = joined(one, other, 0.5)
+    old, new = (np.linalg.inv(lens.covariance) for lens in (one, other))
+    np.testing.assert_allclose(
+        np.linalg.inv(both.covariance), 0.5 * (old - prior) + (new - prior) + prior
+    )
+    pulled = 0.5 * old @ one.mean + new @ other.mean
+    np.testing.assert_allclose(np.linalg.solve(both.covariance, both.mean), pulled)
+
+
+def test_odds_are_for_lenses_that_are_off_by_many_deviations():
+    assert odds_of(gaussian([0.0, 0.0], [1e-3, 1e-3])) < -1.0
+    assert abs(odds_of(gaussian([0.0, 0.0], [0.0499, 0.0499]))) < 0.1  # nothing is known
+    assert odds_of(gaussian([0.02, 0.0], [1e-3, 1e-3])) > 100.0
+
+
+def says(lens=None, used=None):
+    return Estimate(
+        rotation=np.eye(3), translation=np.zeros(3), angular_velocity=np.zeros(3),
+        linear_velocity=np.zeros(3), inliers=np.ones(12, bool), residuals=np.zeros(12),
+        joint_covariance=np.eye(18), global_shutter_inliers=12, iterations=0,
+        of_shake_sizes=np.zeros(6), of_field_sizes=np.zeros(5), lens=used, of_lens=lens,
+    )  # fmt: skip
+
+
+def test_experience_asks_now_and_then_and_forgets_a_lens_that_frames_do_without():
+    experience, asked = Experience.of(says()), []
+    for _ in range(33):
+        asked.append(experience.prior.asks_lens)
+        assert experience.prior.lens is None
+        experience = experience.and_of(says())
+    assert sum(asked) == 2
+    off = gaussian([0.02, 0.0], [1e-3, 1e-3])
+    experience = experience.and_of(says(off))
+    known = experience.prior.lens
+    assert known is not None
+    assert experience.and_of(says(None, known)).prior.lens is not None  # says nothing, uses it
+    assert experience.and_of(says()).prior.lens is None
