@@ -64,3 +64,16 @@ def test_pixels_are_those_of_the_point_that_moves_farthest():
     lens = LensError(np.array([0.05, -0.055]), np.eye(2), 400.0)
     far = np.sqrt(0.15 / 0.275)
     assert lens.pixels == pytest.approx(400.0 * (0.05 * far**3 - 0.055 * far**5), rel=0.01)
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
+def test_a_model_without_coefficients_is_a_pinhole_to_begin_with(model):
+    given = camera(model)
+    rays = RAYS.copy()
+    same = LensError(np.zeros(4), np.eye(4), 400.0).mended(given)
+    np.testing.assert_allclose(same.distort(rays)[0], given.distort(rays)[0], atol=1e-9)
+    assert coefficients_of(given) == 4
+    step = 1e-6 * np.eye(4)
+    ways = [LensError(one, np.eye(4), 400.0).mended(given).distort(rays)[0] for one in step]
+    by_steps = np.stack([1e6 * (way - given.distort(rays)[0]) for way in ways], axis=-1)
+    np.testing.assert_allclose(by_distortion(given, rays), by_steps, rtol=1e-5, atol=1e-4)
