@@ -33,6 +33,7 @@ from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, maximum_a_
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.estimation.residuals import linearized
 
 # Standard deviations of the coefficients beforehand: radial ones of 20 px at the corners of an
@@ -221,6 +222,8 @@ def _told(
         sighted: by the camera with these coefficients (k,).
     """
     count, chosen = len(observations), best.inliers
+    # The noise in derivatives looks like a lens, the same in all frames, and these are joined.
+    observations = relinearized(sighted.camera, observations, best.state, sighted.turn, fewest=0)
     lines = linearized(
         observations.packed,
         count,
