@@ -28,7 +28,7 @@ class LensError:
 
     mean: Array  # (k,) of a, b, c, d
     covariance: Array  # (k,k)
-    corner: float  # px, distance of the image's corners from its middle
+    corner: float  # px, distance of the image's corners, see corner_of
 
     def mended(self, camera: Camera) -> Camera:
         """The camera with the distortion that it lacks."""
@@ -42,8 +42,16 @@ class LensError:
 
 
 def corner_of(camera: Camera) -> float:
-    """Distance of the image's corners from its middle, in focal lengths."""
-    return float(0.5 * np.hypot(*camera.size) / camera.focal_length)
+    """Distance of the image's corners from its middle, in focal lengths.
+
+    A region of the sensor may lie far from the axis: then that of its farthest corner from there.
+    """
+    roi, K = camera.roi, camera.K
+    if roi is None:
+        return float(0.5 * np.hypot(*camera.size) / camera.focal_length)
+    across = np.array([roi.x_offset, roi.x_offset + roi.width]) - K[0, 2]
+    down = np.array([roi.y_offset, roi.y_offset + roi.height]) - K[1, 2]
+    return float(np.hypot(np.abs(across).max() / K[0, 0], np.abs(down).max() / K[1, 1]))
 
 
 def coefficients_of(camera: Camera) -> int:
