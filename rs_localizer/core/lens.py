@@ -28,7 +28,7 @@ class LensError:
 
     mean: Array  # (k,) of a, b, c, d
     covariance: Array  # (k,k)
-    corner: float  # px, distance of the image's corners from its middle
+    corner: float  # px, distance of the image's corners, see corner_of
 
     def mended(self, camera: Camera) -> Camera:
         """The camera with the distortion that it lacks."""
@@ -42,13 +42,21 @@ class LensError:
 
 
 def corner_of(camera: Camera) -> float:
-    """Distance of the image's corners from its middle, in focal lengths."""
-    return float(0.5 * np.hypot(*camera.size) / camera.focal_length)
+    """Distance of the image's corners from its middle, in focal lengths.
+
+    A region of the sensor may lie far from the axis: then that of its farthest corner from there.
+    """
+    roi, K = camera.roi, camera.K
+    if roi is None:
+        return float(0.5 * np.hypot(*camera.size) / camera.focal_length)
+    across = np.array([roi.x_offset, roi.x_offset + roi.width]) - K[0, 2]
+    down = np.array([roi.y_offset, roi.y_offset + roi.height]) - K[1, 2]
+    return float(np.hypot(np.abs(across).max() / K[0, 0], np.abs(down).max() / K[1, 1]))
 
 
 def coefficients_of(camera: Camera) -> int:
     """How many coefficients may be off."""
-    return 2 if camera.distortion_model == DistortionModel.EQUIDISTANT else 4
+    return 2 if _model_of(camera) == DistortionModel.EQUIDISTANT else 4
 
 
 def with_distortion(camera: Camera, coefficients: Array) -> Camera:
@@ -56,14 +64,14 @@ def with_distortion(camera: Camera, coefficients: Array) -> Camera:
     distortion = _distortion_of(camera)
     count = len(coefficients)
     distortion[:count] += coefficients / _scales_of(camera)[:count]
-    return replace(camera, D=distortion)
+    return replace(camera, D=distortion, distortion_model=_model_of(camera))
 
 
 def by_distortion(camera: Camera, rays: Array) -> Array:
     """Derivatives (n,2,k) of the pixels of rays (n,2) by all coefficients."""
     count, zero, found = coefficients_of(camera), np.zeros(3), _distortion_of(camera)
     bearings = np.column_stack([rays, np.ones(len(rays))])[:, None]
-    if camera.distortion_model == DistortionModel.EQUIDISTANT:
+    if _model_of(camera) == DistortionModel.EQUIDISTANT:
         first = 4  # behind focal lengths and centre
         jacobian = cv2.fisheye.projectPoints(bearings, zero, zero, camera.K, found)[1]
     else:
@@ -72,6 +80,11 @@ def by_distortion(camera: Camera, rays: Array) -> Array:
     columns = jacobian.reshape(len(rays), 2, -1)[:, :, first : first + count]
     scaled: Array = columns / np.outer(camera.binning, _scales_of(camera))
     return scaled
+
+
+def _model_of(camera: Camera) -> str:
+    """Whose coefficients may be off: a camera without any is a pinhole, whatever its model."""
+    return camera.distortion_model if len(camera.D) else DistortionModel.PLUMB_BOB
 
 
 def _distortion_of(camera: Camera) -> Array:

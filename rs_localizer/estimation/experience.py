@@ -10,7 +10,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.lens import joined, odds_of
+from rs_localizer.estimation.lens import credible, joined, odds_of
 from rs_localizer.estimation.prior import Prior
 
 # What a frame says fades by this from frame to frame, and counts as part of what an independent
@@ -71,7 +71,7 @@ class Experience:
         """What is known of the next frame, and the lens if it is off."""
         if prior is None:
             return None
-        if self.lens is not None and self.odds > _DECIDED:
+        if self.lens is not None and self.odds > _DECIDED and credible(self.lens):
             least = _LEAST_DEVIATION**2 * np.eye(len(self.lens.mean))
             lens = replace(self.lens, covariance=self.lens.covariance + least)
             return replace(prior, lens=lens)

@@ -33,12 +33,15 @@ from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, maximum_a_
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
 from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.estimation.residuals import linearized
 
 # Standard deviations of the coefficients beforehand: radial ones of 20 px at the corners of an
 # image of 800 px across, as 30 % of the distortion of a plain lens; tangential ones, which hardly
 # differ from a turn of the camera, of a few tenths.
 _DEVIATIONS = np.array([0.05, 0.05, 5e-4, 5e-4])
+# Beyond this many of them tangential ones are something else: a centre that is off, or a map.
+_MOST_DEVIATIONS = 3.0
 # Parts of them to try, of what many frames tell.
 _PARTS = (0.06, 0.2, 0.6)
 # Gates of the rounds, in inlier thresholds: at first the rim of the image is far off.
@@ -172,10 +175,17 @@ def decided(before: Posterior, after: Posterior, lens: LensError, threshold: flo
     now = after.squared_errors[chosen].sum()
     freedom = 2.0 * np.count_nonzero(chosen) - PARAMETERS
     left_over = _odd(after, threshold) or after.model_error > _MOST_LEFT * after.noise
-    if left_over or not (freedom > 0.0 and now > 0.0):
+    if left_over or not credible(lens) or not (freedom > 0.0 and now > 0.0):
         return False
     gain = freedom * math.log(left / now) - _known(lens, 1.0)
     return bool(0.5 * gain > _DECIDED)
+
+
+def credible(lens: LensError) -> bool:
+    """Whether its tangential part may be a lens's."""
+    tangential = lens.mean[2:]
+    most = _MOST_DEVIATIONS * _DEVIATIONS[2 : len(lens.mean)]
+    return bool(np.all(np.abs(tangential) < most))
 
 
 def joined(before: LensError, newest: LensError, memory: float) -> LensError:
@@ -221,6 +231,8 @@ def _told(
         sighted: by the camera with these coefficients (k,).
     """
     count, chosen = len(observations), best.inliers
+    # The noise in derivatives looks like a lens, the same in all frames, and these are joined.
+    observations = relinearized(sighted.camera, observations, best.state, sighted.turn, fewest=0)
     lines = linearized(
         observations.packed,
         count,

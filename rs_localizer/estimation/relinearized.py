@@ -24,16 +24,21 @@ _NEAR = 10.0
 
 
 def relinearized(
-    camera: Camera, observations: Observations, state: Array, turn: KnownTurn | None
+    camera: Camera,
+    observations: Observations,
+    state: Array,
+    turn: KnownTurn | None,
+    fewest: int = _MANY,
 ) -> Observations:
     """The same observations with derivatives at a motion near the best; few points as they are.
 
     Args:
         state: (24,) of the motion.
         turn: what the observations are steadied by.
+        fewest: points that are not few.
     """
     count = len(observations)
-    if count < _MANY or (len(camera.D) == 0 and turn is None):
+    if count < fewest or (len(camera.D) == 0 and turn is None):
         return observations
     gradient = observations.row_time_gradient
     lines = linearized(observations.packed, count, state, gradient, np.zeros((count, 6)))

@@ -130,3 +130,20 @@ def test_experience_asks_now_and_then_and_forgets_a_lens_that_frames_do_without(
     assert known is not None
     assert experience.and_of(says(None, known)).prior.lens is not None  # says nothing, uses it
     assert experience.and_of(says()).prior.lens is None
+
+
+def test_a_centre_that_is_off_is_no_tangential_distortion():
+    """Six deviations of it explained these frames, with poses beyond any region."""
+    right, _ = lacking(0.0)
+    off = right.camera.K + np.array([[0.0, 0.0, 15.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    localizer = Localizer(replace(right.camera, K=off))
+    found = estimate(frames(), localizer, 0.1, tracking=False).values()
+    assert sum(not result for result in found) >= 4
+    assert not any(result and result.lens for result in found)
+
+
+def test_trackers_do_not_use_a_lens_that_no_lens_is():
+    for mean, used in (([0.02, 0.0, 1.4e-3, 0.0], True), ([0.02, 0.0, 0.0, -1.6e-3], False)):
+        experience = Experience.of(says(gaussian(mean, [1e-3, 1e-3, 1e-5, 1e-5])))
+        assert (experience.prior.lens is not None) == used
+        assert experience.prior.asks_lens != used

@@ -7,8 +7,9 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lanes.simd import LANES
 from rs_localizer.core.types import Motion
+from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.observing import find_usable, packed
-from rs_localizer.estimation.prior import state_in
+from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.lab.simulation.scene import room
@@ -83,3 +84,16 @@ def test_thousands_of_points_of_a_fisheye_show_no_error_of_its_lens():
         assert found, found
         assert found.model_error < 0.25
         assert np.linalg.norm(found.position - frame.middle_row.positions[0]) < 0.005
+
+
+def test_the_noise_of_a_fisheyes_points_is_no_lens_that_is_off():
+    """By derivatives where the points were measured, eight frames made odds of e^20 for one."""
+    points, pixels = seen(2500)
+    rng, experience, localizer = np.random.default_rng(2), None, Localizer(FISHEYE)
+    for _ in range(8):
+        noisy = pixels + rng.normal(size=pixels.shape)
+        found = localizer.localize(points, noisy, prior=Prior(asks_lens=True))
+        assert found, found
+        experience = Experience.of(found) if experience is None else experience.and_of(found)
+    assert experience.lens is not None
+    assert experience.odds < -1.0
