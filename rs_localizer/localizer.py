@@ -12,7 +12,7 @@ from rs_localizer.config import LocalizerConfig, localizer_config
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.lens import LensError, with_distortion
+from rs_localizer.core.lens import LensError, with_lens
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import step_between
@@ -105,7 +105,7 @@ class Localizer:
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
         # And through a lens that is off.
-        bent = with_distortion(self.camera, np.array([-0.02, 0.0]))
+        bent = with_lens(self.camera, np.array([-0.02, 0.0]))
         self.localize(points, bent.distort(rays)[0], prior=Prior(asks_lens=True))
         # And before a plane whose points agree with nothing.
         flat = points * (2.0 / points @ [0.1, 0.0, 1.0])[:, None]
@@ -234,9 +234,7 @@ class Localizer:
         if not decided(posterior, settled, mended.lens, threshold):
             return found
         result = self._accept(again, start, best, settled)
-        if not result:
-            return found
-        return result if result.of_lens else replace(result, of_lens=mended.lens)
+        return result or found
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
         """The motion nearest to the prior one, if the points agree with it."""

@@ -1,10 +1,11 @@
-"""Distortion that a calibration lacks.
+"""What a calibration lacks: distortion, focal lengths, centre.
 
 Most of what a calibration may have wrong is radial: an image point at ``r`` from the axis moves
 along the radius by ``r (a r^2 + b r^4)``; a little is tangential, ``c`` and ``d`` (Brown,
 "Close-range camera calibration", 1971). ``equidistant`` lenses have powers of the angle, and
-nothing tangential. Distances are in parts of that of the image's corner, so that the coefficients
-of all cameras are of one size.
+nothing tangential. Distances are in parts of that of the image's corner, also those of the centre,
+and focal lengths are off by parts of themselves, so that the coefficients of all cameras are of one
+size.
 """
 
 from __future__ import annotations
@@ -19,20 +20,21 @@ from rs_localizer.core.camera import Camera, DistortionModel
 
 # No model has fewer coefficients; k1, k2 stand first in all, and p1, p2 behind them.
 _FEWEST = 4
+_OF_MATRIX = 4  # focal lengths and centre
 _RADII = np.linspace(0.0, 1.0, 21)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensError:
-    """What distortion a calibration lacks: a Gaussian of its coefficients, two or four."""
+    """What a calibration lacks: a Gaussian of its coefficients, six or eight."""
 
-    mean: Array  # (k,) of a, b, c, d
+    mean: Array  # (k,) of a, b, (c, d,) and what focal lengths and centre are off
     covariance: Array  # (k,k)
     corner: float  # px, distance of the image's corners, see corner_of
 
     def mended(self, camera: Camera) -> Camera:
-        """The camera with the distortion that it lacks."""
-        return with_distortion(camera, self.mean)
+        """The camera with what it lacks."""
+        return with_lens(camera, self.mean)
 
     @property
     def pixels(self) -> float:
@@ -56,30 +58,43 @@ def corner_of(camera: Camera) -> float:
 
 def coefficients_of(camera: Camera) -> int:
     """How many coefficients may be off."""
-    return 2 if _model_of(camera) == DistortionModel.EQUIDISTANT else 4
+    return _distorting(camera) + _OF_MATRIX
 
 
-def with_distortion(camera: Camera, coefficients: Array) -> Camera:
-    """The camera with coefficients (k,) beside its own."""
-    distortion = _distortion_of(camera)
-    count = len(coefficients)
-    distortion[:count] += coefficients / _scales_of(camera)[:count]
-    return replace(camera, D=distortion, distortion_model=_model_of(camera))
+def with_lens(camera: Camera, coefficients: Array) -> Camera:
+    """The camera with coefficients (k,) beside its own; the last ones may be left out."""
+    distortion, K = _distortion_of(camera), camera.K.copy()
+    changes = np.zeros(coefficients_of(camera))
+    changes[: len(coefficients)] = coefficients
+    changes *= _scales_of(camera)
+    count = _distorting(camera)
+    distortion[:count] += changes[:count]
+    K[(0, 1, 0, 1), (0, 1, 2, 2)] += changes[count:]
+    return replace(camera, K=K, D=distortion, distortion_model=_model_of(camera))
 
 
-def by_distortion(camera: Camera, rays: Array) -> Array:
+def by_lens(camera: Camera, rays: Array) -> Array:
     """Derivatives (n,2,k) of the pixels of rays (n,2) by all coefficients."""
-    count, zero, found = coefficients_of(camera), np.zeros(3), _distortion_of(camera)
+    zero, found = np.zeros(3), _distortion_of(camera)
     bearings = np.column_stack([rays, np.ones(len(rays))])[:, None]
     if _model_of(camera) == DistortionModel.EQUIDISTANT:
-        first = 4  # behind focal lengths and centre
+        first = 0
         jacobian = cv2.fisheye.projectPoints(bearings, zero, zero, camera.K, found)[1]
     else:
-        first = 10  # and behind the pose
+        first = 6  # behind the pose
         jacobian = cv2.projectPoints(bearings, zero, zero, camera.K, found)[1]
-    columns = jacobian.reshape(len(rays), 2, -1)[:, :, first : first + count]
-    scaled: Array = columns / np.outer(camera.binning, _scales_of(camera))
+    jacobian = jacobian.reshape(len(rays), 2, -1)
+    behind = first + _OF_MATRIX
+    columns = np.concatenate(
+        [jacobian[:, :, behind : behind + _distorting(camera)], jacobian[:, :, first:behind]],
+        axis=2,
+    )
+    scaled: Array = columns * _scales_of(camera) / np.array(camera.binning)[:, None]
     return scaled
+
+
+def _distorting(camera: Camera) -> int:
+    return 2 if _model_of(camera) == DistortionModel.EQUIDISTANT else 4
 
 
 def _model_of(camera: Camera) -> str:
@@ -92,6 +107,8 @@ def _distortion_of(camera: Camera) -> Array:
 
 
 def _scales_of(camera: Camera) -> Array:
-    """What the coefficients (k,) are in parts of OpenCV's."""
-    corner = corner_of(camera)
-    return np.array([corner**2, corner**4, corner, corner])[: coefficients_of(camera)]
+    """What OpenCV's parameters change by one of the coefficients (k,)."""
+    corner, count = corner_of(camera), _distorting(camera)
+    focal = np.diag(camera.K)[:2]
+    distorting = corner ** -np.array([2.0, 4.0, 1.0, 1.0])[:count]
+    return np.concatenate([distorting, focal, corner * focal])

@@ -48,7 +48,7 @@ class Estimate(Motion):
     turn: KnownTurn | None = None
     # By how many readouts the points would delay the known turn, and the variance of that
     delay: tuple[float, float] = (0.0, math.inf)
-    # Distortion that the calibration lacks, where the motion was found with it; None: it lacks none
+    # What the calibration lacks, if the motion was found with it: project with lens.mended(camera)
     lens: LensError | None = None
     of_lens: LensError | None = None  # what the frame says of that; None: not asked
 

@@ -17,10 +17,10 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lens import (
     LensError,
-    by_distortion,
+    by_lens,
     coefficients_of,
     corner_of,
-    with_distortion,
+    with_lens,
 )
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shake import shake_at
@@ -38,9 +38,13 @@ from rs_localizer.estimation.residuals import linearized
 
 # Standard deviations of the coefficients beforehand: radial ones of 20 px at the corners of an
 # image of 800 px across, as 30 % of the distortion of a plain lens; tangential ones, which hardly
-# differ from a turn of the camera, of a few tenths.
-_DEVIATIONS = np.array([0.05, 0.05, 5e-4, 5e-4])
-# Beyond this many of them tangential ones are something else: a centre that is off, or a map.
+# differ from a turn of the camera, of a few tenths; focal lengths of 1 %, the centre of 10 px.
+_RADIAL, _TANGENTIAL, _MATRIX = [0.05, 0.05], [5e-4, 5e-4], [0.01, 0.01, 0.025, 0.025]
+_DEVIATIONS = {
+    len(each): np.array(each) for each in (_RADIAL + _MATRIX, _RADIAL + _TANGENTIAL + _MATRIX)
+}
+# Beyond this many of them, what is not radial is something else: a map that is bent, or more of the
+# calibration.
 _MOST_DEVIATIONS = 3.0
 # Parts of them to try, of what many frames tell.
 _PARTS = (0.06, 0.2, 0.6)
@@ -89,7 +93,7 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
     camera, state = sighted.camera, refused.state
     coefficients = np.zeros(coefficients_of(camera))
     for gate in _GATES:
-        mended = with_distortion(camera, coefficients)
+        mended = with_lens(camera, coefficients)
         observations = sighted.by(mended)
         if observations is None:
             return None
@@ -106,7 +110,7 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
         coefficients, state = lens.mean, apply_step(best.state, step)
         if gate == _GATES[-1] and change @ np.linalg.solve(lens.covariance, change) < _SMALL**2:
             break
-    mended = with_distortion(camera, coefficients)
+    mended = with_lens(camera, coefficients)
     observations = sighted.by(mended)
     if observations is None:
         return None
@@ -182,10 +186,10 @@ def decided(before: Posterior, after: Posterior, lens: LensError, threshold: flo
 
 
 def credible(lens: LensError) -> bool:
-    """Whether its tangential part may be a lens's."""
-    tangential = lens.mean[2:]
-    most = _MOST_DEVIATIONS * _DEVIATIONS[2 : len(lens.mean)]
-    return bool(np.all(np.abs(tangential) < most))
+    """Whether all that is not radial may be a calibration's."""
+    others = lens.mean[2:]
+    most = _MOST_DEVIATIONS * _DEVIATIONS[len(lens.mean)][2:]
+    return bool(np.all(np.abs(others) < most))
 
 
 def joined(before: LensError, newest: LensError, memory: float) -> LensError:
@@ -210,7 +214,7 @@ def odds_of(lens: LensError) -> float:
 
 def _beforehand(lens: LensError) -> Array:
     """Information (k,k) on as many coefficients before any frame."""
-    information: Array = np.diag(_DEVIATIONS[: len(lens.mean)] ** -2)
+    information: Array = np.diag(_DEVIATIONS[len(lens.mean)] ** -2)
     return information
 
 
@@ -245,7 +249,7 @@ def _told(
         turned = sighted.turn.at_rows(observations.tau[chosen])[0]
         local = np.einsum("nij,nj->ni", turned, np.column_stack([seen, np.ones(len(seen))]))
         seen = local[:, :2] / local[:, 2:]
-    columns = by_distortion(camera, seen).reshape(-1, len(coefficients))
+    columns = by_lens(camera, seen).reshape(-1, len(coefficients))
     dense, left = lines.by_motion[chosen].reshape(-1, PARAMETERS), lines.errors[chosen].ravel()
     variance = best.noise**2
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
@@ -257,7 +261,7 @@ def _told(
     crossed = dense.T @ columns
     pull = -inverse @ crossed
     plain = inverse @ (-dense.T @ left - slope)
-    beforehand = np.diag(variance / _DEVIATIONS[: len(coefficients)] ** 2)
+    beforehand = np.diag(variance / _DEVIATIONS[len(coefficients)] ** 2)
     precision = columns.T @ columns + crossed.T @ pull + beforehand
     beside = -columns.T @ left - crossed.T @ plain - beforehand @ coefficients
     covariance = inverted(precision)

@@ -32,7 +32,7 @@ class Prior:
             :mod:`rs_localizer.estimation.tone_memory`.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
-        lens: radial distortion that the calibration lacks, by other frames; None: it lacks none.
+        lens: what the calibration lacks, by other frames; None: nothing.
         asks_lens: whether the frame shall say what it lacks.
         gravity, gravity_deviation: a vector (3,) in camera axes at the middle row that points
             along ``gravity_in_map``, of any length, and the standard deviation of its direction
