@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,17 +37,22 @@ K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 Start = Callable[..., Any]
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("bags") / "flight"
-    camera = Camera(640, 480, K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=READOUT_TIME)
+def record(path: Path, known: float = 1.0) -> Path:
+    """A flight, and a calibration that knows a part of the distortion."""
+    distortion = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
+    camera = Camera(640, 480, K, distortion, readout_time=READOUT_TIME)
     motion = ConstantVelocity(np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4)
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     settings = FrameSettings(points=100, noise=0.7, outliers=0.3)
     with BagWriter(path) as bag:
         for frame in simulate_frames(camera, motion, world, settings):
-            write_simulated(bag, camera, frame)
+            write_simulated(bag, replace(camera, D=known * distortion), frame)
     return path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("bags") / "flight")
 
 
 def inputs(recording: Path) -> list[tuple[Any, Any]]:
@@ -118,15 +124,23 @@ def set_parameter(peer: Any, name: str, value: object) -> tuple[bool, str]:
     return result.successful, result.reason
 
 
-@pytest.mark.parametrize("pose_time", ["stamp", "mid_frame"])
+@pytest.mark.parametrize(
+    ("pose_time", "known"),
+    [("stamp", 1.0), ("mid_frame", 1.0), ("mid_frame", 0.7)],
+    ids=["stamp", "mid_frame", "a calibration that is off"],
+)
 def test_node_and_replay_say_the_same_to_the_last_byte(
-    recording: Path, tmp_path: Path, start_node: Start, peer: Any, pose_time: str
+    tmp_path: Path, start_node: Start, peer: Any, pose_time: str, known: float
 ) -> None:
+    recording = record(tmp_path / "flight", known)
     settings = [*SHUTTER, "-p", f"pose_time:={pose_time}", "-p", "solver:=joint"]
     out = tmp_path / "out"
     # In a process of its own: what other tests have compiled in this one may round differently.
     words = ["replay", str(recording), "--out", str(out), *settings]
-    subprocess.run([sys.executable, "-m", "rs_localizer", *words], check=True, capture_output=True)
+    replayed = subprocess.run(
+        [sys.executable, "-m", "rs_localizer", *words], check=True, capture_output=True, text=True
+    )
+    assert ("noticed: lens" in replayed.stdout) == (known < 1.0)
     start_node(*settings)
     talk = Talk(peer)
     talk.connect()
