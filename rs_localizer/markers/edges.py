@@ -194,7 +194,6 @@ def _corner(q: Array, at: int, before: Array, after: Array) -> tuple[float, floa
     return px + share * tx, py + share * ty
 
 
-@kernel
 def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Move the corners of markers to where their sides meet, in place.
 
@@ -206,6 +205,16 @@ def refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> 
     Returns:
         (m,4): which corners were found; the others are left at their start.
     """
+    # Whether an image may be written depends on where it came from. Numba would compile a kernel
+    # for either kind, and the two might round differently.
+    seen = image.view()
+    seen.flags.writeable = False
+    found: NDArray[np.bool_] = _refine(seen, quads, cells)
+    return found
+
+
+@kernel
+def _refine(image: NDArray[np.uint8], quads: Array, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     found = np.zeros((len(quads), 4), np.bool_)
     curves = np.empty((4, 3))
     good = np.empty(4, np.bool_)
