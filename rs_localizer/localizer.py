@@ -17,7 +17,6 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import step_between
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation import lookalike, motion_model, tone_search
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.assumptions import (
     assumptions,
@@ -37,6 +36,7 @@ from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.estimation.settling import settle
+from rs_localizer.estimation.warm_up import compile_rare
 from rs_localizer.solvers.table import find_solver
 
 # A prediction may be off by this multiple of the inlier threshold.
@@ -87,9 +87,7 @@ class Localizer:
         """Compile every kernel that :meth:`localize`, or tracking, may need, or load it from the
         cache.
         """
-        motion_model.warm_up()
-        tone_search.warm_up()
-        lookalike.warm_up()
+        compile_rare()
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
         count = max(160, self.config.min_inliers)
         pixels = np.random.default_rng(0).uniform(0.3, 0.7, (count, 2)) * self.camera.size

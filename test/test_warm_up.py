@@ -1,11 +1,38 @@
 """After warming up no frame waits for the compiler, and what is no camera is said to be none."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 import rs_localizer as rsl
 from rs_localizer.estimation import modes, settling, tone_evidence
 
+# In a process of its own: what other tests have compiled in this one is no longer missing.
+LATE = """
+import gc
+from numba.core.registry import CPUDispatcher
+from rs_localizer.config import NodeConfig
+from rs_localizer.lab.experiments.honesty import coverage, few_points, lens, many_points
+from rs_localizer.lab.experiments.honesty import small_planes, vibration
+from rs_localizer.pipeline.frames import FrameLocalizer
+
+def compiled():
+    ours = [k for k in gc.get_objects() if isinstance(k, CPUDispatcher)]
+    return {(k.__module__, k.__name__, str(s)) for k in ours for s in k.signatures}
+
+FrameLocalizer(NodeConfig()).warm_up()
+before = compiled()
+for bench, every in ((coverage, 7), (few_points, 9), (lens, 5), (many_points, 5),
+                     (small_planes, 4), (vibration, 9)):
+    for condition in bench.conditions()[::every]:
+        bench.measure(condition, 1, 3)
+after = compiled()
+assert len(after) > 50
+for late in sorted(after - before):
+    print(*late)
+"""
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 
 
@@ -43,3 +70,12 @@ def test_a_matrix_is_no_camera_and_a_dictionary_no_prior():
     localizer = rsl.Localizer(rsl.Camera(640, 480, K))
     with pytest.raises(ValueError, match=r"must be an rs_localizer.Prior, got dict"):
         localizer.localize(np.zeros((20, 3)), np.zeros((20, 2)), prior={})
+
+
+def test_no_frame_waits_for_the_compiler():
+    """Slow and fast, few points and thousands, planes and rooms, alone and in tracking."""
+    ran = subprocess.run(
+        [sys.executable, "-c", LATE], capture_output=True, text=True, timeout=200, check=True
+    )
+    late = [line for line in ran.stdout.splitlines() if line.startswith("rs_localizer.")]
+    assert [line for line in late if not line.startswith("rs_localizer.lab.")] == []

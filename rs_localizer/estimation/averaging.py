@@ -9,7 +9,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.state import PARAMETERS, TURN, step_between
+from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.curvature import told_from
 from rs_localizer.estimation.model_error import Examined
 from rs_localizer.estimation.prior_terms import PriorTerms
@@ -70,6 +70,11 @@ def on_the_way(state: Array, other: Array, covariance: Array) -> bool:
     step = step_between(state, other)
     solution, solved = solve_positive(covariance, step)
     return bool(solved and np.sum(step * solution) < _ON_THE_WAY)
+
+
+def warm_up() -> None:
+    """Compile what a frame comes to of which another motion is as good."""
+    on_the_way(np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.eye(PARAMETERS))
 
 
 @kernel

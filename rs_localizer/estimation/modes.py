@@ -102,7 +102,8 @@ class Inliers:
         And its cost, as if the others had as much of it. Few points lead nowhere, at no cost.
         """
         chosen = np.flatnonzero(self.inliers)
-        part = chosen[:: len(chosen) // _ENOUGH] if len(chosen) >= 2 * _ENOUGH else chosen
+        apart = max(len(chosen) // _ENOUGH, 1)
+        part = chosen[::apart].copy()
         if len(part) == len(chosen):
             return start, 0.0
         share = len(part) / len(chosen)

@@ -56,3 +56,8 @@ def weighted(data: Array, weights: Array | BoolArray) -> Array:
     for i in range(len(weights)):
         data[i // LANES, 10 * LANES + i % LANES] = weights[i]
     return data
+
+
+def warm_up() -> None:
+    """Compile what frames with many points come to."""
+    thin(np.zeros((1, POINT_SIZE * LANES)), np.zeros(1, np.int64))

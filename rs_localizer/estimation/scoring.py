@@ -7,10 +7,12 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
 from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.lanes.simd import LANES
 from rs_localizer.core.state import STATE_SIZE
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
 from rs_localizer.estimation.refine import anneal, refine
 from rs_localizer.estimation.residuals import truncated_cost
+from rs_localizer.estimation.view import POINT_SIZE
 
 # Of local optimisation, at the last scale.
 _ITERATIONS = 3
@@ -120,3 +122,9 @@ def descend(
         data, state, gradient, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE
     )
     return state, truncated_cost(data, state, gradient, last_scale, np.inf)
+
+
+def warm_up() -> None:
+    """Compile what a plane comes to that faces the camera."""
+    nothing = np.zeros((0, POINT_SIZE * LANES))
+    descend(nothing, np.zeros(STATE_SIZE), np.zeros(2), 1.0, 1.0, held_terms(), 1.0)
