@@ -253,7 +253,8 @@ def coloured(
     count: int, rng: np.random.Generator, degrees: float, hertz: tuple[float, float]
 ) -> Motions:
     """Cameras on a drone that shakes at random, by an angle (rms), as much in every octave."""
-    frequency = np.exp(rng.uniform(*np.log(hertz), (count, _COLOURS)))
+    low, high = np.log(hertz)
+    frequency = np.exp(rng.uniform(low, high, (count, _COLOURS)))
     amplitude = np.zeros((count, _COLOURS, 6))
     amplitude[..., :3] = math.radians(degrees) * math.sqrt(2.0 / (3.0 * _COLOURS))
     drift, slow = _waves(count, rng, _DRIFT_HERTZ, _DRIFT_RATE, _DRIFT_SPEED)
@@ -267,7 +268,7 @@ def struck(
     """Cameras in a hand that are hit some time between the two (s), and ring by an angle."""
     held = hand(count, rng)
     return Struck(
-        *(getattr(held, item.name) for item in fields(Motions)),
+        **{item.name: getattr(held, item.name) for item in fields(Motions)},
         swing=math.radians(degrees) * directions(count, rng),
         ringing=2.0 * np.pi * rng.uniform(*_RINGING_HERTZ, count),
         hit=rng.uniform(earliest, latest, count),

@@ -19,7 +19,7 @@ from rs_localizer.lab.experiments.honesty.scores import Score, Scores, score_at
 from rs_localizer.lab.independent.cameras import Camera
 from rs_localizer.lab.independent.frames import Frames, MakeMotions, first_row_times, simulate
 from rs_localizer.lab.independent.gyroscopes import Imu
-from rs_localizer.lab.independent.motions import Motions
+from rs_localizer.lab.independent.motions import Moving
 from rs_localizer.lab.independent.scenes import Scene
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
@@ -63,9 +63,9 @@ def record(
     """Simulate recordings and their IMU: so many, and so many frames of each."""
     recordings, length = size
     imu = imu or Imu()
-    made: list[Motions] = []
+    made: list[Moving] = []
 
-    def remembered(count: int, rng: np.random.Generator) -> Motions:
+    def remembered(count: int, rng: np.random.Generator) -> Moving:
         made.append(make_motions(count, rng))
         return made[-1]
 
