@@ -8,14 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.independent.cameras import Camera
-from benchmarks.independent.motions import IntArray, Motions, States
+from benchmarks.independent.motions import IntArray, Moving, States
 from benchmarks.independent.rotations import Array, BoolArray
 from benchmarks.independent.scenes import Scene, points, visible
 
 PERIOD_NS = 33_333_333  # 30 Hz
 _EPOCH_NS = 10**12
 
-MakeMotions = Callable[[int, np.random.Generator], Motions]
+MakeMotions = Callable[[int, np.random.Generator], Moving]
+Displaced = Callable[[Array, Array, IntArray], Array]
+"""Where points (f,n,3) are at times (f,n) of recordings (f,): some of them may move."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +56,7 @@ def simulate(
     recordings: int,
     length: int,
     seed: int,
+    displaced: Displaced | None = None,
 ) -> Frames:
     """Recordings of ``length`` frames; time 0 of their motions is the middle of each."""
     rng = np.random.default_rng(seed)
@@ -67,8 +70,10 @@ def simulate(
     each = np.repeat(which, count)
 
     def local_at(delay: Array) -> Array:
-        rotation, position = motions.poses(each, (time[:, None] + delay).ravel())
-        local = np.einsum("nji,nj->ni", rotation, true.reshape(-1, 3) - position)
+        now = time[:, None] + delay
+        rotation, position = motions.poses(each, now.ravel())
+        there = true if displaced is None else displaced(true, now, which)
+        local = np.einsum("nji,nj->ni", rotation, there.reshape(-1, 3) - position)
         placed: Array = local.reshape(true.shape)
         return placed
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.independent.motions import IntArray, Motions
+from benchmarks.independent.motions import IntArray, Moving
 from benchmarks.independent.rotations import Array
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in the map
@@ -25,7 +25,7 @@ class Imu:
     force_noise: float = 0.002  # m/s^2/sqrt(Hz)
 
     def record(
-        self, motions: Motions, which: int, first: float, last: float, rng: np.random.Generator
+        self, motions: Moving, which: int, first: float, last: float, rng: np.random.Generator
     ) -> tuple[IntArray, Array, Array]:
         """Stamps (n,) in ns, angular velocities (n,3), specific forces (n,3) of one camera.
 
@@ -46,7 +46,7 @@ class Imu:
         return np.rint(1e9 * (times - self.offset)).astype(np.int64), shown, force
 
 
-def _accelerations(motions: Motions, which: IntArray, times: Array) -> Array:
+def _accelerations(motions: Moving, which: IntArray, times: Array) -> Array:
     """Of the camera's places (n,3), m/s^2 in the map."""
     before, here, after = (motions.poses(which, times + step)[1] for step in (-_STEP, 0.0, _STEP))
     found: Array = (before - 2.0 * here + after) / _STEP**2

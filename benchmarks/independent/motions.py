@@ -1,4 +1,4 @@
-"""Motions of many cameras at once: sums of sines, and sudden stops.
+"""Motions of many cameras at once: sums of sines, sudden stops, hits, and recorded ones.
 
 The rotation vector of a camera and its place both are sums of sines in time plus a steady part
 that may stop, so pose, velocities and accelerations are known exactly at every instant.
@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.spatial.transform import Rotation
 
-from benchmarks.independent.rotations import Array, body_rate, exponential
+from benchmarks.independent.rotations import Array, body_rate, exponential, logarithm
 
 _SINES = 4
 # A hand: 67 deg/s (median), 9 rad/s^2 (rms), 0.45 m/s and 3 m/s^2 (rms).
@@ -25,6 +27,10 @@ _DRIFT_RATE, _DRIFT_SPEED = math.radians(10.0), 0.3
 # A turn of 60 deg/s and a move of 0.5 m/s that end within 20 to 40 ms.
 _STOPPED_RATE, _STOPPED_SPEED = math.radians(60.0), 0.5
 _STOP_SECONDS = (0.02, 0.04)
+# Sines of a coloured noise: enough that their sum is as good as Gaussian.
+_COLOURS = 40
+# How a light camera mount rings when it is hit.
+_RINGING_HERTZ, _RINGING_SECONDS = (30.0, 120.0), (0.01, 0.03)
 
 IntArray = NDArray[np.int64]
 
@@ -67,10 +73,7 @@ class Motions:
     def states(self, which: IntArray, time: Array) -> States:
         """Poses and twists of cameras (n,) at times (n,)."""
         rotation, position = self.poses(which, time)
-        frequency = self.frequency[which][:, :, None]
-        angle = frequency * time[:, None, None] + self.phase[which]
-        rate = np.sum(self.amplitude[which] * frequency * np.cos(angle), axis=1)
-        rate += self.steady[which] * self._still_moving(which, time)[:, None]
+        rate = self._rate(which, time)
         linear = np.einsum("nji,nj->ni", rotation, rate[:, 3:])
         turn = body_rate(self._way(which, time)[:, :3], rate[:, :3])
         return States(rotation, position, turn, linear)
@@ -81,6 +84,13 @@ class Motions:
         way: Array = np.sum(self.amplitude[which] * waves, axis=1)
         travelled = self._travelled(which, time) - self._travelled(which, np.zeros_like(time))
         return way + self.steady[which] * travelled[:, None]
+
+    def _rate(self, which: IntArray, time: Array) -> Array:
+        frequency = self.frequency[which][:, :, None]
+        angle = frequency * time[:, None, None] + self.phase[which]
+        rate = np.sum(self.amplitude[which] * frequency * np.cos(angle), axis=1)
+        moving: Array = rate + self.steady[which] * self._still_moving(which, time)[:, None]
+        return moving
 
     def _still_moving(self, which: IntArray, time: Array) -> Array:
         """Share (n,) of the steady velocity that is left: half a cosine from 1 to 0."""
@@ -97,6 +107,89 @@ class Motions:
         way = 0.5 * braking + duration / (2.0 * np.pi) * np.sin(np.pi * braking / duration)
         travelled: Array = np.where(never | (since < 0.0), since, way)
         return travelled
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Struck(Motions):
+    """The same, each camera hit once: from then on it rings, and that dies away."""
+
+    swing: Array  # (m,3) rad
+    ringing: Array  # (m,) rad/s
+    hit: Array  # (m,) s
+    fading: Array  # (m,) s
+
+    def _way(self, which: IntArray, time: Array) -> Array:
+        way = Motions._way(self, which, time)
+        way[:, :3] += self._rung(which, time)[0][:, None] * self.swing[which]
+        return way
+
+    def _rate(self, which: IntArray, time: Array) -> Array:
+        rate = Motions._rate(self, which, time)
+        rate[:, :3] += self._rung(which, time)[1][:, None] * self.swing[which]
+        return rate
+
+    def _rung(self, which: IntArray, time: Array) -> tuple[Array, Array]:
+        """Share (n,) of the swing, and its change (n,) per second."""
+        since = np.maximum(time - self.hit[which], 0.0)
+        ringing, fading = self.ringing[which], self.fading[which]
+        faded, angle = np.exp(-since / fading), ringing * since
+        change = faded * (ringing * np.cos(angle) - np.sin(angle) / fading)
+        return faded * np.sin(angle), np.where(time > self.hit[which], change, 0.0)
+
+
+class Recorded:
+    """Cameras that move as a recorded one did, each from another moment on.
+
+    Cubic splines through its poses, a knot every 50 ms: motion capture shakes from sample to
+    sample, hands do not. Time 0 of a camera lies within a stretch without gaps, with as much time
+    on both sides as it is to be asked for.
+    """
+
+    _KNOTS, _GAP, _STEP = 0.05, 3.0, 1e-5  # s; samples; s
+
+    def __init__(self, samples: Array, count: int, rng: np.random.Generator, around: float) -> None:
+        """From samples (n,8): time (s), position (m), quaternion (x, y, z, w)."""
+        times = samples[:, 0]
+        gaps = np.flatnonzero(np.diff(times) > self._GAP * np.median(np.diff(times))) + 1
+        stretches = [s for s in np.split(samples, gaps) if np.ptp(s[:, 0]) > 2.0 * around + 1.0]
+        longest = np.array([np.ptp(s[:, 0]) - 2.0 * around for s in stretches])
+        self._stretch = rng.choice(len(stretches), count, p=longest / longest.sum())
+        self._splines = [self._spline(s) for s in stretches]
+        self._start = around + longest[self._stretch] * rng.uniform(size=count)
+        every = np.arange(count)
+        self.rotation, self.position = self.poses(every, np.zeros(count))
+
+    def __len__(self) -> int:
+        return len(self._start)
+
+    def poses(self, which: IntArray, time: Array) -> tuple[Array, Array]:
+        """Rotations (n,3,3) and positions (n,3) of cameras (n,) at times (n,)."""
+        values = np.empty((len(which), 7))
+        for index, spline in enumerate(self._splines):
+            here = self._stretch[which] == index
+            values[here] = spline(self._start[which[here]] + time[here])
+        return Rotation.from_quat(values[:, 3:]).as_matrix(), values[:, :3]
+
+    def states(self, which: IntArray, time: Array) -> States:
+        """Poses and twists of cameras (n,) at times (n,)."""
+        rotation, position = self.poses(which, time)
+        before, after = (self.poses(which, time + step) for step in (-self._STEP, self._STEP))
+        turn = logarithm(np.swapaxes(before[0], 1, 2) @ after[0]) / (2.0 * self._STEP)
+        way = (after[1] - before[1]) / (2.0 * self._STEP)
+        return States(rotation, position, turn, np.einsum("nji,nj->ni", rotation, way))
+
+    def _spline(self, samples: Array) -> BSpline:
+        quaternions = samples[:, 4:]
+        turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+        signs = np.cumprod(np.r_[1.0, np.where(turned, -1.0, 1.0)])
+        times = samples[:, 0] - samples[0, 0]
+        inner = np.linspace(0.0, times[-1], int(times[-1] / self._KNOTS))
+        knots = np.r_[[0.0] * 3, inner, [times[-1]] * 3]
+        values = np.column_stack([samples[:, 1:4], signs[:, None] * quaternions])
+        return make_lsq_spline(times, values, knots)
+
+
+Moving = Motions | Recorded
 
 
 def rest(count: int, rng: np.random.Generator) -> Motions:
@@ -154,6 +247,33 @@ def shaken_hand(
     """Cameras in a hand that vibrate besides, each vibration (degrees, hertz) about any axis."""
     held = hand(count, rng)
     return _with_last_of(held, [vibration(count, rng, *one) for one in shaking])
+
+
+def coloured(
+    count: int, rng: np.random.Generator, degrees: float, hertz: tuple[float, float]
+) -> Motions:
+    """Cameras on a drone that shakes at random, by an angle (rms), as much in every octave."""
+    low, high = np.log(hertz)
+    frequency = np.exp(rng.uniform(low, high, (count, _COLOURS)))
+    amplitude = np.zeros((count, _COLOURS, 6))
+    amplitude[..., :3] = math.radians(degrees) * math.sqrt(2.0 / (3.0 * _COLOURS))
+    drift, slow = _waves(count, rng, _DRIFT_HERTZ, _DRIFT_RATE, _DRIFT_SPEED)
+    waves = np.concatenate([drift, amplitude], axis=1)
+    return _motions(count, rng, (waves, np.column_stack([slow, 2.0 * np.pi * frequency])))
+
+
+def struck(
+    count: int, rng: np.random.Generator, degrees: float, earliest: float, latest: float
+) -> Struck:
+    """Cameras in a hand that are hit some time between the two (s), and ring by an angle."""
+    held = hand(count, rng)
+    return Struck(
+        **{item.name: getattr(held, item.name) for item in fields(Motions)},
+        swing=math.radians(degrees) * directions(count, rng),
+        ringing=2.0 * np.pi * rng.uniform(*_RINGING_HERTZ, count),
+        hit=rng.uniform(earliest, latest, count),
+        fading=rng.uniform(*_RINGING_SECONDS, count),
+    )
 
 
 def steady(count: int, rng: np.random.Generator, rate: float, speed: float) -> Motions:

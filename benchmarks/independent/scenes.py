@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.independent.cameras import Camera
-from benchmarks.independent.motions import IntArray, Motions, directions
+from benchmarks.independent.motions import IntArray, Moving, directions
 from benchmarks.independent.rotations import Array, BoolArray, exponential
 
 _DEPTHS = (1.0, 5.0)  # m
@@ -60,7 +60,7 @@ Scene = Rich | Wall | SmallPlane | Board
 def points(
     scene: Scene,
     camera: Camera,
-    motions: Motions,
+    motions: Moving,
     which: IntArray,
     middle: Array,
     rng: np.random.Generator,
@@ -84,7 +84,7 @@ def points(
 def _in_view(
     scene: Rich | Wall,
     camera: Camera,
-    motions: Motions,
+    motions: Moving,
     which: IntArray,
     middle: Array,
     rng: np.random.Generator,
@@ -126,7 +126,7 @@ def _pattern(
 
 
 def _placed(
-    scene: Wall | SmallPlane | Board, motions: Motions, rng: np.random.Generator
+    scene: Wall | SmallPlane | Board, motions: Moving, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Middles (m,3) and axes (m,3,3) of planes before the cameras at time 0; the normal is z."""
     count = len(motions)

@@ -13,7 +13,7 @@ from benchmarks.honesty.scores import Score, Scores, score_at
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.frames import Frames, MakeMotions, first_row_times, simulate
 from benchmarks.independent.gyroscopes import Imu
-from benchmarks.independent.motions import Motions
+from benchmarks.independent.motions import Moving
 from benchmarks.independent.scenes import Scene
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
@@ -63,9 +63,9 @@ def record(
     """Simulate recordings and their IMU: so many, and so many frames of each."""
     recordings, length = size
     imu = imu or Imu()
-    made: list[Motions] = []
+    made: list[Moving] = []
 
-    def remembered(count: int, rng: np.random.Generator) -> Motions:
+    def remembered(count: int, rng: np.random.Generator) -> Moving:
         made.append(make_motions(count, rng))
         return made[-1]
 

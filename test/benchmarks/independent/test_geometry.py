@@ -37,12 +37,23 @@ def test_the_lens_is_that_of_opencv() -> None:
     assert np.all(np.isnan(camera.project(-points)))
 
 
+def samples() -> np.ndarray:
+    """Of a recorded trajectory (n,8) that has a gap."""
+    times = np.delete(np.arange(0.0, 6.0, 0.01), slice(250, 300))
+    turn = np.column_stack([np.sin(times), 0.5 * np.cos(2.0 * times), times])
+    quaternions = Rotation.from_rotvec(turn).as_quat()
+    return np.column_stack([times, np.cos(turn), quaternions * np.sign(quaternions[:, 3:])])
+
+
 MOTIONS = {
     "rest": motions.rest,
     "hand": motions.hand,
     "vibration": partial(motions.vibration, degrees=1.0, hertz=20.0),
     "steady": partial(motions.steady, rate=3.0, speed=1.0),
     "stop": partial(motions.sudden_stop, earliest=-0.02, latest=0.02),
+    "coloured": partial(motions.coloured, degrees=0.3, hertz=(20.0, 60.0)),
+    "struck": partial(motions.struck, degrees=0.3, earliest=-0.1, latest=0.0),
+    "recorded": lambda count, rng: motions.Recorded(samples(), count, rng, around=0.2),
 }
 
 
