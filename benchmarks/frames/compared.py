@@ -80,7 +80,7 @@ def changes_of(before: Judged, after: Judged) -> dict[str, Change]:
     found = {}
     hits = [_hits(one) for one in (before, after)]
     for name in _SHARES:
-        change = _share(*(one[name] for one in hits), before.of("recording"))
+        change = _share(hits[0][name], hits[1][name], before.of("recording"))
         if change is not None:
             found[name] = change
     both = before.localized & after.localized
@@ -123,7 +123,7 @@ def _share(
     more, fewer = int(np.sum(each > 0.0)), int(np.sum(each < 0.0))
     certain = more + fewer > 0 and binomtest(more, more + fewer).pvalue < _CHANCE
     low, high = wilson(after[0][after[1]])
-    return Change(*shares, low, high, int(np.sign(more - fewer)) * certain)
+    return Change(shares[0], shares[1], low, high, int(np.sign(more - fewer)) * certain)
 
 
 def _error(before: Array, after: Array, recording: Array) -> Change:

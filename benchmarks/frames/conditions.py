@@ -199,9 +199,9 @@ def _sine() -> Iterator[tuple[Any, ...]]:
         shaken = moving("vibration", degrees=degrees, hertz=hertz)
         label = f"{degrees:g}deg/{hertz:g}Hz/{noise:g}px/tracked"
         yield label, shaken, Rich(), noise, {"sequence": TRACKED}
-    for degrees, n, wrong, noise in product(((0.1, 0.3), (0.3, 1.0)), (30, 60), (0.0, 0.5), (0.5,)):
-        shaken = moving("any_vibration", degrees=degrees, hertz=(20.0, 200.0))
-        label = f"{degrees[0]:g}-{degrees[1]:g}deg/{n}points/{wrong:.0%}wrong/{noise:g}px"
+    for sizes, n, wrong, noise in product(((0.1, 0.3), (0.3, 1.0)), (30, 60), (0.0, 0.5), (0.5,)):
+        shaken = moving("any_vibration", degrees=sizes, hertz=(20.0, 200.0))
+        label = f"{sizes[0]:g}-{sizes[1]:g}deg/{n}points/{wrong:.0%}wrong/{noise:g}px"
         yield label, shaken, Rich(n), noise, {"points": Points(wrong=wrong)}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -115,6 +115,8 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     reasons: list[str] = []
     for frame in generate(condition, frames, seed):
         variant = frame.recording % variants
+        localize: Callable[..., rsl.Estimate | rsl.Failure]
+        first: tuple[int, ...]
         if trackers is None:
             localize, first = localizers[variant].localize, ()
         else:
