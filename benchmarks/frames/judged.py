@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -115,7 +115,7 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     reasons: list[str] = []
     for frame in generate(condition, frames, seed):
         variant = frame.recording % variants
-        localize: Callable[..., rsl.Estimate | rsl.Failure]
+        localize: Any
         first: tuple[int, ...]
         if trackers is None:
             localize, first = localizers[variant].localize, ()
@@ -124,7 +124,9 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
                 trackers[variant].reset()
             localize, first = trackers[variant].localize, (frame.middle_ns,)
         readout = localizers[variant].camera.readout_time
-        known = {} if frame.gyroscope is None else {"turn": _turn(frame.gyroscope, readout)}
+        known: dict[str, Any] = (
+            {} if frame.gyroscope is None else {"turn": _turn(frame.gyroscope, readout)}
+        )
         start = time.process_time()
         try:
             result = localize(*first, frame.points, frame.pixels, **known)
