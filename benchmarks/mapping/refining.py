@@ -17,10 +17,10 @@ from benchmarks.mapping.rooms import (
 )
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.mapping.adjustment import MapProblem
+from rs_localizer.mapping.observations import MapObservations, Start
 from rs_localizer.mapping.placing import laid_down
 from rs_localizer.mapping.preparation import Preparation
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.sightings import Sightings, Start
 from rs_localizer.mapping.similarity import through
 from rs_localizer.trajectory.model import Freedom, start_state
 
@@ -95,7 +95,7 @@ def bound(seed: int, trials: int = 20) -> Iterator[str]:
     )
 
 
-def _least(seen: Sightings, found: RefinedMap, freedom: MapFreedom) -> Array:
+def _least(seen: MapObservations, found: RefinedMap, freedom: MapFreedom) -> Array:
     """Covariances (p,3,3) of an estimator that loses nothing, at errors of zero."""
     start = Start(found.points, *found.poses())
     prepared = Preparation(found.camera, seen, start, freedom, 0.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.mapping.errors import MappingError
+from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.similarity import Similarity, through, upright
 from rs_localizer.mapping.triangulation import Triangulated
 from rs_localizer.mapping.views import View

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.anchors import Placement
-from rs_localizer.mapping.errors import MappingError
 from rs_localizer.mapping.inertial_metres import (
     NO_FORCES,
     InertialMetres,

@@ -7,10 +7,10 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.mapping.first_motion import first_motion
-from rs_localizer.mapping.sightings import (
+from rs_localizer.mapping.observations import (
     LEAST_KEYPOINTS,
     MapFreedom,
-    Sightings,
+    MapObservations,
     Start,
     shared_landmarks,
 )
@@ -34,7 +34,7 @@ class Preparation:
     """The keypoints that count, and the first motion."""
 
     def __init__(
-        self, camera: Camera, seen: Sightings, start: Start, freedom: MapFreedom,
+        self, camera: Camera, seen: MapObservations, start: Start, freedom: MapFreedom,
         stamp_offset: float,
     ) -> None:  # fmt: skip
         self.camera, self.seen, self.start, self.freedom = camera, seen, start, freedom

@@ -14,7 +14,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.maps.landmarks import Map, make_map
-from rs_localizer.mapping.sightings import Sightings, Start
+from rs_localizer.mapping.observations import MapObservations, Start
 from rs_localizer.trajectory.observe import Observed, localize_each
 
 # A landmark in the wrong place is no outlier: keypoints count up to so many px beside the pose.
@@ -26,7 +26,7 @@ class RecordedMap:
     """A map, and what the images of a recording show of it."""
 
     landmarks: Map
-    seen: Sightings
+    seen: MapObservations
     start: Start
     images: int  # of the recording
 
@@ -59,7 +59,7 @@ def from_recording(
     found = [result for result in results if isinstance(result, Estimate)]
     near = [estimate.residuals < _MOST_RESIDUAL for estimate in found]
     counts = [int(np.count_nonzero(of)) for of in near]
-    seen = Sightings(
+    seen = MapObservations(
         np.array([images[k].stamp_ns for k in posed], np.int64),
         np.repeat(np.arange(len(posed)), counts),
         np.concatenate([rows[k][of] for k, of in zip(posed, near, strict=True)]),

@@ -19,9 +19,9 @@ from rs_localizer.mapping.adjustment import MapProblem, sights_of
 from rs_localizer.mapping.alike import Pull, pull_at_landmarks
 from rs_localizer.mapping.asked_readout import AskedReadout, asked_readout
 from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
+from rs_localizer.mapping.observations import MapFreedom, MapObservations, Start, check
 from rs_localizer.mapping.placing import laid_down
 from rs_localizer.mapping.preparation import Preparation
-from rs_localizer.mapping.sightings import MapFreedom, Sightings, Start, check
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over, steepness
@@ -32,7 +32,7 @@ from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
 
-__all__ = ["MapFreedom", "RefinedMap", "Sightings", "Start", "refine"]
+__all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine"]
 
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
@@ -61,6 +61,7 @@ class RefinedMap:
     spline: Spline  # s since ``start_ns``
     start_ns: int
     times: Array  # (g,) s, of the images' middle rows
+    tells_readout: bool  # images follow each other closely enough to tell the readout time
 
     @property
     def camera_as_found(self) -> Camera:
@@ -78,7 +79,7 @@ class RefinedMap:
 
 def refine(
     camera: Camera,
-    seen: Sightings,
+    seen: MapObservations,
     start: Start,
     freedom: MapFreedom | None = None,
     *,
@@ -121,6 +122,7 @@ class _Refinement:
         self.freedom = Freedom(
             readout_time=given.readout_time,
             lens=given.lens,
+            lens_deviations=given.lens_deviations,
             angular_acceleration=given.angular_acceleration,
             linear_acceleration=given.linear_acceleration,
             angular_velocity=ANGULAR_VELOCITY,
@@ -184,6 +186,7 @@ class _Refinement:
             spline=placed.spline,
             start_ns=prepared.start_ns,
             times=prepared.times,
+            tells_readout=prepared.tells_readout,
         )
 
     def _with_alike_errors(

@@ -6,7 +6,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.sightings import MapFreedom, Sightings, Start
+from rs_localizer.mapping.observations import MapFreedom, MapObservations, Start
 from rs_localizer.mapping.similarity import through
 from rs_localizer.mapping.triangulation import Sights, triangulate
 
@@ -18,11 +18,11 @@ _LEAST_CORNERS, _LEAST_SIGHTS = 4, 3
 
 def tied(
     camera: Camera,
-    seen: Sightings,
+    seen: MapObservations,
     start: Start,
-    corners: Sightings,
+    corners: MapObservations,
     places: Array,
-) -> tuple[Sightings, Start, MapFreedom]:
+) -> tuple[MapObservations, Start, MapFreedom]:
     """What is adjusted with the corners of markers, in their frame; without, if too few are seen.
 
     Args:
@@ -42,7 +42,7 @@ def tied(
     images = np.concatenate([seen.images, at[kept]])
     order: IntArray = np.argsort(images, kind="stable")
     return (
-        Sightings(
+        MapObservations(
             seen.stamps_ns,
             images[order],
             np.concatenate([seen.landmarks, count + corners.landmarks[kept]])[order],

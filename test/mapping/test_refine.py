@@ -10,10 +10,10 @@ from scenes import READOUT, Walk, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.mapping.adjustment import MapProblem, MapStep
+from rs_localizer.mapping.observations import MapObservations
 from rs_localizer.mapping.preparation import Preparation
 from rs_localizer.mapping.reduced import MapNormal, Reduced
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.sightings import Sightings
 from rs_localizer.mapping.similarity import through
 from rs_localizer.trajectory.model import Freedom, State, start_state
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
@@ -203,7 +203,7 @@ def test_images_that_stand_alone() -> None:
         refine(camera(), scene.seen, scene.start, MapFreedom(readout_time=True))
 
 
-def shifted(seen: Sightings, by: int) -> Sightings:
+def shifted(seen: MapObservations, by: int) -> MapObservations:
     """The second half of the images sees other landmarks."""
     late = seen.images >= len(seen.stamps_ns) // 2
     return replace(seen, landmarks=seen.landmarks + np.where(late, by, 0))
@@ -221,7 +221,7 @@ def test_what_is_no_map_is_refused(video: Walk) -> None:
     with pytest.raises(ValueError, match="landmarks that are not among the 10"):
         refine(camera(), video.seen, replace(video.start, points=np.zeros((10, 3))))
     some = video.seen.images < 2
-    few = Sightings(
+    few = MapObservations(
         video.seen.stamps_ns[:2], video.seen.images[some], video.seen.landmarks[some],
         video.seen.pixels[some],
     )  # fmt: skip

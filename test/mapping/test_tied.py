@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.sightings import Sightings, Start
+from rs_localizer.mapping.observations import MapObservations, Start
 from rs_localizer.mapping.similarity import Similarity
 from rs_localizer.mapping.tied import tied
 
@@ -24,12 +24,12 @@ POSITIONS = np.column_stack([np.linspace(-0.5, 0.5, IMAGES), np.zeros((IMAGES, 2
 STAMPS = 10**9 + 66_000_000 * np.arange(IMAGES)
 
 
-def sightings(points: np.ndarray, images: range = range(IMAGES)) -> Sightings:
+def sightings(points: np.ndarray, images: range = range(IMAGES)) -> MapObservations:
     rows, which = (
         grid.ravel() for grid in np.meshgrid(images, np.arange(len(points)), indexing="ij")
     )
     local = np.einsum("nji,nj->ni", ROTATIONS[rows], points[which] - POSITIONS[rows])
-    return Sightings(STAMPS, rows, which, CAMERA.project(local))
+    return MapObservations(STAMPS, rows, which, CAMERA.project(local))
 
 
 def test_the_start_moves_into_the_markers_frame() -> None:

@@ -9,25 +9,26 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.image_source import add_source_arguments
-from rs_localizer.cli.map.build_images import Looked, Shutter, look_at_images, shutter_of
+from rs_localizer.cli.map.build_images import Looked, look_at_images, shutter_of
 from rs_localizer.cli.map.build_imu import add_imu_arguments, imu_of
 from rs_localizer.config import FeatureConfig
 from rs_localizer.evaluation.map_pictures import save_pictures
+from rs_localizer.io.calibration.files import write_calibration
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.trajectories import Trajectory, write_tum
 from rs_localizer.io.whole import whole
 from rs_localizer.mapping.anchors import Anchors, Distance
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
-from rs_localizer.mapping.inertial_placing import GivenImu
-from rs_localizer.mapping.report import rows, written
-from rs_localizer.mapping.structure import Effort, require
+from rs_localizer.mapping.colmap import Effort, require
+from rs_localizer.mapping.report import advice, rows, written
 from rs_localizer.mapping.views import Looker
 from rs_localizer.markers.consistency import other_units
 from rs_localizer.markers.map_files import read_marker_map
@@ -35,7 +36,7 @@ from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import write_parameters
 
-COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
+CAMERA, COLMAP, POSES, REPORT = "camera_info.yaml", "colmap", "poses.txt", "report.md"
 # A hand's motion is held by so many images a second.
 _IMAGES_PER_SECOND = 15.0
 
@@ -104,11 +105,16 @@ def run(args: argparse.Namespace) -> None:
     shutter, imu = shutter_of(args), imu_of(args)
     with whole(args.out):
         args.out.mkdir(parents=True)
-        looker = Looker(args.max_keypoints, markers)
-        looked = look_at_images(args, looker, shutter.scan_direction)
-        built = _build(
-            args, looked, shutter, Anchors(markers, looked.points, tuple(args.distance)), imu
-        )
+        with TemporaryDirectory(dir=args.out) as images:
+            looked = look_at_images(args, Looker(args.max_keypoints, Path(images), markers))
+            anchors = Anchors(markers, looked.points, tuple(args.distance))
+            given = Given(
+                looked.views, looked.camera, anchors, shutter.readout_time,
+                shutter.scan_direction, MAP_FRAME if markers is None else markers.map_frame, imu,
+            )  # fmt: skip
+            folder = args.out / COLMAP
+            folder.mkdir()
+            built = build_map(given, Workshop(folder, Effort(args.threads, args.seed), _stage))
         _write(args.out, built, looked)
     _tell(args, built, looked)
 
@@ -133,24 +139,6 @@ def _marker_map(path: Path) -> MarkerMap:
     return marker_map
 
 
-def _build(
-    args: argparse.Namespace, looked: Looked, shutter: Shutter, anchors: Anchors,
-    imu: GivenImu | None,
-) -> Built:  # fmt: skip
-    markers = anchors.marker_map
-    given = Given(
-        looked.views,
-        replace(looked.camera, readout_time=shutter.readout_time or 0.0),
-        anchors,
-        estimate_readout=shutter.readout_time is None,
-        frame=MAP_FRAME if markers is None else markers.map_frame,
-        imu=imu,
-    )
-    folder = args.out / COLMAP
-    folder.mkdir()
-    return build_map(given, Workshop(folder, Effort(args.threads, args.seed), _stage))
-
-
 @contextmanager
 def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
     with tqdm(total=total, desc=name, disable=None) as bar:
@@ -165,8 +153,10 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     )  # fmt: skip
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
-    save_pictures(built, looked.views, out)
-    (out / REPORT).write_text(written(built, looked.images, len(looked.views)), encoding="utf-8")
+    if looked.camera is None:
+        write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
+    save_pictures(built, out)
+    (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 
 def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
@@ -184,10 +174,14 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
     for doubt in (built.placement.doubt, *built.place.doubts):
         if doubt:
             print(f"warning: {doubt}")
+    for text in advice(built, looked.views):
+        print(f"to film otherwise: {text}")
     out = shlex.quote(str(args.out))
+    lens = f" --calibration {out}/{CAMERA}" if looked.camera is None else ""
     print(
-        "next, for images of another walk: rs_localizer detect IMAGES --features sift --out seen "
-        f"&& rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out poses"
+        f"next, for images of another walk: rs_localizer detect IMAGES --features sift{lens} --out "
+        f"seen && rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out "
+        "poses"
     )
 
 

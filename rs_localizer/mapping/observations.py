@@ -12,12 +12,14 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 
 # A part of the map hangs together with another by at least so many landmarks.
 _LEAST_IMAGES, _LEAST_SHARED = 3, 3
+# Fewer observations hold a landmark on one ray, nearly.
+_LEAST_OBSERVATIONS = 3
 # An image with fewer keypoints does not know where it is.
 LEAST_KEYPOINTS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class MapObservations:
     """Keypoints of g images.
 
     Raises:
@@ -60,26 +62,30 @@ class MapFreedom:
     deviations: Array | None = None  # (p,) m, of the landmarks; infinite: not known at all
     angular_acceleration: float = 20.0  # rad/s^2, of the motion at first
     linear_acceleration: float = 10.0  # m/s^2
+    # Standard deviations of the lens: focal lengths and centre by focal length, distortion.
+    lens_deviations: tuple[float, float] = (0.02, 0.1)
 
 
-def shared_landmarks(seen: Sightings) -> BoolArray:
+def shared_landmarks(observations: MapObservations) -> BoolArray:
     """Which landmarks (up to the last one that is seen) two images or more see."""
-    pairs = np.unique(np.column_stack([seen.landmarks, seen.images]), axis=0)
+    pairs = np.unique(np.column_stack([observations.landmarks, observations.images]), axis=0)
     return np.bincount(pairs[:, 0]) > 1
 
 
-def check(seen: Sightings, points: int) -> None:
+def check(observations: MapObservations, points: int) -> None:
     """Raise ValueError when the images do not make one map of so many points, and say why."""
-    if len(seen.landmarks) and not 0 <= seen.landmarks.min() <= seen.landmarks.max() < points:
+    rows = observations.landmarks
+    if len(rows) and not 0 <= rows.min() <= rows.max() < points:
         raise ValueError(f"keypoints are of landmarks that are not among the {points} of the map")
-    if len(seen.stamps_ns) < _LEAST_IMAGES:
+    if len(observations.stamps_ns) < _LEAST_IMAGES:
         raise ValueError(
-            f"{len(seen.stamps_ns)} images show the map, at least {_LEAST_IMAGES} are needed"
+            f"{len(observations.stamps_ns)} images show the map, at least {_LEAST_IMAGES} are "
+            "needed"
         )
-    shared = shared_landmarks(seen) if len(seen.images) else np.zeros(0, np.bool_)
+    shared = shared_landmarks(observations) if len(observations.images) else np.zeros(0, np.bool_)
     if not shared.any():
         raise ValueError("no overlap: no landmark is seen by two images")
-    sizes = _parts(seen, shared[seen.landmarks])
+    sizes = _parts(observations, shared[observations.landmarks])
     if len(sizes) > 1:
         listed = ", ".join(str(size) for size in sizes[:6]) + (", ..." if len(sizes) > 6 else "")
         raise ValueError(
@@ -88,9 +94,9 @@ def check(seen: Sightings, points: int) -> None:
         )
 
 
-def _parts(seen: Sightings, usable: BoolArray) -> list[int]:
+def _parts(observations: MapObservations, usable: BoolArray) -> list[int]:
     """Numbers of images that hang together, largest first."""
-    images, landmarks = seen.images[usable], seen.landmarks[usable]
+    images, landmarks = observations.images[usable], observations.landmarks[usable]
     ones = np.ones(len(images))
     sees = coo_array((ones, (images, landmarks))).tocsr()
     sees.data[:] = 1.0
@@ -100,3 +106,26 @@ def _parts(seen: Sightings, usable: BoolArray) -> list[int]:
     _, labels = connected_components(common, directed=False)
     present = np.unique(images)
     return sorted(np.unique(labels[present], return_counts=True)[1].tolist(), reverse=True)
+
+
+def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArray:
+    """Which landmarks (up to the last one) to adjust: those that are observed most often, each if
+    half of its images need more.
+
+    Args:
+        landmarks, images: (n,) of each keypoint.
+        wanted: keypoints of each image.
+    """
+    order = np.argsort(landmarks, kind="stable")
+    count = int(landmarks.max(initial=-1)) + 1
+    starts = np.searchsorted(landmarks[order], np.arange(count + 1))
+    counts = np.zeros(int(images.max(initial=-1)) + 1, np.int64)
+    chosen = np.zeros(count, np.bool_)
+    for landmark in np.argsort(-np.diff(starts), kind="stable").tolist():
+        at = images[order[starts[landmark] : starts[landmark + 1]]]
+        if len(at) < _LEAST_OBSERVATIONS:
+            break
+        if np.mean(counts[at] < wanted) >= 0.5:
+            chosen[landmark] = True
+            counts[at] += 1
+    return chosen
