@@ -29,9 +29,9 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Given, Workshop, build_map
 from rs_localizer.mapping.colmap import Effort
+from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.refine import RefinedMap
-from rs_localizer.mapping.similarity import through
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
 from rs_localizer.simulation.marker_frames import CAMERA, SENSOR

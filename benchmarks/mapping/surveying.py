@@ -19,8 +19,8 @@ from benchmarks.mapping.rooms import (
     ring,
 )
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.mapping.spotting import Spotted, every_marker
 from rs_localizer.mapping.survey import Survey, survey
+from rs_localizer.mapping.unknown_markers import Spotted, every_marker
 from rs_localizer.markers.families import family
 from rs_localizer.trajectory.fit import Fit
 from rs_localizer.trajectory.problem import LIMIT
@@ -131,7 +131,7 @@ def _errors(found: Survey, poses: list[tuple[Array, Array]], size: float) -> _Er
     shape = _off(found, true, over, squares.mean(axis=0) - over @ ours.mean(axis=0))
     own, free = off[1:].ravel(), found.covariance[6:, 6:]
     squared = float(own @ np.linalg.solve(free, own)) / len(own)
-    asked = found.asked_readout
+    asked = found.readout_check
     return _Errors(
         *_sizes(off[1:]),
         *_sizes(shape),
@@ -139,7 +139,7 @@ def _errors(found: Survey, poses: list[tuple[Array, Array]], size: float) -> _Er
         np.abs(shape) < 3.0 * found.deviations_of_shape,
         squared,
         squared * _by_bound(found.fit),
-        np.nan if asked is None else (asked.asked - asked.given) / asked.deviation,
+        np.nan if asked is None else (asked.estimated - asked.given) / asked.deviation,
     )
 
 

@@ -23,7 +23,7 @@ from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
 from rs_localizer.mapping.colmap import Effort, Stage
-from rs_localizer.mapping.similarity import through
+from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.views import Looker, View
 from rs_localizer.pipeline.features import FrameExtractor, keypoints
 from rs_localizer.pipeline.frames import FrameLocalizer

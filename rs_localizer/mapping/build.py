@@ -25,19 +25,19 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.mapping import MappingError
-from rs_localizer.mapping.anchors import Anchors, Placement, placement
+from rs_localizer.mapping.anchors import Anchors, Placement, marker_constraints, placement
 from rs_localizer.mapping.colmap import Effort, Stage, Structure, build_structure
-from rs_localizer.mapping.inertial_placing import (
+from rs_localizer.mapping.gauge import Similarity, scaled
+from rs_localizer.mapping.inertial_metres import (
     GivenImu,
     InertialPlace,
     place_by_imu,
     refuse_early,
 )
+from rs_localizer.mapping.initial_trajectory import usual_accelerations
 from rs_localizer.mapping.observations import MapObservations, Start, most_observed
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
-from rs_localizer.mapping.similarity import Similarity, scaled
-from rs_localizer.mapping.tied import tied
 from rs_localizer.mapping.track_on_map import Tracked, track_on_map
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
 from rs_localizer.mapping.views import View, blurred
@@ -257,9 +257,9 @@ def _structure(given: Given, keyframes: IntArray, work: Workshop) -> Structure:
     )
     total = len(keyframes)
     if structure.parts[0] < max(_LEAST_VIEWS, _LEAST_PART * total):
-        listed = ", ".join(map(str, structure.parts))
+        listed = " and ".join(map(str, structure.parts))
         raise MappingError(
-            f"reconstruction is disconnected (components of {listed} of {total} keyframes): "
+            f"reconstruction is disconnected (components of {listed} keyframes, of {total}): "
             "record what lies between them, slowly, without blank walls"
         )
     places = structure.positions[np.searchsorted(structure.views, structure.seen_views)]
@@ -282,11 +282,24 @@ def _refined(
     )
     start = Start(structure.points, tracked.rotations[used], tracked.positions[used])
     freedom = MapFreedom()
+    # A time lapse, whose stamps are closer than its images were, moves faster than any hand.
+    angular, linear = usual_accelerations(
+        1e-9 * (observations.stamps_ns - observations.stamps_ns[0]), start.rotations,
+        start.positions,
+    )  # fmt: skip
     if given.anchors.marker_map is not None:
         corners = _corners(given, observations.stamps_ns)
         places = given.anchors.marker_map.points
-        observations, start, freedom = tied(camera, observations, start, corners, places)
-    freedom = replace(freedom, lens=given.camera is None, lens_deviations=_LENS)
+        observations, start, freedom = marker_constraints(
+            camera, observations, start, corners, places
+        )
+    freedom = replace(
+        freedom,
+        lens=given.camera is None,
+        lens_deviations=_LENS,
+        angular_acceleration=max(freedom.angular_acceleration, angular),
+        linear_acceleration=max(freedom.linear_acceleration, linear),
+    )
     directions = [ScanDirection(camera.scan_direction)]
     if given.scan_direction is None:
         directions = likely_axes(camera.size)

@@ -30,7 +30,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.calibration.colmap import colmap_camera, colmap_parameters
 from rs_localizer.io.maps.colmap import read_colmap
 from rs_localizer.mapping import MappingError
-from rs_localizer.mapping.similarity import Similarity
+from rs_localizer.mapping.gauge import Similarity
 
 DATABASE, SPARSE = "database.db", "sparse"
 _ARRAYS, _TASK = "arrays.npz", "task.json"

@@ -8,7 +8,9 @@ what it leaves. On standard output it says ``stage NAME TOTAL`` and ``step COUNT
 from __future__ import annotations
 
 import json
+import sqlite3
 import sys
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -40,12 +42,15 @@ def main(task: dict[str, Any]) -> None:
     _extract(task, database)
     _match(task, database)
     ordered = _map(task, database, folder)
-    arrays: dict[str, Any] = {"parts": [model.num_reg_images() for model in ordered]}
+    arrays = {"parts": [model.num_reg_images() for model in ordered]} | _statistics(database)
     if ordered:
         (folder / SPARSE).mkdir()
         ordered[0].write(folder / SPARSE)
         arrays |= _arrays(ordered[0])
-    np.savez(folder / ARRAYS, **(arrays | _statistics(database)))
+    with closing(sqlite3.connect(database)) as tables:
+        # Readers of a database with a write-ahead log leave files beside it.
+        tables.execute("PRAGMA journal_mode=DELETE")
+    np.savez(folder / ARRAYS, **arrays)
 
 
 def _say(*words: object) -> None:

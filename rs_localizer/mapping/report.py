@@ -8,7 +8,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import BoolArray
 from rs_localizer.mapping.build import Built
-from rs_localizer.mapping.inertial_placing import InertialPlace
+from rs_localizer.mapping.inertial_metres import InertialPlace
 from rs_localizer.mapping.views import View
 
 PICTURES = ("map.png", "residuals.png")

@@ -24,10 +24,9 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
 from rs_localizer.mapping.colmap import DATABASE, SPARSE, Effort
-from rs_localizer.mapping.inertial_metres import inertial_metres
-from rs_localizer.mapping.inertial_placing import InertialPlace
+from rs_localizer.mapping.gauge import through
+from rs_localizer.mapping.inertial_metres import InertialPlace, inertial_metres
 from rs_localizer.mapping.report import written
-from rs_localizer.mapping.similarity import through
 from rs_localizer.mapping.views import View
 from rs_localizer.simulation.renderer import ImageSettings
 

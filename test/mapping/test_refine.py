@@ -9,12 +9,10 @@ import pytest
 from scenes import READOUT, Walk, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.mapping.adjustment import MapProblem, MapStep
+from rs_localizer.mapping.adjustment import MapNormal, MapProblem, MapStep, Reduced
+from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.observations import MapObservations
-from rs_localizer.mapping.preparation import Preparation
-from rs_localizer.mapping.reduced import MapNormal, Reduced
-from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.similarity import through
+from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine
 from rs_localizer.trajectory.model import Freedom, State, start_state
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
@@ -142,15 +140,15 @@ def test_the_readout_time_is_found(video: Walk) -> None:
 
 
 def test_a_wrong_readout_time_is_named(video: Walk) -> None:
-    right = refine(camera(), video.seen, video.start).asked_readout
+    right = refine(camera(), video.seen, video.start).readout_check
     assert right is not None
     assert not right.differs
-    wrong = refine(camera(0.4 * READOUT), video.seen, video.start).asked_readout
+    wrong = refine(camera(0.4 * READOUT), video.seen, video.start).readout_check
     assert wrong is not None
     assert wrong.differs
     # One step brings it most of the way.
-    assert abs(wrong.asked - READOUT) < 0.3 * READOUT
-    assert f"{0.4e3 * READOUT:.1f} ms was given" in wrong.told
+    assert abs(wrong.estimated - READOUT) < 0.3 * READOUT
+    assert f"{0.4e3 * READOUT:.1f} ms was given" in wrong.message
 
 
 def test_the_reverse_scan_direction_is_found(video: Walk) -> None:

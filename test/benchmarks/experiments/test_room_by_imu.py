@@ -30,7 +30,7 @@ def refined_of(motion: RecordedMotion, size: float) -> RefinedMap:
     return RefinedMap(
         points=none, covariances=np.zeros((0, 3, 3)), refined=empty > 0, sights=np.zeros(0, int),
         camera=Camera(640, 480, np.diag([500.0, 500.0, 1.0])), readout_time=0.03,
-        readout_time_deviation=np.nan, asked_readout=None, deviation=0.1, squared_errors=empty,
+        readout_time_deviation=np.nan, readout_check=None, deviation=0.1, squared_errors=empty,
         inliers=empty > 0, before=1.0, after=0.1,
         spline=Spline(layout, true.rotations, true.positions / size), start_ns=start_ns,
         times=np.arange(0.0, SECONDS, 1 / 15),
