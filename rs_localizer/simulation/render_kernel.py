@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 # Walls that meet in an edge overlap by this many texels, so that no ray slips between them.
 _OVERLAP = np.float32(0.02)

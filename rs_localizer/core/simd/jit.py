@@ -18,7 +18,7 @@ import llvmlite.binding
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-from rs_localizer.core.lanes import shipped
+from rs_localizer.core.simd import shipped
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -131,7 +131,7 @@ class _Locator:
 
     def ensure_cache_path(self) -> None:
         self._directory.mkdir(parents=True, exist_ok=True)
-        from rs_localizer.core.lanes import old_caches  # for who compiles
+        from rs_localizer.core.simd import old_caches  # for who compiles
 
         old_caches.remove_others(self._directory.parent)
 
@@ -217,7 +217,7 @@ class _Cache(FunctionCache):
         try:
             found = super().load_overload(signature, target)
             if found is not None:
-                from rs_localizer.core.lanes import old_caches
+                from rs_localizer.core.simd import old_caches
 
                 old_caches.mark(Path(self._cache_path).parent)
             return found

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.core.lanes import old_caches
+from rs_localizer.core.simd import old_caches
 
 DAY = 86400.0
 
