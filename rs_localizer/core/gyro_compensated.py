@@ -8,8 +8,8 @@ and ``m`` the velocity of the image point (as the module ``view`` of the estimat
 
     I - (k + m) g^T = (I - k g^T) (I - m' g^T),   m' = (I - k g^T)^-1 m
 
-so that derivatives of the pixel by the compensated bearing times ``(I - k g^T)^-1`` are all that the
-kernels need.
+so that derivatives of the pixel by the compensated bearing times ``(I - k g^T)^-1`` are all that
+the kernels need.
 """
 
 from __future__ import annotations

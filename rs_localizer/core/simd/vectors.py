@@ -1,7 +1,7 @@
 """SIMD values in ordinary Numba code: loops where tracing would unroll too much.
 
-:mod:`rs_localizer.core.simd.tracing` unrolls a small solver into straight-line code. Elimination and
-eigenvalues of 20x20 matrices take tens of thousands of operations and need loops. Here Numba
+The module ``tracing`` unrolls a small solver into straight-line code. Elimination and eigenvalues
+of 20x20 matrices take tens of thousands of operations and need loops. Here Numba
 gets one type whose values hold ``LANES`` doubles, one per sample, in one LLVM vector; kernels
 load, combine and store such values as they would numbers.
 
