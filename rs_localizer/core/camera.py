@@ -8,10 +8,11 @@ the raw row of the full sensor: distortion moves light between rows, not rows in
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -19,19 +20,6 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.scanning import ScanDirection
-
-import math
-from collections.abc import Sequence
-from enum import StrEnum
-from numbers import Real
-from typing import Any, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
-
-from rs_localizer.core.arrays import Array
-
-
 
 # NumPy's ArrayLike is so wide that type checkers take [[500, 0], [0, 500]] for a list of objects.
 Matrix = NDArray[Any] | Sequence[Sequence[float]]
