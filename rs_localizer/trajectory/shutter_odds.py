@@ -95,6 +95,11 @@ class ShutterOdds:
         return scatter < _MOST_SCATTER and against > _CERTAIN
 
     @property
+    def rolling(self) -> float:
+        """Logarithm of the odds for the readout time that is set, either way, against none."""
+        return max(self._odds(_SET, _NONE), self._odds(_REVERSED, _NONE))
+
+    @property
     def may_be_reversed(self) -> bool:
         """Whether that fits better than what is set."""
         return self._odds(_REVERSED, _SET, to_doubt=True) > 0.0
