@@ -10,6 +10,7 @@ import numpy as np
 from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.fleet import add_fleet_arguments
 from rs_localizer.core.arrays import Array
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
@@ -201,7 +202,8 @@ def _plot(
         plots.errors({"estimate": poses}, {"estimate": twists} if twists else {}),
     )
     for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
-        figures.save(figure, directory / name)
+        with atomic_files(directory / name) as (part,):
+            figures.save(figure, part)
         print(f"{directory / name}")
 
 
