@@ -10,21 +10,19 @@ import numpy as np
 from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.fleet import add_fleet_arguments
 from rs_localizer.core.arrays import Array
-from rs_localizer.evaluation.alignment import aligned
 from rs_localizer.evaluation.metrics import (
     Errors,
     Summary,
-    associate,
-    pose_errors,
-    summarize,
-    twist_errors,
-)
-from rs_localizer.evaluation.time_offset import (
     TimeOffset,
+    aligned,
+    associate,
     estimate_offset,
     interpolated,
     interpolated_twists,
+    pose_errors,
     shifted,
+    summarize,
+    twist_errors,
 )
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagError, open_bag
@@ -194,7 +192,7 @@ def _print_offset(found: TimeOffset | None) -> None:
 def _plot(
     directory: Path, estimate: Trajectory, truth: Trajectory, poses: Errors, twists: Errors | None
 ) -> None:
-    from rs_localizer.evaluation import figures, plots
+    from rs_localizer.evaluation import plots
 
     directory.mkdir(parents=True, exist_ok=True)
     drawn = (
@@ -203,7 +201,7 @@ def _plot(
     )
     for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
         with atomic_files(directory / name) as (part,):
-            figures.save(figure, part)
+            plots.save(figure, part)
         print(f"{directory / name}")
 
 

@@ -32,9 +32,9 @@ from rs_localizer.simulation.image_sequence import FORMATS, Encoding, rendered_f
 from rs_localizer.simulation.landmarks import described, keypoint_rows
 from rs_localizer.simulation.recording import write_rendered, write_simulated
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.rooms import SCENES
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.true_motion import TrueMotion, sampled_way
+from rs_localizer.simulation.walls import SCENES
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")

@@ -11,8 +11,7 @@ from rs_localizer.cli import UsageError
 from rs_localizer.cli.simulated_camera import option
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.process.arguments import number
-from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
-from rs_localizer.simulation.imu_recording import ImuBagWriter
+from rs_localizer.simulation.imu import ImuBagWriter, ImuSettings, Lever, simulate_imu
 from rs_localizer.simulation.true_motion import TrueMotion
 
 # Its random numbers are its own: the frames are the same with and without it.

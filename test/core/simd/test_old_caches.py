@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.core.lanes import jit
+from rs_localizer.core.simd import jit
 
 DAY = 86400.0
 

@@ -22,7 +22,7 @@ import llvmlite.binding
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-from rs_localizer.core.lanes import shipped
+from rs_localizer.core.simd import shipped
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 
-from rs_localizer.core.lanes import jit
+from rs_localizer.core.simd import jit
 
 PACKAGE = Path(jit.__file__).parents[2]
 KERNEL = """
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 @kernel
 def double(x):
@@ -214,7 +214,7 @@ def test_a_kernel_is_compiled_anew_when_one_that_it_calls_changes(
     inner = package / "matching" / "deep" / "inner.py"
     (package / "matching" / "outer.py").write_text(
         "from changing.matching.deep.inner import inner\n"
-        "from rs_localizer.core.lanes.jit import kernel\n\n"
+        "from rs_localizer.core.simd.jit import kernel\n\n"
         "@kernel\ndef outer(x):\n    return 10.0 * inner(x)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
@@ -222,7 +222,7 @@ def test_a_kernel_is_compiled_anew_when_one_that_it_calls_changes(
 
     def outer(change: str) -> Any:
         inner.write_text(
-            "from rs_localizer.core.lanes.jit import kernel\n\n"
+            "from rs_localizer.core.simd.jit import kernel\n\n"
             f"@kernel\ndef inner(x):\n    return x + {change}\n"
         )
         jit._digest.cache_clear()
