@@ -24,6 +24,7 @@ from rs_localizer.evaluation.metrics import (
     summarize,
     twist_errors,
 )
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
@@ -199,7 +200,8 @@ def _plot(
         plots.errors({"estimate": poses}, {"estimate": twists} if twists else {}),
     )
     for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
-        plots.save(figure, directory / name)
+        with atomic_files(directory / name) as (part,):
+            plots.save(figure, part)
         print(f"{directory / name}")
 
 

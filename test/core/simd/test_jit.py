@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import resource
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,7 @@ Load = Callable[[], Any]
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(jit, "_said", set())
+    jit.open_to_others.cache_clear()
     return tmp_path / "cache"
 
 
@@ -149,6 +152,51 @@ def test_a_kernel_is_compiled_with_one_that_comes_from_the_cache(load: Load, cac
     # The callee has been inlined, as it is where both are compiled.
     (code,) = quadruple.inspect_llvm().values()
     assert "8doubling6double" not in "".join(line for line in code.splitlines() if " call " in line)
+
+
+@pytest.mark.parametrize("shared", ["cache", "rs_localizer", "digest", "kernels"])
+def test_a_cache_that_others_can_write_is_not_used(
+    load: Load, monkeypatch: pytest.MonkeyPatch, shared: str
+) -> None:
+    """Numba unpickles what is there: whoever writes it runs code in this process."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:  # pytest's own is nobody else's
+        Path(folder).chmod(0o755)
+        monkeypatch.setenv("XDG_CACHE_HOME", f"{folder}/cache")
+        check_shared(load, Path(folder) / "cache", shared)
+
+
+def check_shared(load: Load, cache: Path, shared: str) -> None:
+    load()(1.5)
+    kernels = files(cache, ".nbc")[0].parent
+    assert {path.stat().st_mode & 0o777 for path in (kernels, kernels.parent)} == {0o700}
+    folders = [cache, cache / "rs_localizer", kernels.parent, kernels]
+    for folder in folders:
+        folder.chmod(0o755)
+    folders[["cache", "rs_localizer", "digest", "kernels"].index(shared)].chmod(0o777)
+    before = files(cache, ".nbi")[0].read_bytes()
+    jit.open_to_others.cache_clear()
+    compiled = load()
+    with pytest.warns(RuntimeWarning, match="not used, since other users can write to"):
+        assert compiled(1.5) == 3.0
+    assert compiled(2) == 4.0  # said once
+    assert hits(compiled) == 0
+    assert files(cache, ".nbi")[0].read_bytes() == before
+    cache.chmod(0o700)  # nobody else gets there
+    jit.open_to_others.cache_clear()
+    again = load()
+    assert again(1.5) == 3.0
+    assert hits(again) == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_a_cache_of_another_user_is_not_used(load: Load, cache: Path) -> None:
+    load()(1.5)
+    os.chown(cache / "rs_localizer", 65534, 65534)
+    jit.open_to_others.cache_clear()
+    compiled = load()
+    with pytest.warns(RuntimeWarning, match="not used"):
+        assert compiled(1.5) == 3.0
+    assert hits(compiled) == 0
 
 
 def test_a_folder_that_cannot_be_made_is_a_warning(load: Load, cache: Path) -> None:
