@@ -6,6 +6,7 @@ import io
 import sqlite3
 import struct
 import tempfile
+import zlib
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -165,6 +166,31 @@ def compressed(suffix: str) -> bytes:
     """The same packed."""
     picture: NDArray[np.uint8] = np.arange(48, dtype=np.uint8).reshape(6, 8)
     return bytes(cv2.imencode(suffix, picture)[1].tobytes())
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def animated_png() -> bytes:
+    """Two pictures, one after the other."""
+    png = compressed(".png")
+    head, pixels = png[:33], zlib.compress((b"\0" + bytes(8)) * 6)
+    control = [struct.pack(">5I2H2B", number, 8, 6, 0, 0, 1, 10, 0, 0) for number in (0, 1)]
+    first = _chunk(b"acTL", struct.pack(">II", 2, 0)) + _chunk(b"fcTL", control[0])
+    second = _chunk(b"fcTL", control[1]) + _chunk(b"fdAT", struct.pack(">I", 2) + pixels)
+    return head + first + _chunk(b"IDAT", pixels) + second + png[-12:]
+
+
+def with_check_sums(png: bytes) -> bytes:
+    """A damaged PNG whose chunks are whole again, as far as they can be told."""
+    parts, position = [png[:8]], 8
+    while position + 12 <= len(png):
+        length = min(int.from_bytes(png[position : position + 4]), len(png) - position - 12)
+        body = png[position + 8 : position + 8 + length]
+        parts.append(_chunk(png[position + 4 : position + 8], body))
+        position += 12 + length
+    return b"".join(parts)
 
 
 def _maps() -> list[Map]:

@@ -109,7 +109,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "imu": Target(_messages((seeds.imu(),)), read_imu, message),
         "image": Target(_messages(pictures), read_image, message),
         "image/compressed": Target(
-            _bytes([seeds.compressed(suffix) for suffix in (".png", ".jpg")]),
+            _pictures,
             _compressed,
             message,
         ),
@@ -167,6 +167,16 @@ def _messages(templates: Sequence[Any]) -> Callable[[Random], Any]:
 
 def _bytes(good: Sequence[bytes]) -> Callable[[Random], bytes]:
     return lambda random: damaged(random.choice(good), good, random)
+
+
+_PICTURES = [seeds.compressed(f".{name}") for name in ("png", "jpg", "webp", "tiff")]
+_PICTURES.append(seeds.animated_png())
+
+
+def _pictures(random: Random) -> bytes:
+    picture = damaged(random.choice(_PICTURES), _PICTURES, random)
+    repaired = picture.startswith(b"\x89PNG") and random.random() < 0.7
+    return seeds.with_check_sums(picture) if repaired else picture
 
 
 _ARRAYS = seeds.arrays()
