@@ -20,13 +20,13 @@ from rs_localizer.cli.shots import clock_of, of_bag, of_files, tell_times
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.evaluation.calibration_plots import save_plots
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration.files import read_calibration, write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
-from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.offline.image_sources import (
     Carried,
     Shot,

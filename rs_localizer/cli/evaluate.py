@@ -10,12 +10,8 @@ import numpy as np
 from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.fleet import add_fleet_arguments
 from rs_localizer.core.arrays import Array
-from rs_localizer.io.bags import BagError, open_bag
-from rs_localizer.io.estimates import Motions, read_motions
-from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
-from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
-from rs_localizer.lab.measures.alignment import aligned
-from rs_localizer.lab.measures.metrics import (
+from rs_localizer.evaluation.alignment import aligned
+from rs_localizer.evaluation.metrics import (
     Errors,
     Summary,
     associate,
@@ -23,13 +19,17 @@ from rs_localizer.lab.measures.metrics import (
     summarize,
     twist_errors,
 )
-from rs_localizer.lab.measures.time_offset import (
+from rs_localizer.evaluation.time_offset import (
     TimeOffset,
     estimate_offset,
     interpolated,
     interpolated_twists,
     shifted,
 )
+from rs_localizer.io.bags import BagError, open_bag
+from rs_localizer.io.estimates import Motions, read_motions
+from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
+from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
 from rs_localizer.process.arguments import number
 
 _AUTO = "auto"
@@ -193,7 +193,7 @@ def _print_offset(found: TimeOffset | None) -> None:
 def _plot(
     directory: Path, estimate: Trajectory, truth: Trajectory, poses: Errors, twists: Errors | None
 ) -> None:
-    from rs_localizer.lab.measures import figures, plots
+    from rs_localizer.evaluation import figures, plots
 
     directory.mkdir(parents=True, exist_ok=True)
     drawn = (

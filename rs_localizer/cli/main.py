@@ -101,11 +101,6 @@ COMMANDS = {
         "compile all kernels now, for images and installers; the first start is then as any other",
         "rs_localizer warm",
     ),
-    "experiments": Command(
-        "rs_localizer.cli.experiments",
-        "the experiments of the literature and ours: curves, figures, a verdict on every claim",
-        "rs_localizer experiments motion noise --out figures",
-    ),
 }
 
 

@@ -24,17 +24,17 @@ from rs_localizer.io.bags import STORAGES
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
 from rs_localizer.io.whole import whole
-from rs_localizer.lab.rendering.image_sequence import FORMATS, Encoding, rendered_frames
-from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
-from rs_localizer.lab.rendering.rooms import SCENES
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.landmarks import described, keypoint_rows
-from rs_localizer.lab.simulation.recording import write_rendered, write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import TrueMotion, sampled_way
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import write_parameters
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.image_sequence import FORMATS, Encoding, rendered_frames
+from rs_localizer.simulation.landmarks import described, keypoint_rows
+from rs_localizer.simulation.recording import write_rendered, write_simulated
+from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.rooms import SCENES
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import TrueMotion, sampled_way
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")

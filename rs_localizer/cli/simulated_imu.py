@@ -9,10 +9,10 @@ import numpy as np
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.simulated_camera import option
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.lab.simulation.imu import ImuSettings, Lever, simulate_imu
-from rs_localizer.lab.simulation.imu_recording import ImuBagWriter
-from rs_localizer.lab.simulation.true_motion import TrueMotion
 from rs_localizer.process.arguments import number
+from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
+from rs_localizer.simulation.imu_recording import ImuBagWriter
+from rs_localizer.simulation.true_motion import TrueMotion
 
 # Its random numbers are its own: the frames are the same with and without it.
 _STREAM = 14

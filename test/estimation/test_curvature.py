@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.honesty.small_planes import Condition, measure
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.curvature import along_arcs, told_from
 from rs_localizer.estimation.refine import apply_step
-from rs_localizer.lab.experiments.honesty.small_planes import Condition, measure
 
 CENTRE = np.array([0.3, -0.2, 3.0])
 TURNS, MOVES = np.diag([0.05, 0.03, 0.02]), np.diag([0.001, 0.002, 0.02])

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.honesty.vibration import Condition, measure
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.model_error import gain_of_shaking
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.shake_sizes import _share, sizes_and_step
 from rs_localizer.estimation.shaking import Scales, follow
-from rs_localizer.lab.experiments.honesty.vibration import Condition, measure
 from rs_localizer.localizer import assumptions
 from rs_localizer.solvers.table import find_solver
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
+from benchmarks.honesty.vibration import Condition, measure
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.columns import Columns
@@ -16,7 +17,6 @@ from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, powers, sp
 from rs_localizer.estimation.tone_mixture import averaged
 from rs_localizer.estimation.tone_search import find_tones
 from rs_localizer.estimation.tones import Tones, fitted, seen_at
-from rs_localizer.lab.experiments.honesty.vibration import Condition, measure
 
 from .projection import jacobian_of
 from .test_settling import ASSUMED, PRIOR, frame

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.data import GLOBAL_SHUTTER_TAGS
+from benchmarks.independent.rotations import logarithm
 from rs_localizer import data
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
@@ -17,12 +19,11 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.independent.rotations import logarithm
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import RecordedMotion, sampled_way
 from rs_localizer.offline.replay import find_topics, replay
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
 
 READOUT = 0.02
 CAMERA = Camera(
@@ -134,7 +135,7 @@ def within(error: np.ndarray, covariance: np.ndarray) -> bool:
 
 def test_a_global_shutter_has_no_twist() -> None:
     frames = FrameLocalizer(NodeConfig(readout_time=READOUT))
-    with open_bag(data.path(data.GLOBAL_SHUTTER_TAGS)) as bag:
+    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         for (_, found), _ in zip(replay(bag, find_topics(bag), frames), range(40), strict=False):
             assert found
     assert found.twist is None
@@ -144,7 +145,7 @@ def test_a_global_shutter_has_no_twist() -> None:
 @pytest.mark.parametrize("tracking", [True, False])
 def test_a_global_shutter_is_known_within_a_second_and_stays_one(tracking: bool) -> None:
     frames = FrameLocalizer(NodeConfig(readout_time=READOUT, tracking=tracking))
-    with open_bag(data.path(data.GLOBAL_SHUTTER_TAGS)) as bag:
+    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         for (_, found), _ in zip(replay(bag, find_topics(bag), frames), range(30), strict=False):
             assert found
     assert frames.readout_watch.far_off

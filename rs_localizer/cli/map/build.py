@@ -18,11 +18,11 @@ from rs_localizer.cli.image_source import add_source_arguments
 from rs_localizer.cli.map.build_images import Looked, Shutter, look_at_images, shutter_of
 from rs_localizer.cli.map.build_imu import add_imu_arguments, imu_of
 from rs_localizer.config import FeatureConfig
+from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.trajectories import Trajectory, write_tum
 from rs_localizer.io.whole import whole
-from rs_localizer.lab.measures.map_pictures import save_pictures
 from rs_localizer.mapping.anchors import Anchors, Distance
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
 from rs_localizer.mapping.inertial_placing import GivenImu

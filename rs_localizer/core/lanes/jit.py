@@ -27,7 +27,7 @@ if importlib.util.find_spec("scipy") is None:  # Numba would say so in the first
 
 PARTS = (
     *("core", "solvers", "estimation", "inertial", "matching", "markers", "trajectory", "mapping"),
-    "lab",
+    "simulation",
 )
 """Folders of the package with kernels; a kernel calls those of its own and of earlier ones."""
 
@@ -119,7 +119,7 @@ class _Locator:
 
     def __init__(self, function: Any, file: str) -> None:
         names = function.__module__.split(".")
-        part = names[1] if len(names) > 1 else ""
+        part = names[1] if names[0] == _PACKAGE.name and len(names) > 1 else ""
         self._py_file = file  # Numba's name, for its warnings
         self.folder = Path(_digest(part, _PACKAGE), function.__module__)
         self._directory = cache_directory() / self.folder
