@@ -67,12 +67,12 @@ def main() -> None:
         shutter = shutter_of(clip, cache)
         if config.readout_time > 0.0:
             shutter = replace(shutter, readout_time=config.readout_time)
-        print(f"{clip.name}: {len(clip.images)} images, calibrate: {shutter.verdict}", flush=True)  # noqa: T201
+        print(f"{clip.name}: {len(clip.images)} images, calibrate: {shutter.verdict}", flush=True)
         rows[clip.name] = judged(clip, opencv_lens(clip), shutter, config)
     args.out.mkdir(parents=True, exist_ok=True)
     _write_csv(rows, args.out / "real.csv")
     text = _text(rows)
-    print(text)  # noqa: T201
+    print(text)
     (args.out / "real.txt").write_text(text + "\n", encoding="utf-8")
     _draw(rows, args.out / "real.png")
 
