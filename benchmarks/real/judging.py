@@ -16,6 +16,7 @@ from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
@@ -137,7 +138,7 @@ def _halves(
     for seed, image in enumerate(images):
         for part, chosen in zip(parts, halved(len(image.points), seed), strict=True):
             part.append(replace(image, points=image.points[chosen], pixels=image.pixels[chosen]))
-    reverse = replace(camera, scan_direction=str(REVERSED[camera.scan_direction]))
+    reverse = replace(camera, scan_direction=str(REVERSED[ScanDirection(camera.scan_direction)]))
     cameras = {"single": camera, "tracked": camera, "reversed": reverse, "p3p": camera}
     fits = {
         name: [
