@@ -78,6 +78,7 @@ _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   profiling, frame_times           where the time of a frame goes
   load, load.signals               a live node under load, and stopped at random moments
   image_flight, marker_flight      rendered flights through live nodes and through commands
+  signals                          commands that are stopped at random moments
   fusion                           estimates in the filter of robot_localization
 """
 

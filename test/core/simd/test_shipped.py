@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 from numba.core.registry import cpu_target
 
-from rs_localizer.core.lanes import jit, shipped
+from rs_localizer.core.simd import jit, shipped
 
 ROOT = Path(jit.__file__).parents[3]
 KERNEL = """
 import numpy as np
 
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 @kernel
 def tripled(x):
@@ -94,7 +94,7 @@ def test_nothing_is_compiled_where_the_package_has_it(load: Load, tmp_path: Path
 
 def test_it_runs_in_a_process_that_has_compiled_nothing(made: Path, tmp_path: Path) -> None:
     use = (
-        "from pathlib import Path; from rs_localizer.core.lanes import shipped; "
+        "from pathlib import Path; from rs_localizer.core.simd import shipped; "
         f"shipped.FOLDER = Path({str(made / 'compiled')!r}); "
     )
     found = run(use + CALL, made, tmp_path / "cache", {})

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.core.lanes import old_caches
+from rs_localizer.core.simd import jit
 
 DAY = 86400.0
 
 
 @pytest.fixture
 def cache(tmp_path: Path) -> Path:
-    old_caches.mark.cache_clear()
-    old_caches.remove_others.cache_clear()
+    jit._mark.cache_clear()
+    jit._remove_others.cache_clear()
     return tmp_path
 
 
@@ -42,7 +42,7 @@ def test_what_nobody_used_for_a_month_is_removed(cache: Path) -> None:
     empty.mkdir()
     os.utime(empty, times=(time.time() - 100 * DAY,) * 2)
     staying.append(empty)
-    old_caches.remove_others(used)
+    jit._remove_others(used)
     assert not old.exists()
     assert all(path.is_dir() for path in [used, *staying])
     assert (cache / "3333333333333333").is_file()
@@ -50,18 +50,18 @@ def test_what_nobody_used_for_a_month_is_removed(cache: Path) -> None:
 
 def test_use_keeps_a_folder(cache: Path) -> None:
     used, old = folder(cache, "0" * 16, 0), folder(cache, "1" * 16, 31)
-    old_caches.mark(old)
-    old_caches.remove_others(used)
+    jit._mark(old)
+    jit._remove_others(used)
     assert old.is_dir()
 
 
 def test_a_folder_is_marked_once_a_day(cache: Path) -> None:
     today = folder(cache, "0" * 16, 0.5)
     before = today.stat().st_mtime_ns
-    old_caches.mark(today)
+    jit._mark(today)
     assert today.stat().st_mtime_ns == before
 
 
 def test_a_folder_that_is_gone_is_no_error(cache: Path) -> None:
-    old_caches.mark(cache / ("0" * 16))
-    old_caches.remove_others(cache / "nowhere" / ("0" * 16))
+    jit._mark(cache / ("0" * 16))
+    jit._remove_others(cache / "nowhere" / ("0" * 16))

@@ -8,6 +8,10 @@ import hashlib
 import importlib.util
 import os
 import pickle
+import re
+import shutil
+import stat
+import time
 import warnings
 import zlib
 from collections.abc import Callable
@@ -18,7 +22,7 @@ import llvmlite.binding
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-from rs_localizer.core.lanes import shipped
+from rs_localizer.core.simd import shipped
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -38,6 +42,10 @@ _CHECKSUM_BYTES = 4
 # A module without a function.
 _NOTHING = llvmlite.binding.parse_assembly("").as_bitcode()
 _said: set[str] = set()
+_DAY = 86400.0
+# Kernels of other versions, in other environments, may be at work beside this one.
+_KEPT = 30.0 * _DAY
+_OURS = re.compile(r"[0-9a-f]{16}")
 
 
 def cache_directory() -> Path:
@@ -50,6 +58,30 @@ def cache_directory() -> Path:
         except RuntimeError:  # a user without a home, as in some containers
             chosen = "/nonexistent"
     return Path(chosen) if config.CACHE_DIR else Path(chosen) / "rs_localizer"
+
+
+@functools.cache
+def open_to_others(folder: Path) -> Path | None:
+    """The first of a folder and those above it into which other users can put files.
+
+    What is kept there runs in this process; a folder that is not there yet is made for its user.
+    """
+    users, hidden = {0, os.geteuid()}, False
+    folder = folder.resolve()
+    for path in (*reversed(folder.parents), folder):
+        try:
+            about = path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except OSError:
+            return path
+        # In /tmp (sticky), nobody can replace what is another's.
+        sticky = path != folder and about.st_mode & stat.S_ISVTX
+        shared = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not sticky and not hidden
+        if about.st_uid not in users or shared:
+            return path
+        hidden |= not about.st_mode & (stat.S_IXGRP | stat.S_IXOTH)
+    return None
 
 
 def digest(part: str, package: Path) -> str:
@@ -130,10 +162,10 @@ class _Locator:
         return cls(function, file)
 
     def ensure_cache_path(self) -> None:
-        self._directory.mkdir(parents=True, exist_ok=True)
-        from rs_localizer.core.lanes import old_caches  # for who compiles
-
-        old_caches.remove_others(self._directory.parent)
+        folder = self._directory
+        for path in (*reversed(folder.relative_to(cache_directory().parent).parents), folder):
+            (cache_directory().parent / path).mkdir(0o700, parents=True, exist_ok=True)
+        _remove_others(folder.parent)
 
     def get_cache_path(self) -> str:
         return str(self._directory)
@@ -214,12 +246,12 @@ class _Cache(FunctionCache):
         return self._load_own(signature, target) if found is None else found
 
     def _load_own(self, signature: Any, target: Any) -> Any:
+        if not self._is_own():
+            return None
         try:
             found = super().load_overload(signature, target)
             if found is not None:
-                from rs_localizer.core.lanes import old_caches
-
-                old_caches.mark(Path(self._cache_path).parent)
+                _mark(Path(self._cache_path).parent)
             return found
         except (*_DAMAGE, pickle.UnpicklingError) as error:
             _say(f"damaged files are compiled anew ({self._cache_file._index_path}: {error!r})")
@@ -242,11 +274,53 @@ class _Cache(FunctionCache):
             _say(f"what came with the package is damaged ({shipped.FOLDER}: {error!r})")
         return None
 
+    def _is_own(self) -> bool:
+        intruded = open_to_others(Path(self._cache_path))
+        if intruded is not None:
+            _say(
+                f"not used, since other users can write to {intruded}: chmod -R go-w, or remove it"
+            )
+        return intruded is None
+
     def save_overload(self, signature: Any, compiled: Any) -> None:
+        if not self._is_own():
+            return
         try:
             super().save_overload(signature, compiled)
         except OSError as error:
             _say(f"kernels are compiled again at the next start: {error.strerror or error}")
+
+
+@functools.cache
+def _mark(folder: Path) -> None:
+    """Note that a folder is in use: by its time of change, once a day."""
+    with contextlib.suppress(OSError):  # which is not ours to write
+        if time.time() - folder.stat().st_mtime > _DAY:
+            os.utime(folder)
+
+
+@functools.cache
+def _remove_others(used: Path) -> None:
+    """Remove the neighbours of a folder that have not been marked for a month.
+
+    A process that still had one open compiles again what it has not loaded.
+    """
+    oldest = time.time() - _KEPT
+    with contextlib.suppress(OSError):
+        for folder in used.parent.iterdir():
+            if folder != used and _holds_kernels(folder) and folder.stat().st_mtime < oldest:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _holds_kernels(folder: Path) -> bool:
+    """Whether there are kernels of this package, and nothing else.
+
+    ``NUMBA_CACHE_DIR`` is everybody's, and an empty folder may be anybody's.
+    """
+    if not _OURS.fullmatch(folder.name) or not folder.is_dir():
+        return False
+    names = [item.name for item in folder.iterdir()]
+    return bool(names) and all(name.startswith("rs_localizer.") for name in names)
 
 
 def _say(text: str) -> None:

@@ -1,11 +1,11 @@
 """SIMD values in ordinary Numba code: loops where tracing would unroll too much.
 
-:mod:`rs_localizer.core.lanes.simd` unrolls a small solver into straight-line code. Elimination and
-eigenvalues of 20x20 matrices take tens of thousands of operations and need loops. Here Numba
+The module ``tracing`` unrolls a small solver into straight-line code. Elimination and eigenvalues
+of 20x20 matrices take tens of thousands of operations and need loops. Here Numba
 gets one type whose values hold ``LANES`` doubles, one per sample, in one LLVM vector; kernels
 load, combine and store such values as they would numbers.
 
-Arrays are flat float64 arrays with ``LANES`` doubles per value, as :func:`simd.traced` has them.
+Arrays are flat float64 arrays with ``LANES`` doubles per value, as :func:`tracing.traced` has them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from numba.core.typing import templates
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES
 
 # Numba has types, but not for these.
 _get_or_insert_function: Any = cgutils.get_or_insert_function

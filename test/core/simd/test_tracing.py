@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.lanes.algebra import cross, least_squares, nearest_rotation
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES, select, sqrt, traced, traced_sums
+from rs_localizer.core.simd.algebra import cross, least_squares, nearest_rotation
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES, select, sqrt, traced, traced_sums
 from rs_localizer.core.so3 import hat
 
 

@@ -1,7 +1,7 @@
 """Machine code that came with the package, where nobody wants to wait for a compiler.
 
 ``packaging/compile_kernels.py`` puts it there before a wheel is built: caches of kernels
-(:mod:`rs_localizer.core.lanes.jit`) of processes that compiled for a kind of CPU and not for their
+(:mod:`rs_localizer.core.simd.jit`) of processes that compiled for a kind of CPU and not for their
 own. What a CPU can do decides here which of it may run: an instruction that it does not have would
 end the process.
 """

@@ -8,8 +8,8 @@ and ``m`` the velocity of the image point (as the module ``view`` of the estimat
 
     I - (k + m) g^T = (I - k g^T) (I - m' g^T),   m' = (I - k g^T)^-1 m
 
-so that derivatives of the pixel by the steadied bearing times ``(I - k g^T)^-1`` are all that the
-kernels need.
+so that derivatives of the pixel by the compensated bearing times ``(I - k g^T)^-1`` are all that
+the kernels need.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn, find_turn
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 # Image points that nearly keep pace with the rows.
 _LEAST_PACE = 0.1
@@ -26,7 +26,7 @@ _LEAST_PACE = 0.1
 _LEAST_FRONT = 1e-3
 
 
-def steadied(
+def gyro_compensated(
     rays: Array, tau: Array, by_ray: Array, gradient: Array, turn: KnownTurn
 ) -> tuple[Array, Array]:
     """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, with a known turn taken out.
@@ -37,12 +37,12 @@ def steadied(
         by_ray: (n,2,2) derivatives of the raw pixels by the rays.
         gradient: (2,) of the row time by the pixel.
     """
-    found: tuple[Array, Array] = _steadied(rays, tau, by_ray, gradient, *turn.spline)
+    found: tuple[Array, Array] = _gyro_compensated(rays, tau, by_ray, gradient, *turn.spline)
     return found
 
 
 @kernel
-def _steadied(
+def _gyro_compensated(
     rays: Array, tau: Array, by_ray: Array, gradient: Array,
     times: Array, cubics: Array, rotations: Array, parabola: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
@@ -66,7 +66,7 @@ def _steadied(
             by_turned[i] = np.nan
             continue
         turned[i, 0], turned[i, 1] = u / w, v / w
-        # The ray by the steadied one.
+        # The ray by the compensated one.
         for j in range(2):
             step[0, j] = w * (rotation[0, j] - x * rotation[2, j])
             step[1, j] = w * (rotation[1, j] - y * rotation[2, j])

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import resource
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from rs_localizer.core.lanes import jit
+from rs_localizer.core.simd import jit
 
 PACKAGE = Path(jit.__file__).parents[2]
 KERNEL = """
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 @kernel
 def double(x):
@@ -33,6 +35,7 @@ Load = Callable[[], Any]
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(jit, "_said", set())
+    jit.open_to_others.cache_clear()
     return tmp_path / "cache"
 
 
@@ -151,6 +154,51 @@ def test_a_kernel_is_compiled_with_one_that_comes_from_the_cache(load: Load, cac
     assert "8doubling6double" not in "".join(line for line in code.splitlines() if " call " in line)
 
 
+@pytest.mark.parametrize("shared", ["cache", "rs_localizer", "digest", "kernels"])
+def test_a_cache_that_others_can_write_is_not_used(
+    load: Load, monkeypatch: pytest.MonkeyPatch, shared: str
+) -> None:
+    """Numba unpickles what is there: whoever writes it runs code in this process."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:  # pytest's own is nobody else's
+        Path(folder).chmod(0o755)
+        monkeypatch.setenv("XDG_CACHE_HOME", f"{folder}/cache")
+        check_shared(load, Path(folder) / "cache", shared)
+
+
+def check_shared(load: Load, cache: Path, shared: str) -> None:
+    load()(1.5)
+    kernels = files(cache, ".nbc")[0].parent
+    assert {path.stat().st_mode & 0o777 for path in (kernels, kernels.parent)} == {0o700}
+    folders = [cache, cache / "rs_localizer", kernels.parent, kernels]
+    for folder in folders:
+        folder.chmod(0o755)
+    folders[["cache", "rs_localizer", "digest", "kernels"].index(shared)].chmod(0o777)
+    before = files(cache, ".nbi")[0].read_bytes()
+    jit.open_to_others.cache_clear()
+    compiled = load()
+    with pytest.warns(RuntimeWarning, match="not used, since other users can write to"):
+        assert compiled(1.5) == 3.0
+    assert compiled(2) == 4.0  # said once
+    assert hits(compiled) == 0
+    assert files(cache, ".nbi")[0].read_bytes() == before
+    cache.chmod(0o700)  # nobody else gets there
+    jit.open_to_others.cache_clear()
+    again = load()
+    assert again(1.5) == 3.0
+    assert hits(again) == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_a_cache_of_another_user_is_not_used(load: Load, cache: Path) -> None:
+    load()(1.5)
+    os.chown(cache / "rs_localizer", 65534, 65534)
+    jit.open_to_others.cache_clear()
+    compiled = load()
+    with pytest.warns(RuntimeWarning, match="not used"):
+        assert compiled(1.5) == 3.0
+    assert hits(compiled) == 0
+
+
 def test_a_folder_that_cannot_be_made_is_a_warning(load: Load, cache: Path) -> None:
     cache.write_text("a file in its place")
     compiled = load()
@@ -166,7 +214,7 @@ def test_a_kernel_is_compiled_anew_when_one_that_it_calls_changes(
     inner = package / "matching" / "deep" / "inner.py"
     (package / "matching" / "outer.py").write_text(
         "from changing.matching.deep.inner import inner\n"
-        "from rs_localizer.core.lanes.jit import kernel\n\n"
+        "from rs_localizer.core.simd.jit import kernel\n\n"
         "@kernel\ndef outer(x):\n    return 10.0 * inner(x)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
@@ -174,7 +222,7 @@ def test_a_kernel_is_compiled_anew_when_one_that_it_calls_changes(
 
     def outer(change: str) -> Any:
         inner.write_text(
-            "from rs_localizer.core.lanes.jit import kernel\n\n"
+            "from rs_localizer.core.simd.jit import kernel\n\n"
             f"@kernel\ndef inner(x):\n    return x + {change}\n"
         )
         jit._digest.cache_clear()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rs_localizer.core.lanes.simd import Vector, select, sqrt
+from rs_localizer.core.simd.tracing import Vector, select, sqrt
 
 
 def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:

@@ -4,9 +4,9 @@ import numba
 import numpy as np
 import pytest
 
-from rs_localizer.core.lanes.eigenvalues import real_eigenvalues, reduce_to_hessenberg
-from rs_localizer.core.lanes.simd import LANES
-from rs_localizer.core.lanes.vectors import lane_array
+from rs_localizer.core.simd.eigenvalues import real_eigenvalues, reduce_to_hessenberg
+from rs_localizer.core.simd.tracing import LANES
+from rs_localizer.core.simd.vectors import lane_array
 
 
 @numba.njit
