@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -111,7 +112,9 @@ def _is_reason(name: str) -> bool:
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.0f}" if value == round(value) else f"{value:.3g}"
+    if value is None or math.isnan(value):
+        return ""
+    return f"{value:.0f}" if value == round(value) else f"{value:.3g}"
 
 
 def _draw(rows: Mapping[str, Row], file: Path) -> None:

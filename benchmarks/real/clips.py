@@ -97,7 +97,7 @@ def opencv_lens(clip: Clip, images: list[Observed] | None = None) -> Camera:
     picks = np.unique(np.linspace(0, len(chosen) - 1, _CALIBRATION_IMAGES).astype(int))
     points = [np.asarray(chosen[k].points, np.float32) for k in picks]
     pixels = [np.asarray(chosen[k].pixels, np.float32) for k in picks]
-    _, K, D, _, _ = cv2.calibrateCamera(points, pixels, clip.size, None, None)  # type: ignore[call-overload]
+    _, K, D, _, _ = cv2.calibrateCamera(points, pixels, clip.size, None, None)
     return Camera(width=clip.size[0], height=clip.size[1], K=K, D=np.asarray(D).ravel()[:5])
 
 

@@ -47,7 +47,7 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: LocalizerConfig) 
         for reason, count in Counter(str(x.reason) for x in poses[name] if not x).items():
             row[f"{name}_{reason}"] = count
     found = [one for name in METHODS for one in poses[name] if one]
-    row["lens_notices"] = float(np.mean([one.lens is not None for one in found] or [0.0]))
+    row["lens_notices"] = float(np.mean([one.lens is not None for one in found] or [False]))
     row["solvepnp_localized"] = sum(_solve_pnp(lens, image) for image in whole)
     for name in METHODS:
         row |= {f"{name}_{key}": x for key, x in _jitter(clip, poses[name], poses["p3p"]).items()}
