@@ -12,8 +12,7 @@ from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
-from rs_localizer.simulation.imu_recording import make_imu
+from rs_localizer.simulation.imu import ImuSettings, Lever, make_imu, simulate_imu
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.evaluation.palette import BLUE, ORANGE
+from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.mapping.build import Built
 from rs_localizer.mapping.views import View

@@ -31,8 +31,8 @@ from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.simulation.image_sequence import in_order
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.rooms import marked_room
 from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.walls import marked_room
 
 
 @dataclass(frozen=True, slots=True)

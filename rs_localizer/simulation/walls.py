@@ -1,20 +1,68 @@
-"""Scenes of textured planes around the way of a simulated camera, built to be looked at."""
+"""Scenes of textured planes around the path of a simulated camera, built to be looked at."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.io.video import Image
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap, wall
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.simulation.planes import TexturedPlane
-from rs_localizer.simulation.textures import collage
 from rs_localizer.simulation.true_motion import TrueState
+
+# Shapes per square of this many texels, of all sizes between a few texels and a few hundred.
+_SHAPES_PER = 9000
+_SMALLEST, _LARGEST = 6.0, 400.0
+# Fine grain (standard deviation of a grey level) and its sizes in texels.
+_GRAIN = ((1, 6.0), (4, 8.0), (32, 10.0))
+
+
+def collage(width: int, height: int, rng: np.random.Generator) -> Image:
+    """Rectangles, discs and letters of all sizes and greys over each other, with some grain.
+
+    The same generator state gives the same picture (height, width).
+    """
+    picture = np.full((height, width), 128, np.uint8)
+    count = max(20, width * height // _SHAPES_PER)
+    # Large ones first, or they would cover the rest.
+    sizes = np.sort(np.exp(rng.uniform(np.log(_SMALLEST), np.log(_LARGEST), count)))[::-1]
+    for size in sizes.tolist():
+        middle = rng.uniform((0.0, 0.0), (width, height))
+        _draw_shape(picture, middle.tolist(), size, int(rng.integers(10, 246)), rng)
+    grey = picture.astype(np.float32)
+    for step, deviation in _GRAIN:
+        grain = rng.standard_normal((height // step + 2, width // step + 2)).astype(np.float32)
+        grown = cv2.resize(grain, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+        grey += deviation * grown[:height, :width]
+    return np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8)
+
+
+def _draw_shape(
+    picture: Image, middle: list[float], size: float, grey: int, rng: np.random.Generator
+) -> None:
+    x, y = (int(value) for value in middle)
+    kind, angle = rng.integers(3), float(rng.uniform(0.0, 180.0))
+    if kind == 0:
+        extent = (size, size * float(rng.uniform(0.2, 1.0)))
+        box = cv2.boxPoints(((x, y), extent, angle))
+        cv2.fillPoly(picture, [np.rint(box).astype(np.int32)], grey, cv2.LINE_AA)
+    elif kind == 1:
+        axes = (max(1, int(0.5 * size)), max(1, int(0.5 * size * rng.uniform(0.4, 1.0))))
+        cv2.ellipse(picture, (x, y), axes, angle, 0.0, 360.0, grey, -1, cv2.LINE_AA)
+    else:
+        letter = chr(int(rng.integers(ord("A"), ord("Z") + 1)))
+        cv2.putText(
+            picture, letter, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size / 22.0, grey,
+            max(1, int(size / 9.0)), cv2.LINE_AA,
+        )  # fmt: skip
+
 
 _FAMILY = "4x4_250"  # few cells: the largest that a far or slanted marker can show
 # Texels along a cell of a marker: corners lie between texels, so that nothing is rounded.
@@ -156,3 +204,54 @@ def _picture(
     return TexturedPlane(
         axes @ corner, axes @ right, axes @ np.asarray(down), _PICTURE_TEXEL, texture
     )
+
+
+# Texels along a cell of a marker: corners lie between texels, so that nothing is rounded.
+_POSTER_TEXELS = 14
+# Where along a wall its markers hang, in shares of its width.
+_PLACES = (0.3, 0.7)
+_PAPER, _INK = 235, 26
+
+
+def marked_room(way: TrueState) -> Scene:
+    """The room of :func:`rs_localizer.simulation.walls.room` with two markers on each wall.
+
+    Floor and ceiling have none.
+    """
+    bare = room(way)
+    middle = way.positions.mean(axis=0)
+    planes, markers = list[TexturedPlane](), list[Marker]()
+    for plane in bare.planes:
+        if abs(plane.normal[2]) > 0.5:
+            planes.append(plane)
+            continue
+        texture = plane.texture.copy()
+        for share in _PLACES:
+            markers.append(_hang(texture, plane, share, len(markers), middle))
+        planes.append(replace(plane, texture=texture))
+    return Scene(tuple(planes), MarkerMap(tuple(markers)))
+
+
+SCENES = {"three": three_walls, "poster": poster, "room": room, "marked_room": marked_room}
+"""All scenes by name, the first one unless another is wanted."""
+
+
+def _hang(texture: Image, plane: TexturedPlane, share: float, number: int, viewer: Array) -> Marker:
+    """Draw a marker into the picture of a plane; the marker."""
+    drawn = family(_FAMILY)
+    side = drawn.cells * _POSTER_TEXELS
+    sheet = side + 2 * _POSTER_TEXELS
+    white = np.pad(pattern(drawn, number), 1, constant_values=True)
+    cells = np.where(white, _PAPER, _INK).astype(np.uint8)
+    paper = cells.repeat(_POSTER_TEXELS, axis=0).repeat(_POSTER_TEXELS, axis=1)
+    # From inside the room, half of the walls are read from behind.
+    mirrored = float(plane.normal @ (viewer - plane.corner)) > 0.0
+    height, width = texture.shape
+    upright = abs(plane.down[2]) > 0.5
+    along, across = (share * width, 0.5 * height) if upright else (0.5 * width, share * height)
+    left, top = round(along - 0.5 * sheet), round(across - 0.5 * sheet)
+    texture[top : top + sheet, left : left + sheet] = paper[:, ::-1] if mirrored else paper
+    centre = plane.points(np.array([[left + 0.5 * sheet, top + 0.5 * sheet]]))[0]
+    right, up = (-plane.right if mirrored else plane.right), -plane.down
+    pose = Pose(centre, np.column_stack([right, up, np.cross(right, up)]))
+    return Marker.at(_FAMILY, number, side * plane.texel, pose)

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.trajectory.online_kernels import SIDE, Equations
 

@@ -21,15 +21,15 @@ from rs_localizer.evaluation.comparison import (
     counts_at,
     load_recording,
     predicted_pixels,
+    table,
     true_rates,
 )
-from rs_localizer.evaluation.comparison_pictures import (
+from rs_localizer.evaluation.plots import (
     error_picture,
     inlier_picture,
     residual_picture,
     trajectory_picture,
 )
-from rs_localizer.evaluation.comparison_table import table
 
 MIDDLE_NS = 15_000_000
 

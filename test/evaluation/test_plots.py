@@ -7,7 +7,7 @@ import pytest
 
 from rs_localizer.evaluation import plots
 from rs_localizer.evaluation.metrics import Errors
-from rs_localizer.evaluation.palette import BLUE, ORANGE
+from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.io.trajectories import Trajectory
 
 COUNT = 200

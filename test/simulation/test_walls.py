@@ -10,14 +10,13 @@ from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.renderer import Renderer
-from rs_localizer.simulation.rooms import SCENES
 from rs_localizer.simulation.true_motion import (
     ConstantVelocity,
     RecordedMotion,
     TrueState,
     sampled_way,
 )
-from rs_localizer.simulation.walls import three_walls
+from rs_localizer.simulation.walls import SCENES, three_walls
 
 CAMERA = Camera(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
 STILL = np.zeros(3)
