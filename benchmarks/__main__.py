@@ -72,6 +72,7 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
 # All experiments with so many trials take about a quarter of an hour on two cores.
 _TRIALS = 2000
 _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
+  frames                           regions, errors and times of frames; two versions compared
   honesty, mapping                 single benches, and single conditions of them
   mapped_room, room_by_imu         maps of rendered rooms, by markers and by an IMU
   fuzzing                          wrong input for everything that reads

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from benchmarks.frames.judged import REGION, Judged, far_off
+from benchmarks.frames.judged import REGION, Judged, far_off, quantile, sharpness
 from benchmarks.independent.rotations import Array
 
 BoolArray = NDArray[np.bool_]
@@ -188,11 +188,9 @@ def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
         del row["not>5s"]
         some = joined.localized
         for name, figure in _ERRORS.items():
-            row[name] = float(np.nanmedian(joined.of(figure)[some]))
+            row[name] = quantile(joined.of(figure)[some], 0.5)
         for name in ("turn_s", "turn", "way", "angular", "linear"):
-            values = joined.of(name)[some]
-            known = values[np.isfinite(values)]
-            row[f"s_{name}"] = float(np.sqrt(2.366 / np.median(known))) if len(known) else np.nan
+            row[f"s_{name}"] = sharpness(joined.of(name)[some])
         row["ms"] = float(np.mean(joined.of("ms")))
         found[bench] = row
     return found

@@ -64,7 +64,7 @@ def generate(condition: Condition, frames: int, seed: int) -> Iterator[Frame]:
     if condition.sequence.length == 1:
         recordings = frames
     else:
-        recordings = max(_FEWEST, -(-frames // (last - first)))
+        recordings = max(min(_FEWEST, frames), -(-frames // (last - first)))
     made = _simulated(
         condition.camera,
         condition.motion,

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.honesty.estimating import Found
-from benchmarks.honesty.scores import Score, Scores, Truth, score
+from benchmarks.honesty.scores import Score, Scores, Truth, percent, score
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
@@ -145,3 +145,28 @@ def _truths(recording: Path) -> dict[int, Truth]:
             strict=True,
         )
     }
+
+
+COLUMNS = (
+    "condition", "frames", "pose@stamp", "pose@mid", "twist@stamp", "twist@mid",
+    "over_5_sigma", "deg@stamp", "deg@mid", "mm@stamp", "mm@mid", "deg/s@mid", "m/s@mid",
+    "refused", "reasons",
+)  # fmt: skip
+
+
+def row(name: str, found: Found) -> tuple[str | float | int, ...]:
+    """Shares in %, medians of the errors."""
+    stamp, middle = found.stamp, found.middle
+    return (
+        name,
+        len(middle),
+        *(percent(scores.inside("pose")) for scores in (stamp, middle)),
+        *(percent(scores.inside("twist")) for scores in (stamp, middle)),
+        max(percent(scores.far_off()) for scores in (stamp, middle)),
+        *(scores.median("orientation") for scores in (stamp, middle)),
+        *(1e3 * scores.median("position") for scores in (stamp, middle)),
+        middle.median("angular"),
+        middle.median("linear"),
+        100.0 * middle.refused,
+        middle.reasons(),
+    )

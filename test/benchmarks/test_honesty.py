@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments.results import Verdict
 from benchmarks.honesty import __main__ as command
-from benchmarks.honesty import claims, coverage
+from benchmarks.honesty import against_p3p, claims
 from benchmarks.honesty.benches import Recordings, benches
 from benchmarks.honesty.estimating import Found
 from benchmarks.honesty.scores import Score, Scores, Truth, normalised, score
@@ -64,12 +64,51 @@ def test_too_small_and_too_large_covariances_are_seen(wider: float, verdict: Ver
     assert judged == {"honesty.rendered_pose": verdict, "honesty.rendered_twist": verdict}
 
 
+def test_few_frames_decide_nothing() -> None:
+    some = scores(40, 1.0)
+    (claim, _) = claims.rendered_claims({"x/all": Found(some, some)})
+    assert claim.verdict is Verdict.UNDECIDED
+
+
 def test_one_bad_condition_among_many_is_seen() -> None:
     good, bad = scores(400, 1.0), scores(60, 0.1)
     found = {f"good {k}": Found(good, good) for k in range(20)} | {"bad": Found(bad, bad)}
     claim = claims.rendered_claims(found)[0]
     assert claim.verdict is Verdict.NOT_HELD
     assert "bad" in claim.finding
+
+
+def pair(ours: np.ndarray, p3p: np.ndarray) -> against_p3p.Pair:
+    def of(errors: np.ndarray) -> Scores:
+        return Scores(
+            [
+                Score(k, "residual") if np.isinf(error) else Score(k, orientation=error, moving=1.0)
+                for k, error in enumerate(errors)
+            ]
+        )
+
+    return against_p3p.Pair(of(ours), of(p3p))
+
+
+@pytest.mark.parametrize(
+    ("factor", "verdict"), [(0.7, Verdict.HELD), (1.5, Verdict.NOT_HELD), (1.08, Verdict.UNDECIDED)]
+)
+def test_p3p_is_compared_frame_by_frame(factor: float, verdict: Verdict) -> None:
+    rng = np.random.default_rng(0)
+    p3p = rng.exponential(size=300)
+    ours = factor * p3p * rng.uniform(0.8, 1.2, 300)
+    judged = {c.name: c.verdict for c in claims.p3p_claims({"board/0ms/x": pair(ours, p3p)})}
+    assert judged["honesty.p3p_median"] is verdict
+    assert judged["honesty.p3p_refused"] is Verdict.HELD
+    assert judged["honesty.global_shutter"] is Verdict.HELD
+
+
+def test_more_refusals_than_p3ps_are_seen() -> None:
+    ours, p3p = np.ones(100), np.ones(100)
+    ours[:20], p3p[20:22] = np.inf, np.inf
+    judged = {c.name: c for c in claims.p3p_claims({"board/0ms/x": pair(ours, p3p)})}
+    assert judged["honesty.p3p_refused"].verdict is Verdict.NOT_HELD
+    assert "20 and 2 refused" in judged["honesty.p3p_refused"].finding
 
 
 def test_a_covariance_that_denies_an_error_is_infinitely_wrong() -> None:
@@ -79,10 +118,20 @@ def test_a_covariance_that_denies_an_error_is_infinitely_wrong() -> None:
     assert normalised(np.array([3.0, 4.0, 0.0]), np.diag([1.0, 4.0, 1.0])) == pytest.approx(13.0)
 
 
+def test_conditions_have_names_of_their_own() -> None:
+    for bench in BENCHES.values():
+        names = [condition.name for condition in bench.conditions]
+        assert len(set(names)) == len(names)
+    chosen = BENCHES["p3p"].matching(["board", "lens 10%", "bend 0mm", "0.1px", "5ms"])
+    faults = "board/lens 10% bend 0mm/0.1px/5ms"
+    assert [one.name for one in chosen] == [
+        f"{faults}/{told}" for told in ("unset", "set", "tracked")
+    ]
+
+
 @pytest.mark.bench
-@pytest.mark.parametrize("name", ["coverage", "p3p", "vibration", "few", "many", "planes"])
-def test_a_condition_of_each_bench(name: str) -> None:
-    bench = BENCHES[name]
+def test_a_condition_against_p3p() -> None:
+    bench = BENCHES["p3p"]
     condition = bench.conditions[-1]
     ((found, result),) = bench.run([condition], 5, 0)
     row = bench.row(found, result)
@@ -90,20 +139,23 @@ def test_a_condition_of_each_bench(name: str) -> None:
     assert row[:2] == (condition.name, 5)
 
 
-@pytest.mark.bench
-def test_at_rest_before_a_rich_scene_all_is_well() -> None:
-    found = coverage.measure(coverage.Condition("rest", "rich", 1.0, False), 60, 0)
-    assert np.mean(found.middle.inside("pose")) > 0.85
-    assert found.middle.refused == 0.0
-
-
 def test_the_command(tmp_path: Path, capsys, monkeypatch) -> None:
-    words = ["honesty", "planes", "--only", "1m at 2m", "tilt 60", "0deg", "--frames", "3"]
+    words = [
+        "honesty",
+        "p3p",
+        "--only",
+        "markers",
+        "lens 30%",
+        "0.5px",
+        "30ms/set",
+        "--frames",
+        "3",
+    ]
     monkeypatch.setattr(sys, "argv", [*words, "--csv", str(tmp_path)])
     assert command.main() == 0
-    assert "1m at 2m/tilt 60/0deg" in capsys.readouterr().out
-    with (tmp_path / "planes.csv").open() as file:
+    assert "markers/lens 30% bend 0mm/0.5px/30ms/set" in capsys.readouterr().out
+    with (tmp_path / "p3p.csv").open() as file:
         assert len(list(csv.reader(file))) == 2
-    monkeypatch.setattr(sys, "argv", ["honesty", "planes", "--only", "nowhere"])
+    monkeypatch.setattr(sys, "argv", ["honesty", "p3p", "--only", "nowhere"])
     assert command.main() == 2
     assert "no condition" in capsys.readouterr().err

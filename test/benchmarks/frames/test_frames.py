@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from benchmarks.frames.conditions import (
 )
 from benchmarks.frames.generated import generate
 from benchmarks.frames.judged import FIGURES, Judged, camera_of, configured, judge, normalised
+from benchmarks.frames.timed import calls_of, in_turns
 from benchmarks.independent.rotations import logarithm
 from benchmarks.independent.scenes import Rich, SmallPlane
 
@@ -176,6 +178,29 @@ def test_a_hand_before_a_rich_scene_is_honest() -> None:
     row = one.row(CONDITION)
     assert min(float(row[name]) for name in ("pose@stamp", "pose@mid", "twist@mid")) > 80.0
     assert 0.5 < float(row["sharp_turn"]) < 2.5
+
+
+def test_times_are_taken_in_turns_and_calls_are_counted() -> None:
+    frames = list(generate(CONDITION, 2, 0))
+    done: list[str] = []
+
+    def work(name: str, seconds: float) -> None:
+        done.append(name)
+        end = time.process_time() + seconds
+        while time.process_time() < end:
+            pass
+
+    spent = in_turns([lambda _: work("a", 0.02), lambda _: work("b", 0.06)], frames, 3)
+    assert done == ["a", "b"] * 7
+    assert 2.0 < np.sum(spent[1]) / np.sum(spent[0]) < 4.0
+    localizer = rsl.Localizer(camera_of(CONDITION, 0))
+    calls, kernels, files = calls_of(
+        lambda frame: localizer.localize(frame.points, frame.pixels), frames
+    )
+    assert calls > 3
+    assert kernels > 3
+    assert 3 < files <= calls + kernels
+    assert calls_of(lambda frame: normalised(frame.points[0], np.eye(3)), frames) == (0, 0, 0)
 
 
 def test_the_commands(tmp_path, capsys) -> None:
