@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 
 import pytest
-from benchmarks.experiments.table import EXPERIMENTS
 
+from benchmarks.__main__ import EXPERIMENTS
 from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.experiments import augmented_reality, readout_time
 from benchmarks.experiments.results import Context, Result, Verdict
