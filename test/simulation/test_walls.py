@@ -14,7 +14,7 @@ from rs_localizer.simulation.true_motion import (
     ConstantVelocity,
     RecordedMotion,
     TrueState,
-    sampled_way,
+    sampled_states,
 )
 from rs_localizer.simulation.walls import SCENES, three_walls
 
@@ -24,7 +24,7 @@ STILL = np.zeros(3)
 
 @pytest.fixture(scope="module")
 def way() -> TrueState:
-    return sampled_way(RecordedMotion(read_tum(data.path(data.HAND_MOTION))), 0.5)
+    return sampled_states(RecordedMotion(read_tum(data.path(data.HAND_MOTION))), 0.5)
 
 
 def pixels(corners: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -63,11 +63,11 @@ def detect(image: np.ndarray, dictionary: object) -> dict[int, np.ndarray]:
 @pytest.mark.parametrize("name", list(SCENES))
 def test_every_scene_shows_something_before_the_camera(name: str) -> None:
     motion = ConstantVelocity(np.array([0.0, 0.5, 0.0]), np.array([0.3, 0.0, 0.0]), 1.0)
-    scene = SCENES[name](sampled_way(motion))
+    scene = SCENES[name](sampled_states(motion))
     image = Renderer(CAMERA, scene.planes).image(motion, 0)
     corners = cv2.goodFeaturesToTrack(image, 300, 0.02, 5)
     assert len(corners) > 100
     assert (scene.marker_map is not None) == (name in ("three", "marked_room"))
-    again = SCENES[name](sampled_way(motion))
+    again = SCENES[name](sampled_states(motion))
     for plane, same in zip(scene.planes, again.planes, strict=True):
         np.testing.assert_array_equal(plane.texture, same.texture)
