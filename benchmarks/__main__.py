@@ -72,12 +72,14 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
 # All experiments with so many trials take about a quarter of an hour on two cores.
 _TRIALS = 2000
 _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
+  frames                           regions, errors and times of frames; two versions compared
   honesty, mapping                 single benches, and single conditions of them
   mapped_room, room_by_imu         maps of rendered rooms, by markers and by an IMU
   fuzzing                          wrong input for everything that reads
   profiling, frame_times           where the time of a frame goes
   load, load.signals               a live node under load, and stopped at random moments
   image_flight, marker_flight      rendered flights through live nodes and through commands
+  signals                          commands that are stopped at random moments
   fusion                           estimates in the filter of robot_localization
 """
 

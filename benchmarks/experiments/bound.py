@@ -17,7 +17,7 @@ from benchmarks.experiments.uncertainty import Interval, quantile, share
 from benchmarks.experiments.views import GROSS, Outcome, outcome, synthetic_views
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
-from rs_localizer.evaluation.palette import BLUE, ORANGE
+from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 _REGION = 0.95

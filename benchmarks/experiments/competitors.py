@@ -10,8 +10,6 @@ import numpy as np
 
 from benchmarks.experiments.stopwatch import Subject
 from benchmarks.experiments.trials import Trials, camera
-from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
 
 
 def poselib() -> ModuleType | None:
@@ -46,34 +44,4 @@ def p3p_subjects(trials: Trials) -> dict[str, Subject]:
                 module.p3p(bearing, points)
 
         subjects["PoseLib p3p"] = Subject(with_poselib, len(trials))
-    return subjects
-
-
-def poselib_camera(view: Camera) -> dict[str, object]:
-    """A camera without distortion as PoseLib takes it."""
-    return {
-        "model": "PINHOLE",
-        "width": view.width,
-        "height": view.height,
-        "params": [view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]],
-    }
-
-
-def robust_subjects(view: Camera, points: Array, pixels: Array, label: str) -> dict[str, Subject]:
-    """Global-shutter RANSAC of a frame."""
-    subjects = {
-        f"OpenCV solvePnPRansac, {label}": Subject(
-            lambda: cv2.solvePnPRansac(
-                points, pixels, view.K, None, iterationsCount=1000, reprojectionError=2.0
-            ),
-            1,
-        )
-    }
-    module = poselib()
-    if module is not None:
-        model = poselib_camera(view)
-        options = {"max_reproj_error": 2.0, "max_iterations": 1000}
-        subjects[f"PoseLib estimate_absolute_pose, {label}"] = Subject(
-            lambda: module.estimate_absolute_pose(pixels, points, model, options, {}), 1
-        )
     return subjects

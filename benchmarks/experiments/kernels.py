@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 from rs_localizer.estimation.packing import pack, weighted
 from rs_localizer.estimation.prior_terms import PriorTerms

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import hat
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.solvers.batch import MODEL_SIZE

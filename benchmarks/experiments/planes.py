@@ -22,7 +22,7 @@ from rs_localizer.core.state import rotation_of
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.prior_terms import motion_terms
-from rs_localizer.evaluation.palette import BLUE, ORANGE
+from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 
 # 10 degrees and 0.1 m in a readout of 30 ms, which is assumed without one.

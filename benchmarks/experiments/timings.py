@@ -1,4 +1,4 @@
-"""What everything costs: per minimal problem, per frame, and until the first pose."""
+"""What minimal problems cost, and the first pose; frames: ``python -m benchmarks.frames times``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.experiments.competitors import p3p_subjects
-from benchmarks.experiments.frame_timings import (
-    ALL_SAMPLES,
-    FRAME,
-    OUTLIERS,
-    frame_subjects,
-)
-from benchmarks.experiments.median_frame import examine_frames, frame_claims, frame_note
 from benchmarks.experiments.results import Claim, Context, Result, Statement, Table
 from benchmarks.experiments.startup import Startup, cold_and_warm
 from benchmarks.experiments.stopwatch import Subject, interleaved, ratio
@@ -54,7 +47,6 @@ _BUDGETS = (
     Budget("r9p", 1, 0.60, 0.35, 20.0),
     Budget("r6p", 1, 14.0, 9.0, 1700.0),
 )
-_ALL_SAMPLES_AT_MOST = 5.0  # ms
 _COMPILE_AT_MOST, _FIRST_POSE_AT_MOST = 40.0, 1.5  # s
 
 
@@ -64,17 +56,12 @@ def run(context: Context) -> Result:
     unlimited = SOLVERS.keys() - {budget.solver for budget in _BUDGETS}
     budgets = [*_BUDGETS, *(Budget(name, 1) for name in SOLVERS if name in unlimited)]
     minimal = interleaved(_minimal_subjects(budgets, context.seed), repeats, context.track)
-    frame = interleaved(frame_subjects(context.seed), repeats, context.track)
-    medians = {name: float(np.median(times)) for name, times in (minimal | frame).items()}
     startup = None
     if context.trials >= _TRIALS_FOR_STARTUP:
         startup = cold_and_warm()
     rows = [_row(budget, minimal) for budget in budgets]
     claims = [_cost(budget, minimal) for budget in budgets if np.isfinite(budget.at_most)]
     claims.append(_faster_than_paper(rows))
-    claims.append(_all_samples(frame[ALL_SAMPLES]))
-    found = examine_frames(context)
-    claims += frame_claims(found)
     claims += _startup_claims(startup)
     return Result(
         "Timings",
@@ -86,12 +73,8 @@ def run(context: Context) -> Result:
         "call from Python each. The paper's times are those of its Table 1 (2.5 GHz i7), per "
         "iteration.",
         claims,
-        {
-            "timings": Table(_COLUMNS, rows),
-            "timings_frame": Table(("subject", "us"), list(medians.items())),
-            "timings_median_frame": found.table(),
-        },
-        notes=[_text(rows, minimal, frame, startup), frame_note(found)],
+        {"timings": Table(_COLUMNS, rows)},
+        notes=[_text(rows, minimal, startup)],
     )
 
 
@@ -189,21 +172,6 @@ def _faster_than_paper(rows: list[tuple[str | float | int, ...]]) -> Claim:
     )
 
 
-def _all_samples(times: Array) -> Claim:
-    milliseconds = float(np.median(times)) / 1000.0
-    return Statement(
-        "timings.all_samples",
-        "this project",
-        f"all 1000 hypotheses on {FRAME.points} points, {OUTLIERS:.0%} of them outliers, are cheap",
-        "drawn, solved, scored and the best optimised, without stopping early, in at most "
-        f"{_ALL_SAMPLES_AT_MOST:g} ms",
-    ).judged(
-        f"{milliseconds:.1f} ms",
-        milliseconds <= _ALL_SAMPLES_AT_MOST,
-        "the machine had other work, or is of another kind",
-    )
-
-
 def _startup_claims(startup: tuple[Startup, Startup] | None) -> list[Claim]:
     if startup is None:
         return []
@@ -234,7 +202,6 @@ def _startup_claims(startup: tuple[Startup, Startup] | None) -> list[Claim]:
 def _text(
     rows: list[tuple[str | float | int, ...]],
     minimal: Mapping[str, Array],
-    frame: Mapping[str, Array],
     startup: tuple[Startup, Startup] | None,
 ) -> str:
     """The tables as they are printed."""
@@ -257,11 +224,6 @@ def _text(
         f"{name:26}{np.median(minimal[name]):9.3f}{'':34}"
         f"{ratio(minimal[name], minimal[_REFERENCE]):9.3f}"
         for name in others
-    ]
-    lines += [
-        "",
-        f"{f'ms per frame, {FRAME.points} points, {OUTLIERS:.0%} outliers':50}",
-        *(f"{name:50}{np.median(times) / 1000.0:9.3f}" for name, times in frame.items()),
     ]
     if startup is not None:
         cold, warm = startup

@@ -16,7 +16,7 @@ from benchmarks.experiments.uncertainty import IntArray, Interval, bootstrap
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.evaluation.palette import BLUE, ORANGE
+from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.localizer import Localizer
 from rs_localizer.simulation.frames import (

@@ -1,4 +1,4 @@
-"""The commands: ``python -m benchmarks.frames run`` and ``compare``.
+"""The commands: ``python -m benchmarks.frames run``, ``compare`` and ``times``.
 
 Another version of the package is judged by the same benches from any other folder:
 
@@ -26,6 +26,7 @@ import yaml
 from benchmarks.frames.compared import compare
 from benchmarks.frames.conditions import BENCHES, Condition, conditions
 from benchmarks.frames.judged import Judged, judge
+from benchmarks.frames.timed import times
 
 _SHOWN = {
     "frames": "frames", "localized": "loc", "pose@stamp": "pose@s", "pose@mid": "pose@m",
@@ -64,6 +65,10 @@ def _parser() -> argparse.ArgumentParser:
     against.add_argument("--plot", type=Path, metavar="FILE.png")
     against.add_argument("--all", action="store_true", help="also conditions that hardly differ")
     against.set_defaults(command=compare)
+    timed = commands.add_parser("times", help="CPU time beside PoseLib's, and calls of a frame")
+    timed.add_argument("--frames", type=int, default=20, metavar="N", help="of a condition (20)")
+    timed.add_argument("--rounds", type=int, default=7, metavar="N", help="of each frame (7)")
+    timed.set_defaults(command=times)
     return parser
 
 

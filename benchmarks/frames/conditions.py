@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.data import SLOW_HAND_MOTION
 from benchmarks.independent import motions
 from benchmarks.independent.cameras import Camera, Scan
 from benchmarks.independent.motions import Moving
 from benchmarks.independent.scenes import Board, Rich, Scene, SmallPlane, Wall
+from rs_localizer import data
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class Calibration:
     centre: float = 0.0  # px
     focal: float = 0.0  # share
     distortion: float = 0.0  # share that is missing
+    boards: int = 0  # views of a chessboard that it was found from; 0: it was not
     readout_time: float | None = None  # s; None: right
     scan: Scan | None = None
 
@@ -112,18 +117,13 @@ def turning(degrees: float) -> Motion:
     return moving("steady", rate=np.radians(degrees) / readout, speed=0.01 * degrees / readout)
 
 
-def _recorded(file: str) -> Callable[..., Moving]:
-    def make(count: int, rng: np.random.Generator) -> Moving:
-        from rs_localizer import data
-
-        return motions.Recorded(np.loadtxt(data.path(f"motion/{file}")), count, rng, around=0.5)
-
-    return make
+def _recorded(file: Path, count: int, rng: np.random.Generator) -> Moving:
+    return motions.Recorded(np.loadtxt(file), count, rng, around=0.5)
 
 
 RECORDED = {
-    "recorded_hand": _recorded("tum_vi_room5.txt.gz"),
-    "recorded_slow": _recorded("tum_rgbd_fr1_xyz.txt.gz"),
+    "recorded_hand": partial(_recorded, data.path(data.HAND_MOTION)),
+    "recorded_slow": partial(_recorded, SLOW_HAND_MOTION),
 }
 
 
@@ -134,26 +134,35 @@ def conditions() -> Iterator[Condition]:
             yield Condition(bench, name, motion, scene, noise, **(others[0] if others else {}))
 
 
+def named(name: str) -> Condition:
+    """The condition ``bench/name``."""
+    (found,) = (one for one in conditions() if f"{one.bench}/{one.name}" == name)
+    return found
+
+
 def _hand() -> Iterator[tuple[Any, ...]]:
     for n, wrong, noise in product((20, 50, 150), (0.0, 0.3, 0.5), (0.1, 0.3, 1.0, 3.0)):
         if n * (1.0 - wrong) >= _FEWEST_INLIERS:
             name = f"{n}points/{wrong:.0%}wrong/{noise:g}px"
             yield name, HAND, Rich(n), noise, {"points": Points(wrong=wrong)}
-    for scene, noise in product(("wall", "rich"), (0.1, 0.3, 1.0)):
-        seen = Wall() if scene == "wall" else Rich()
-        yield f"{scene}/{noise:g}px/tracked", HAND, seen, noise, {"sequence": TRACKED}
-    for noise in (0.1, 0.3, 1.0):
-        yield f"wall/{noise:g}px", HAND, Wall(), noise
 
 
-def _rest() -> Iterator[tuple[Any, ...]]:
-    for (name, scene), noise, tracked in product(
-        (("rich", Rich(50)), ("wall", Wall(50)), ("small", SmallPlane()), ("board", Board())),
-        (0.1, 1.0, 3.0),
-        (False, True),
+def _grid() -> Iterator[tuple[Any, ...]]:
+    moves = {
+        "rest": REST,
+        "hand": HAND,
+        "drone": moving("vibration", degrees=0.1, hertz=20.0),
+        # Within the second of the five counted frames, so that what follows it counts as well.
+        "stop": moving("sudden_stop", earliest=0.0, latest=0.03),
+    }
+    scenes: dict[str, Scene] = {
+        "rich": Rich(), "wall": Wall(), "plane": SmallPlane(), "board": Board()
+    }  # fmt: skip
+    for (name, motion), (where, scene), noise, tracked in product(
+        moves.items(), scenes.items(), (0.05, 0.3, 1.0, 3.0), (False, True)
     ):
-        label = f"{name}/{noise:g}px{'/tracked' * tracked}"
-        yield label, REST, scene, noise, {"sequence": TRACKED if tracked else SINGLE}
+        label = f"{name}/{where}/{noise:g}px{'/tracked' * tracked}"
+        yield label, motion, scene, noise, {"sequence": TRACKED if tracked else SINGLE}
 
 
 def _few() -> Iterator[tuple[Any, ...]]:
@@ -240,9 +249,6 @@ def _impacts() -> Iterator[tuple[Any, ...]]:
         # Before the first of the frames that count.
         hit = moving("struck", degrees=degrees, earliest=-0.02, latest=0.04)
         yield f"{degrees:g}deg/{noise:g}px/tracked", hit, Rich(), noise, {"sequence": TRACKED}
-    for noise in (0.1, 0.3, 1.0):
-        stop = moving("sudden_stop", earliest=0.0, latest=0.03)
-        yield f"stop/{noise:g}px/tracked", stop, Rich(), noise, {"sequence": TRACKED}
 
 
 def _real() -> Iterator[tuple[Any, ...]]:
@@ -281,6 +287,7 @@ def _camera() -> Iterator[tuple[Any, ...]]:
         "focal 0.3%": Calibration(focal=0.003),
         "lens 10%": Calibration(distortion=0.1),
         "lens 30%": Calibration(distortion=0.3),
+        "ten boards": Calibration(boards=10),
     }
     for (error, calibration), scene, noise, tracked in product(
         errors.items(), ("rich", "wall"), (0.3, 1.0), (False, True)
@@ -349,7 +356,7 @@ def _global() -> Iterator[tuple[Any, ...]]:
 
 BENCHES: dict[str, Callable[[], Iterator[tuple[Any, ...]]]] = {
     "hand": _hand,
-    "rest": _rest,
+    "grid": _grid,
     "few": _few,
     "many": _many,
     "planes": _planes,

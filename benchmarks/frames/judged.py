@@ -15,7 +15,7 @@ from scipy.stats import chi2, norm
 
 import rs_localizer as rsl
 from benchmarks.frames.conditions import EXACT, Condition
-from benchmarks.frames.generated import Frame, Gyroscope, generate
+from benchmarks.frames.generated import Frame, Gyroscope, calibrated, generate
 from benchmarks.independent.rotations import Array, logarithm
 from rs_localizer.pipeline.moments import pose_at, twist_at
 
@@ -52,37 +52,39 @@ class Judged:
     def localized(self) -> NDArray[np.bool_]:
         return np.array([not reason for reason in self.reasons])
 
+    def inside(self, name: str) -> NDArray[np.bool_]:
+        """Of the localized frames (k,), which truths lie in a 95 % region: pose_s, pose, twist."""
+        held: NDArray[np.bool_] = self.of(name)[self.localized] < REGION
+        return held
+
     def row(self, condition: Condition) -> Row:
         """A line of the table; shares in %, of the frames with a pose."""
         some = self.localized
 
         def share(hits: NDArray[np.bool_]) -> float:
-            return 100.0 * float(np.mean(hits[some])) if some.any() else math.nan
+            return 100.0 * float(np.mean(hits)) if len(hits) else math.nan
 
-        def quantile(name: str, q: float) -> float:
-            values = self.of(name)[some & np.isfinite(self.of(name))]
-            return float(np.quantile(values, q)) if len(values) else math.nan
-
-        inside = {name: self.of(name) < REGION for name in ("pose_s", "pose", "twist")}
         twists = np.isfinite(self.of("deg/s")[some]).any()
         return {
             "bench": condition.bench,
             "condition": condition.name,
             "frames": len(some),
             "localized": 100.0 * float(np.mean(some)),
-            "pose@stamp": share(inside["pose_s"]),
-            "pose@mid": share(inside["pose"]),
-            "twist@mid": share(inside["twist"]) if twists else math.nan,
-            "inside_or_refused": 100.0 * float(np.mean(inside["pose"] | ~some)),
-            "over_5_sigma": share(far_off(self)),
+            "pose@stamp": share(self.inside("pose_s")),
+            "pose@mid": share(self.inside("pose")),
+            "twist@mid": share(self.inside("twist")) if twists else math.nan,
+            "inside_or_refused": 100.0 * float(np.mean((self.of("pose") < REGION) | ~some)),
+            "over_5_sigma": share(far_off(self)[some]),
             **{
-                f"{name}_50": quantile(name, 0.5) for name in ("deg_s", "deg", "mm", "deg/s", "m/s")
+                f"{name}_50": quantile(self.of(name), 0.5)
+                for name in ("deg_s", "deg", "mm", "deg/s", "m/s")
             },
-            **{f"{name}_95": quantile(name, 0.95) for name in ("deg", "mm", "deg/s", "m/s")},
             **{
-                f"sharp_{name}": math.sqrt(quantile(name, 0.5) / _MEDIAN) ** -1
-                if quantile(name, 0.5) > 0.0
-                else math.nan
+                f"{name}_95": quantile(self.of(name), 0.95)
+                for name in ("deg", "mm", "deg/s", "m/s")
+            },
+            **{
+                f"sharp_{name}": sharpness(self.of(name))
                 for name in ("turn_s", "turn", "way", "angular", "linear")
             },
             "ms": float(np.mean(self.of("ms"))),
@@ -91,6 +93,18 @@ class Judged:
                 for reason, count in Counter(filter(None, self.reasons)).most_common()
             ),
         }
+
+
+def quantile(values: Array, q: float) -> float:
+    """Of the known ones; NaN of none."""
+    known = values[~np.isnan(values)]
+    return float(np.quantile(known, q)) if len(known) else math.nan
+
+
+def sharpness(squared: Array) -> float:
+    """Claimed over actual deviation, from squared normalised errors of three dimensions."""
+    median = quantile(squared, 0.5)
+    return math.sqrt(_MEDIAN / median) if median > 0.0 else math.nan
 
 
 def far_off(judged: Judged) -> NDArray[np.bool_]:
@@ -107,7 +121,9 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     own = dict(condition.settings) | dict(settings)
     # As users are told: the final inliers may miss by twice the threshold, 3.5 deviations have to.
     own.setdefault("inlier_threshold", max(2.0, 2.0 * condition.noise))
-    config = configured(rsl.LocalizerConfig(), own, condition.calibration == EXACT)
+    # All keypoints off together are like a principal point that is off.
+    exact = condition.calibration == EXACT and not condition.points.shift
+    config = configured(rsl.LocalizerConfig(), own, exact)
     variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
     localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]
     trackers = [rsl.Tracker(one) for one in localizers] if condition.sequence.length > 1 else None
@@ -145,14 +161,17 @@ def camera_of(condition: Condition, variant: int) -> rsl.Camera:
     """What the user believes of the camera."""
     true, off = condition.camera, condition.calibration
     direction = _DIRECTIONS[variant]
-    matrix = true.matrix.copy()
+    if off.boards:
+        matrix, distortion = calibrated(true, off.boards, variant)
+    else:
+        matrix, distortion = true.matrix, (1.0 - off.distortion) * np.array(true.distortion)
     matrix[:2, 2] += off.centre * direction
     matrix[[0, 1], [0, 1]] *= 1.0 + off.focal * math.copysign(1.0, direction[0])
     return rsl.Camera(
         width=true.width,
         height=true.height,
         K=matrix,
-        D=(1.0 - off.distortion) * np.array(true.distortion),
+        D=distortion,
         distortion_model="plumb_bob",
         readout_time=true.readout_time if off.readout_time is None else off.readout_time,
         scan_direction=str(off.scan or true.scan),

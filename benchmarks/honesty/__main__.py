@@ -1,6 +1,6 @@
 """Single benches, or single conditions of them, for who works on the estimator:
 
-python -m benchmarks.honesty coverage --only hand rich --frames 100
+python -m benchmarks.honesty p3p --only board 0.1px --frames 100
 python -m benchmarks.honesty rendered --cache ~/rendered
 """
 
@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
-from benchmarks.experiments.results import Table
 from benchmarks.honesty.benches import Bench, Recordings, benches
-from benchmarks.honesty.picture import Shares, picture, shares_at_stamp
 from benchmarks.honesty.text import heading, line
 from rs_localizer import data
 from rs_localizer.process.arguments import integer
 
-_NAMES = ("coverage", "p3p", "vibration", "few", "many", "lens", "planes", "tags", "rendered")
+_NAMES = ("p3p", "tags", "rendered")
 
 
 def main() -> int:
@@ -33,7 +31,7 @@ def main() -> int:
     parser.add_argument("names", nargs="+", metavar="BENCH", choices=_NAMES, help=", ".join(_NAMES))
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="WORD",
-        help="conditions with all of these words in their names, such as: hand rich 0.05px tracked",
+        help="conditions with all of these words in their names, such as: board 0.1px 5ms unset",
     )  # fmt: skip
     parser.add_argument(
         "--frames", type=integer(1), default=100, metavar="N",
@@ -45,11 +43,6 @@ def main() -> int:
         help="where corners detected in rendered images are kept (default: nowhere)",
     )  # fmt: skip
     parser.add_argument("--csv", type=Path, metavar="DIR", help="write the tables there, too")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the coverage")
-    parser.add_argument(
-        "--before", type=Path, metavar="FILE",
-        help="coverage.csv of another version, which --picture shows beside this one",
-    )  # fmt: skip
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         recordings = Recordings(
@@ -82,20 +75,7 @@ def _run(name: str, bench: Bench[Any, Any], options: argparse.Namespace) -> int:
         options.csv.mkdir(parents=True, exist_ok=True)
         with (options.csv / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([bench.columns, *rows])
-    if name == "coverage" and options.picture is not None:
-        before = None if options.before is None else _shares(_read(options.before))
-        picture(_shares(Table(bench.columns, rows)), before).savefig(options.picture)
     return 0
-
-
-def _shares(table: Table) -> dict[str, Shares]:
-    return {part: shares_at_stamp(table, part) for part in ("pose", "twist")}
-
-
-def _read(path: Path) -> Table:
-    with path.open(newline="", encoding="utf-8") as file:
-        columns, *rows = csv.reader(file)
-    return Table(tuple(columns), rows)
 
 
 if __name__ == "__main__":

@@ -10,14 +10,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from benchmarks.honesty import (
     against_p3p,
-    coverage,
-    few_points,
-    lens,
-    many_points,
     rendered,
-    small_planes,
     tags,
-    vibration,
 )
 from benchmarks.honesty.estimating import Found
 
@@ -79,23 +73,13 @@ def benches(recordings: Recordings) -> dict[str, Bench[Any, Any]]:
         trajectory = recordings.trajectories[condition.motion]
         return rendered.measure(condition, trajectory, recordings.folder, seconds)
 
-    regions = (coverage.COLUMNS, coverage.row)
     return {
-        "coverage": Bench(
-            "Regions", coverage.conditions(), coverage.measure, *regions
-        ),
         "p3p": Bench(
             "Against P3P", against_p3p.conditions(), against_p3p.measure, against_p3p.COLUMNS,
             against_p3p.row,
         ),
-        "vibration": Bench("Vibration", vibration.conditions(), vibration.measure, *regions),
-        "few": Bench("Few points, shaken", few_points.conditions(), few_points.measure, *regions),
-        "lens": Bench("A lens that is off", lens.conditions(), lens.measure, *regions),
-        "many": Bench("Many points", many_points.conditions(), many_points.measure, *regions),
-        "planes": Bench(
-            "Small planes", small_planes.conditions(), small_planes.measure,
-            small_planes.COLUMNS, small_planes.row,
-        ),
         "tags": Bench("Tags", tags.conditions(), replay_tags, tags.COLUMNS, tags.row),
-        "rendered": Bench("Rendered walls", rendered.conditions(), replay_rendered, *regions),
+        "rendered": Bench(
+            "Rendered walls", rendered.conditions(), replay_rendered, rendered.COLUMNS, rendered.row
+        ),
     }  # fmt: skip

@@ -14,73 +14,18 @@ import numpy as np
 from benchmarks.experiments.results import Claim, Statement
 from benchmarks.experiments.uncertainty import IntArray, Interval, share, together
 from benchmarks.honesty.against_p3p import MOST_RATIO, Pair
-from benchmarks.honesty.coverage import MOTIONS
 from benchmarks.honesty.estimating import Found
 from benchmarks.honesty.scores import Scores, percent
-from benchmarks.honesty.small_planes import GROSS
 from benchmarks.honesty.tags import Replayed
 from rs_localizer.core.arrays import BoolArray
 
 _SOURCE = "this project"
-_MOST_FAR_OFF = 0.01
 _LEAST_INSIGNIFICANT = 0.93
-_HOLD, _HOLD_ROUGHLY, _HOLD_PLANES = (0.92, 0.98), (0.90, 1.0), (0.90, 0.99)
-# Without a limit above, regions may hold more than they promise: at rest velocities are shrunk to
-# what happens to be the truth, and what shakes or stops no model of one readout follows.
-_OF_MOTION = {
-    "rest": (0.92, 1.0),
-    "hand": _HOLD,
-    "drone": _HOLD_ROUGHLY,
-    "stop": _HOLD_ROUGHLY,
-}
+_HOLD = (0.92, 0.98)
 _PARTS = {"pose": "poses", "twist": "twists"}
 
 Hits = Mapping[str, tuple[BoolArray, IntArray]]
 """Of each condition, whether something was so in each frame, and the frame's recording."""
-
-
-def coverage_claims(found: Mapping[str, Found]) -> list[Claim]:
-    """Regions and gross errors, motion by motion."""
-    claims = []
-    for motion in MOTIONS:
-        of_motion = {name: one for name, one in found.items() if name.startswith(f"{motion}/")}
-        claims += [
-            _regions(f"honesty.{motion}_{part}", f"{motion}: 95 % regions of {noun}", part,
-                     of_motion, _OF_MOTION[motion])
-            for part, noun in _PARTS.items()
-        ]  # fmt: skip
-    return [*claims, _far_off("honesty.five_sigma", "on all of these motions", found)]
-
-
-def vibration_claims(found: Mapping[str, Found]) -> list[Claim]:
-    """Regions hold or frames are refused."""
-    what = "shaken by 0.1 to 1 deg at 5 to 200 Hz: 95 % regions of published poses"
-    return [
-        _regions("honesty.vibration", what, "pose", found, _HOLD_ROUGHLY),
-        _far_off("honesty.vibration_five_sigma", "of a shaken camera", found),
-    ]
-
-
-def plane_claims(found: Mapping[str, Found]) -> list[Claim]:
-    """Regions and gross errors before small planes."""
-    what = "small planes far away: 95 % regions of poses"
-    gross = sum(
-        int(np.count_nonzero(one.middle.of("orientation")[one.middle.localized] > GROSS))
-        for one in found.values()
-    )
-    total = sum(len(one.middle) for one in found.values())
-    return [
-        _regions("honesty.planes", what, "pose", found, _HOLD_PLANES),
-        Statement(
-            "honesty.planes_gross",
-            _SOURCE,
-            "small planes far away: no pose is wrong by far",
-            f"none off by more than {GROSS:g} deg",
-        ).judged(
-            f"{gross} of {total} frames",
-            gross == 0,
-        ),
-    ]
 
 
 def p3p_claims(found: Mapping[str, Pair]) -> list[Claim]:
@@ -177,20 +122,6 @@ def _regions(
         for condition, scores in _at_both_moments(found)
     }
     return _family(name, f"{what} hold", "they hold the truth in", hits, limits)
-
-
-def _far_off(name: str, where: str, found: Mapping[str, Found]) -> Claim:
-    hits = {
-        condition: (scores.far_off(), scores.groups())
-        for condition, scores in _at_both_moments(found)
-    }
-    return _family(
-        name,
-        f"hardly a pose is off by five of its own standard deviations, {where}",
-        "off by more in",
-        hits,
-        (0.0, _MOST_FAR_OFF),
-    )
 
 
 def _at_both_moments(found: Mapping[str, Found]) -> Iterator[tuple[str, Scores]]:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.honesty.estimating import Found
-from benchmarks.honesty.scores import Score, Scores, Truth, score
+from benchmarks.honesty.scores import Score, Scores, Truth, percent, score
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
@@ -30,7 +30,7 @@ from rs_localizer.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.simulation.image_sequence import in_order
 from rs_localizer.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC, write_truth
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import three_walls
 
 MOTIONS = {"tum_vi_room5": "forward_left_up", "tum_rgbd_fr1_xyz": "optical"}
@@ -87,7 +87,7 @@ def _render(trajectory: Path, axes: str, recording: Path, seconds: float) -> Non
         for stamp in frame_stamps(motion, camera, _RATE)
         if stamp < first + round(seconds * 1e9)
     ]
-    scene = three_walls(sampled_way(motion))
+    scene = three_walls(sampled_states(motion))
     assert scene.marker_map is not None
     renderer = Renderer(camera, scene.planes, _SENSOR)
     detector = MarkerDetector(scene.marker_map)
@@ -145,3 +145,28 @@ def _truths(recording: Path) -> dict[int, Truth]:
             strict=True,
         )
     }
+
+
+COLUMNS = (
+    "condition", "frames", "pose@stamp", "pose@mid", "twist@stamp", "twist@mid",
+    "over_5_sigma", "deg@stamp", "deg@mid", "mm@stamp", "mm@mid", "deg/s@mid", "m/s@mid",
+    "refused", "reasons",
+)  # fmt: skip
+
+
+def row(name: str, found: Found) -> tuple[str | float | int, ...]:
+    """Shares in %, medians of the errors."""
+    stamp, middle = found.stamp, found.middle
+    return (
+        name,
+        len(middle),
+        *(percent(scores.inside("pose")) for scores in (stamp, middle)),
+        *(percent(scores.inside("twist")) for scores in (stamp, middle)),
+        max(percent(scores.far_off()) for scores in (stamp, middle)),
+        *(scores.median("orientation") for scores in (stamp, middle)),
+        *(1e3 * scores.median("position") for scores in (stamp, middle)),
+        middle.median("angular"),
+        middle.median("linear"),
+        100.0 * middle.refused,
+        middle.reasons(),
+    )

@@ -172,7 +172,7 @@ def _few_points(context: Context) -> Step:
                 f"inertial.few-{few}",
                 US,
                 f"{few} right matches among as many wrong ones are enough for the solver that is "
-                "there (r6p_vcwt on steadied bearings)",
+                "there (r6p_vcwt on compensated bearings)",
                 "at least 95 % of the frames within 1 deg",
             ).judged(
                 f"{share:.0f} % (alone {percent(right(alone)):.0f} %)",

@@ -21,6 +21,7 @@ from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.evaluation.calibration_plots import save_plots
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration.files import read_calibration, write_calibration
 from rs_localizer.io.camera_info import read_camera_info
@@ -217,15 +218,18 @@ def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Sou
 
 def _write(found: Calibration, path: Path, intrinsics: bool, config: NodeConfig) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(
-        "/**:\n  ros__parameters:\n"
-        f"    readout_time: {verdict.readout_time(found)!r}\n"
-        f"    readout_time_deviation: {found.deviation!r}\n"
-        f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config),
-        encoding="utf-8",
-    )
-    print(f"written: {path}")
-    if intrinsics:
-        lens = path.with_name(f"{path.stem}_camera_info.yaml")
-        write_calibration(lens, found.fit.camera)
-        print(f"written: {lens}")
+    lens = path.with_name(f"{path.stem}_camera_info.yaml")
+    files = (path, lens) if intrinsics else (path,)
+    with atomic_files(*files) as (part, *lens_part):
+        part.write_text(
+            "/**:\n  ros__parameters:\n"
+            f"    readout_time: {verdict.readout_time(found)!r}\n"
+            f"    readout_time_deviation: {found.deviation!r}\n"
+            f"    scan_direction: {verdict.scan_direction(found)}\n"
+            + imu_parameters(found, config),
+            encoding="utf-8",
+        )
+        if lens_part:
+            write_calibration(lens_part[0], found.fit.camera)
+    for file in files:
+        print(f"written: {file}")

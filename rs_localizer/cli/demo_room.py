@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
-from rs_localizer.evaluation import figures
-from rs_localizer.evaluation.comparison import Recording, Result, compare
-from rs_localizer.evaluation.comparison_table import table
+from rs_localizer.evaluation import plots
+from rs_localizer.evaluation.comparison import Recording, Result, compare, table
 from rs_localizer.evaluation.map_pictures import localized_picture
 from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
 from rs_localizer.io.estimates import Motions
@@ -142,7 +141,7 @@ def play_room(
         )
     results = {names[name]: compare(answers[name], recording.truth) for name in methods}
     print(f"\n{table('A room mapped without markers', recording, results)}", flush=True)
-    figures.save(room.picture(recording, results), out / ROOM)
+    plots.save(room.picture(recording, results), out / ROOM)
     print(out / ROOM)
 
 

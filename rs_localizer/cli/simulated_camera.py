@@ -22,8 +22,8 @@ from rs_localizer.simulation.true_motion import (
     ConstantVelocity,
     RecordedMotion,
     TrueMotion,
+    shaken,
 )
-from rs_localizer.simulation.vibration import shaken
 
 # A still hand is no example: without any motion given, the camera turns and walks like this.
 _ANGULAR_VELOCITY = (0.0, 1.0, 0.0)

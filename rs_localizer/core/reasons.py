@@ -19,6 +19,7 @@ class Reason(StrEnum):
     MIRRORED = "mirrored"
     MODEL_ERROR = "model_error"
     UNCERTAIN = "uncertain"
+    SCAN_AXIS = "scan_axis"
     # Messages that cannot be used, or not yet.
     NO_CAMERA_INFO = "no_camera_info"
     BAD_CAMERA_INFO = "bad_camera_info"
@@ -47,6 +48,7 @@ class ImuReason(StrEnum):
     GAP = "imu_gap"
     TOO_SLOW = "imu_too_slow"
     SATURATED = "imu_saturated"
+    TWO_FRAMES = "imu_two_frames"
     NO_TRANSFORM = "imu_no_transform"
     NO_READOUT_TIME = "imu_no_readout_time"
     NOT_TRACKING = "imu_not_tracking"

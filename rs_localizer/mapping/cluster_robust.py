@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.trajectory.fit import Fit, steepness
 from rs_localizer.trajectory.normal_kernels import border_of
 from rs_localizer.trajectory.problem import Problem

@@ -64,6 +64,12 @@ REASONS: dict[str, Meaning] = {
         "come nearer, use a larger board or markers on several walls; leave tracking on, give the "
         "velocity_prior of a slow camera, or raise the limit where a filter weighs each pose",
     ),
+    Reason.SCAN_AXIS: Meaning(
+        "the shutter moves over the columns, not the rows, or the other way about: scan_direction "
+        "names the wrong axis",
+        "set scan_direction to the direction that the message names; a driver that rotates images "
+        "rotates the scan, too",
+    ),
     Reason.NO_CAMERA_INFO: Meaning(
         "no usable camera_info came before it", "is it recorded, is its topic the right one?"
     ),
@@ -128,6 +134,10 @@ IMU_REASONS: dict[str, Meaning] = {
     ),
     ImuReason.SATURATED: Meaning(
         "the camera turns faster than the gyroscope can tell", "a larger range of the gyroscope"
+    ),
+    ImuReason.TWO_FRAMES: Meaning(
+        "messages on imu come with two frame_ids in turns",
+        "two IMUs, or two drivers, publish on one topic: remap one of them",
     ),
     ImuReason.NO_TRANSFORM: Meaning(
         "TF does not say how the IMU is turned against the camera",

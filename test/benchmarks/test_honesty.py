@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments.results import Verdict
 from benchmarks.honesty import __main__ as command
-from benchmarks.honesty import against_p3p, claims, coverage
+from benchmarks.honesty import against_p3p, claims
 from benchmarks.honesty.benches import Recordings, benches
 from benchmarks.honesty.estimating import Found
-from benchmarks.honesty.picture import picture
 from benchmarks.honesty.scores import Score, Scores, Truth, normalised, score
 from rs_localizer.io.outputs import Pose, Twist
 
@@ -123,13 +122,16 @@ def test_conditions_have_names_of_their_own() -> None:
     for bench in BENCHES.values():
         names = [condition.name for condition in bench.conditions]
         assert len(set(names)) == len(names)
-    chosen = BENCHES["coverage"].matching(["hand", "rich", "3px"])
-    assert [one.name for one in chosen] == ["hand/rich/3px/single", "hand/rich/3px/tracked"]
+    chosen = BENCHES["p3p"].matching(["board", "lens 10%", "bend 0mm", "0.1px", "5ms"])
+    faults = "board/lens 10% bend 0mm/0.1px/5ms"
+    assert [one.name for one in chosen] == [
+        f"{faults}/{told}" for told in ("unset", "set", "tracked")
+    ]
 
 
-@pytest.mark.parametrize("name", ["coverage", "p3p", "vibration", "few", "many", "planes"])
-def test_a_condition_of_each_bench(name: str) -> None:
-    bench = BENCHES[name]
+@pytest.mark.bench
+def test_a_condition_against_p3p() -> None:
+    bench = BENCHES["p3p"]
     condition = bench.conditions[-1]
     ((found, result),) = bench.run([condition], 5, 0)
     row = bench.row(found, result)
@@ -137,27 +139,23 @@ def test_a_condition_of_each_bench(name: str) -> None:
     assert row[:2] == (condition.name, 5)
 
 
-def test_at_rest_before_a_rich_scene_all_is_well() -> None:
-    found = coverage.measure(coverage.Condition("rest", "rich", 1.0, False), 60, 0)
-    assert np.mean(found.middle.inside("pose")) > 0.85
-    assert found.middle.refused == 0.0
-
-
-def test_every_condition_has_a_place_in_the_picture() -> None:
-    shares = {condition.name: 90.0 for condition in coverage.conditions()}
-    drawn = picture({"pose": shares, "twist": shares}, {"pose": shares, "twist": shares})
-    assert len(drawn.axes) == 2 * len(coverage.MOTIONS)
-    for axes in drawn.axes:
-        assert len(axes.lines) == 2 * len(coverage.SCENES)
-
-
 def test_the_command(tmp_path: Path, capsys, monkeypatch) -> None:
-    words = ["honesty", "planes", "--only", "1m at 2m", "tilt 60", "0deg", "--frames", "3"]
+    words = [
+        "honesty",
+        "p3p",
+        "--only",
+        "markers",
+        "lens 30%",
+        "0.5px",
+        "30ms/set",
+        "--frames",
+        "3",
+    ]
     monkeypatch.setattr(sys, "argv", [*words, "--csv", str(tmp_path)])
     assert command.main() == 0
-    assert "1m at 2m/tilt 60/0deg" in capsys.readouterr().out
-    with (tmp_path / "planes.csv").open() as file:
+    assert "markers/lens 30% bend 0mm/0.5px/30ms/set" in capsys.readouterr().out
+    with (tmp_path / "p3p.csv").open() as file:
         assert len(list(csv.reader(file))) == 2
-    monkeypatch.setattr(sys, "argv", ["honesty", "planes", "--only", "nowhere"])
+    monkeypatch.setattr(sys, "argv", ["honesty", "p3p", "--only", "nowhere"])
     assert command.main() == 2
     assert "no condition" in capsys.readouterr().err

@@ -108,6 +108,21 @@ def test_faults_are_one_line_and_an_exit_code(
     assert capsys.readouterr().err.endswith(text)
 
 
+def test_names_cannot_steer_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(arguments: argparse.Namespace) -> None:
+        sys.stdout.write("frame \x1b]0;title\x07 \x9b2J\n\tä\n")
+        raise ValueError("no topic \x1b[2J")
+
+    command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
+    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
+    assert main(["replay"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "frame \\x1b]0;title\\x07 \\x9b2J\n\tä\n"
+    assert captured.err == "rs_localizer replay: no topic \\x1b[2J\n"
+
+
 def test_a_fault_in_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(arguments: argparse.Namespace) -> None:
         raise TypeError("a bug")
@@ -151,14 +166,14 @@ def test_sigterm_ends_a_running_command_in_one_line(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
     )
-    while not (tmp_path / "bag").exists():
+    while not list(tmp_path.glob(".unfinished-*/bag")):
         assert process.poll() is None
         time.sleep(0.02)
     time.sleep(0.5)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (143, "rs_localizer simulate: interrupted\n")
-    assert not (tmp_path / "bag").exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path: Path) -> None:
@@ -170,7 +185,7 @@ def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path: Path) -
         stderr=subprocess.PIPE,
         text=True,
     )
-    while not (tmp_path / "bag").exists():
+    while not list(tmp_path.glob(".unfinished-*/bag")):
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)

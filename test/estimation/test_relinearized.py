@@ -5,7 +5,7 @@ import pytest
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.lanes.simd import LANES
+from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Motion
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.observing import find_usable, packed

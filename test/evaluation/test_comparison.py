@@ -21,15 +21,15 @@ from rs_localizer.evaluation.comparison import (
     counts_at,
     load_recording,
     predicted_pixels,
+    table,
     true_rates,
 )
-from rs_localizer.evaluation.comparison_pictures import (
+from rs_localizer.evaluation.plots import (
     error_picture,
     inlier_picture,
     residual_picture,
     trajectory_picture,
 )
-from rs_localizer.evaluation.comparison_table import table
 
 MIDDLE_NS = 15_000_000
 
@@ -152,26 +152,6 @@ def test_predicted_pixels_move_with_the_rows() -> None:
     static = Answer(0, 0.0, 0, np.zeros(3), start.as_quat(), None, None, np.zeros(0))
     expected = project(camera, points, start, np.zeros(3))
     np.testing.assert_allclose(predicted_pixels(camera, static, points), expected, atol=1e-9)
-
-
-def test_long_names_stand_in_two_lines(recording: Recording) -> None:
-    found = compare(answers(recording, moving=True, shift=0.0), recording.truth)
-    lines = table("Title", recording, {"one": found, "P3P (one pose per image)": found})
-    first, second, third, *_ = lines.splitlines()
-    assert first.split() == ["Title", "one", "P3P", "(one", "pose"]
-    assert second.split() == ["per", "image)"]
-    assert third.split() == ["frames", "30", "30"]
-    assert max(map(len, lines.splitlines())) <= 80
-
-
-def test_picture_and_table_have_the_same_median_of_inliers(recording: Recording) -> None:
-    half = dict(list(answers(recording, moving=True, shift=0.0).items())[:10])
-    results = {"one": compare(half, recording.truth)}
-    median = np.median(results["one"].inlier_counts)
-    assert median > 0.0
-    figure = inlier_picture(recording, results, np.full(30, 105.0))
-    labels = figure.axes[0].get_legend_handles_labels()[1]
-    assert f"one: median {median:.3g}" in labels
 
 
 @pytest.mark.parametrize(("residual", "enlarged"), [(0.11, "500"), (3.0, "20"), (700.0, "0.1")])

@@ -10,8 +10,7 @@ from PIL import Image as Pillow
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.evaluation.animation import gif, side_by_side
-from rs_localizer.evaluation.cube import corner_pixels, cube_on, draw_cube
+from rs_localizer.evaluation.cube_clip import corner_pixels, cube_on, draw_cube, gif, side_by_side
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 

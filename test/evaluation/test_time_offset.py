@@ -7,9 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
-from rs_localizer.evaluation.alignment import aligned
-from rs_localizer.evaluation.metrics import angles_between
-from rs_localizer.evaluation.time_offset import estimate_offset, interpolated, shifted
+from rs_localizer.evaluation.metrics import (
+    aligned,
+    angles_between,
+    estimate_offset,
+    interpolated,
+    shifted,
+)
 from rs_localizer.io.trajectories import Trajectory, read_tum
 
 

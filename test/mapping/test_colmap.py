@@ -15,7 +15,7 @@ from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.io.calibration.colmap import colmap_camera, colmap_parameters
 from rs_localizer.mapping import MappingError, colmap
 from rs_localizer.mapping.colmap import Effort, build_structure, image_name, pairs_of
-from rs_localizer.simulation.textures import collage
+from rs_localizer.simulation.walls import collage
 
 K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
 

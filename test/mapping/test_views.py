@@ -13,7 +13,7 @@ from rs_localizer.io.images import Image
 from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.build import check_views, choose_keyframes
 from rs_localizer.mapping.views import Looker, View, blurred, sharpness
-from rs_localizer.simulation.textures import collage
+from rs_localizer.simulation.walls import collage
 
 PICTURE = collage(900, 700, np.random.default_rng(0))
 

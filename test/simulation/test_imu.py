@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
-from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion
-from rs_localizer.simulation.vibration import Shaken, shaken
+from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, Shaken, shaken
 
 PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 CAMERA_FROM_IMU = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True).as_matrix()

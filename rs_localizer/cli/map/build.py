@@ -22,6 +22,7 @@ from rs_localizer.config import FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.evaluation.map_pictures import save_pictures
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.calibration.files import write_calibration
 from rs_localizer.io.images import Image
@@ -30,7 +31,6 @@ from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.topics import IMU
 from rs_localizer.io.trajectories import Trajectory, write_tum
-from rs_localizer.io.whole import whole
 from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
 from rs_localizer.mapping.colmap import Effort, require
@@ -269,19 +269,19 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else _marker_map(args.markers)
     shutter, imu = shutter_of(args), imu_of(args)
-    with whole(args.out):
-        args.out.mkdir(parents=True)
-        with TemporaryDirectory(dir=args.out) as images:
+    with atomic_directory(args.out) as out:
+        out.mkdir()
+        with TemporaryDirectory(dir=out) as images:
             looked = look_at_images(args, Looker(args.max_keypoints, Path(images), markers))
             anchors = Anchors(markers, looked.points, tuple(args.distance))
             given = Given(
                 looked.views, looked.camera, anchors, shutter.readout_time,
                 shutter.scan_direction, MAP_FRAME if markers is None else markers.map_frame, imu,
             )  # fmt: skip
-            folder = args.out / COLMAP
+            folder = out / COLMAP
             folder.mkdir()
             built = build_map(given, Workshop(folder, Effort(args.threads, args.seed), _stage))
-        _write(args.out, built, looked)
+        _write(out, built, looked)
     _tell(args, built, looked)
 
 

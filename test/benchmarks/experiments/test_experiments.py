@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 
 import pytest
-from benchmarks.experiments.table import EXPERIMENTS
 
+from benchmarks.__main__ import EXPERIMENTS
 from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.experiments import augmented_reality, readout_time
 from benchmarks.experiments.results import Context, Result, Verdict
-from benchmarks.honesty import against_p3p, coverage
+from benchmarks.honesty import against_p3p
 from benchmarks.inertial import experiment as inertial
 from rs_localizer import data
 
@@ -109,17 +109,12 @@ OPEN = {
     # Where the camera hardly moves, a single frame is taken for one at rest, with no velocity; a
     # tracked one knows better that it is not, and errs by what it does not know.
     "tracking.rich",
-    *(f"honesty.{case}_pose" for case in ("rest", "hand", "drone", "stop", "rendered")),
-    *(f"honesty.{case}_twist" for case in ("rest", "hand", "drone", "stop", "rendered")),
-    "honesty.five_sigma",
+    "honesty.rendered_pose",
+    "honesty.rendered_twist",
     "honesty.p3p_median",
     "honesty.p3p_95",
     "honesty.p3p_refused",
     "honesty.global_shutter",
-    "honesty.vibration",
-    "honesty.vibration_five_sigma",
-    "honesty.planes",
-    "honesty.planes_gross",
     "honesty.tags_jitter",
     "honesty.tags_velocities",
     "motion.r9p_gauge",
@@ -185,7 +180,6 @@ def result(name: str) -> Result:
     with pytest.MonkeyPatch.context() as patch:
         # Of some 500 conditions even a single frame takes long.
         patch.setattr(against_p3p, "conditions", some(against_p3p.conditions, 9))
-        patch.setattr(coverage, "conditions", some(coverage.conditions, 5))
         # The least that is taken for a result is too much here.
         patch.setattr(augmented_reality, "_LEAST_FRAMES", 20)
         patch.setattr(readout_time, "_LEAST", 4)
@@ -194,6 +188,7 @@ def result(name: str) -> Result:
         return EXPERIMENTS[name](context)
 
 
+@pytest.mark.bench
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
 def test_verdicts(name: str) -> None:
     claims = {claim.name: claim for claim in result(name).claims}
@@ -210,6 +205,7 @@ def test_verdicts(name: str) -> None:
     assert wrong == []
 
 
+@pytest.mark.bench
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
 def test_everything_is_said_and_shown(name: str) -> None:
     found = result(name)
@@ -225,12 +221,3 @@ def test_everything_is_said_and_shown(name: str) -> None:
         assert {len(row) for row in table.rows} == {len(table.columns)}
     for figure in found.figures.values():
         assert all(axes.lines for axes in figure.axes)
-
-
-def test_every_solver_is_timed() -> None:
-    from rs_localizer.solvers.table import SOLVERS
-
-    timed = {row[0] for row in result("timings").tables["timings"].rows}
-    assert timed == set(SOLVERS)
-    for row in result("timings").tables["timings"].rows:
-        assert all(value > 0.0 for value in row[2:6])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import rs_localizer as rsl
 from benchmarks.frames import __main__ as command
-from benchmarks.frames.compared import changes_of, read, totals
+from benchmarks.frames.compared import changes_of, changes_together, read, totals
 from benchmarks.frames.conditions import (
     BENCHES,
     HAND,
@@ -18,10 +19,12 @@ from benchmarks.frames.conditions import (
     Condition,
     Points,
     conditions,
+    named,
     turning,
 )
 from benchmarks.frames.generated import generate
 from benchmarks.frames.judged import FIGURES, Judged, camera_of, configured, judge, normalised
+from benchmarks.frames.timed import calls_of, in_turns
 from benchmarks.independent.rotations import logarithm
 from benchmarks.independent.scenes import Rich, SmallPlane
 
@@ -88,6 +91,17 @@ def test_refusals_count_and_frames_of_a_recording_are_one() -> None:
     assert totals({"a/x": every, "b/y": fewer})["all"]["localized"] == 90.0
 
 
+def test_small_changes_are_certain_of_many_conditions_together() -> None:
+    before = {f"a/{k}": judged(40, seed=k) for k in range(30)}
+    after = {f"a/{k}": judged(40, wider=0.8, farther=1.05, seed=k) for k in range(30)}
+    changes = {name: changes_of(before[name], after[name]) for name in before}
+    together = changes_together(before, after, changes)
+    assert together["pose@m"].sign == -1
+    assert together["localized"].sign == 0
+    assert together["deg"].after == pytest.approx(1.05)
+    assert together["deg"].sign == -1
+
+
 def test_conditions_have_names_of_their_own_and_every_bench_some() -> None:
     names = [(one.bench, one.name) for one in conditions()]
     assert len(set(names)) == len(names)
@@ -148,13 +162,19 @@ def test_the_gyroscope_says_how_the_camera_turns() -> None:
 
 
 def test_calibrations_are_off_as_described() -> None:
-    (centre,) = (one for one in conditions() if one.name == "centre 1px/rich/1px")
+    centre = named("camera/centre 1px/rich/1px")
     for variant in range(4):
         off = camera_of(centre, variant).K - centre.camera.matrix
         assert np.linalg.norm(off[:2, 2]) == pytest.approx(1.0)
-    (focal,) = (one for one in conditions() if one.name == "focal 0.3%/wall/1px")
+    focal = named("camera/focal 0.3%/wall/1px")
     ratios = {round(float(camera_of(focal, k).K[0, 0] / focal.camera.focal), 6) for k in range(4)}
     assert ratios == {0.997, 1.003}
+    boards = named("camera/ten boards/rich/1px")
+    for variant in range(2):
+        found = camera_of(boards, variant)
+        off = found.K - boards.camera.matrix
+        assert 1e-3 < np.abs(off).max() < 3.0  # px
+        np.testing.assert_allclose(found.D, boards.camera.distortion, atol=0.03)
 
 
 def test_settings_have_dotted_names() -> None:
@@ -176,6 +196,29 @@ def test_a_hand_before_a_rich_scene_is_honest() -> None:
     row = one.row(CONDITION)
     assert min(float(row[name]) for name in ("pose@stamp", "pose@mid", "twist@mid")) > 80.0
     assert 0.5 < float(row["sharp_turn"]) < 2.5
+
+
+def test_times_are_taken_in_turns_and_calls_are_counted() -> None:
+    frames = list(generate(CONDITION, 2, 0))
+    done: list[str] = []
+
+    def work(name: str, seconds: float) -> None:
+        done.append(name)
+        end = time.process_time() + seconds
+        while time.process_time() < end:
+            pass
+
+    spent = in_turns([lambda _: work("a", 0.02), lambda _: work("b", 0.06)], frames, 3)
+    assert done == ["a", "b"] * 7
+    assert 2.0 < np.sum(spent[1]) / np.sum(spent[0]) < 4.0
+    localizer = rsl.Localizer(camera_of(CONDITION, 0))
+    calls, kernels, files = calls_of(
+        lambda frame: localizer.localize(frame.points, frame.pixels), frames
+    )
+    assert calls > 3
+    assert kernels > 3
+    assert 3 < files <= calls + kernels
+    assert calls_of(lambda frame: normalised(frame.points[0], np.eye(3)), frames) == (0, 0, 0)
 
 
 def test_the_commands(tmp_path, capsys) -> None:
