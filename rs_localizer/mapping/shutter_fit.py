@@ -18,10 +18,11 @@ from rs_localizer.trajectory.problem import LIMIT
 
 # A readout time is believed beyond so many deviations: two axes with two directions each are tried,
 # four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
-# third. The same of the mean gain of the images.
+# third.
 _SIGNIFICANT = 4.0
-# One axis is preferred to the other from here on: one chance in 700 that it is the wrong one.
-_PREFERRED = 3.0
+# And where the gains of the images are so by chance less often than this: a wrong model that absorbs
+# something else helps some images and harms others.
+_CHANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +34,9 @@ class ShutterFit:
     direction: ScanDirection
     noise: float  # px, that it leaves
     global_noise: float  # px, that the global shutter leaves which fits best
-    gain: float  # mean gain of the images over a global shutter, in its deviations
     better_images: float  # share of the images that fit it better than a global shutter
-    over_other_axis: float  # likewise, over a shutter along the other axis; NaN: not tried
+    chance: float  # that the images' gains over a global shutter are so by chance
+    axis_chance: float  # likewise, over a shutter along the other axis; 0: not tried
     interval: float  # s, between the images
 
     @property
@@ -47,12 +48,12 @@ class ShutterFit:
     def visible(self) -> bool:
         """Whether the images show a rolling shutter."""
         significant = self.readout_time > _SIGNIFICANT * self.deviation
-        return significant and self.gain > _SIGNIFICANT and self.possible
+        return significant and self.chance < _CHANCE and self.possible
 
     @property
     def axis_known(self) -> bool:
         """Whether they show along which axis it goes."""
-        return not abs(self.over_other_axis) < _PREFERRED
+        return self.axis_chance < _CHANCE
 
 
 def likely_axes(size: tuple[int, int]) -> list[ScanDirection]:
@@ -99,11 +100,10 @@ def fit_shutter(
         for direction in directions
     ]
     costs = [_costs(of, still, observations) for of in (still, *fits)]
-    best, over_other = 0, np.nan
+    best, axis_chance = 0, 0.0
     if len(fits) > 1:
-        over_other = -_significance(costs[1] - costs[2])
-        if over_other < -_PREFERRED:
-            best = 1
+        first, second = (_chance(costs[3 - k] - costs[k]) for k in (1, 2))
+        best, axis_chance = int(second < _CHANCE), min(first, second)
     gains, chosen = costs[0] - costs[1 + best], fits[best]
     shutter = ShutterFit(
         readout_time=chosen.camera_as_found.readout_time,
@@ -111,9 +111,9 @@ def fit_shutter(
         direction=ScanDirection(chosen.camera_as_found.scan_direction),
         noise=chosen.after,
         global_noise=still.after,
-        gain=_significance(gains),
         better_images=float(np.mean(gains > 0.0)),
-        over_other_axis=over_other,
+        chance=_chance(gains),
+        axis_chance=axis_chance,
         interval=1e-9 * float(np.median(np.diff(observations.stamps_ns))),
     )
     return (chosen if shutter.visible else still), shutter
@@ -127,7 +127,10 @@ def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) ->
     return np.asarray(sums, np.float64)
 
 
-def _significance(gains: Array) -> float:
-    """Mean of the images' gains (g,) in its deviations; errors within an image may be alike."""
-    spread = float(np.std(gains, ddof=1))
-    return float(np.mean(gains) * np.sqrt(len(gains)) / max(spread, 1e-12))
+def _chance(gains: Array) -> float:
+    """Probability that the images' gains (g,) are so large by chance (Wilcoxon's signed-rank test:
+    images at rest gain nothing, those of a quick turn much).
+    """
+    from scipy.stats import wilcoxon  # takes a second
+
+    return float(wilcoxon(gains, alternative="greater").pvalue)

@@ -166,7 +166,6 @@ def test_without_calibration_lens_and_shutter_are_found(views: list[View], folde
     assert len(built.posed) == len(views)
     assert built.shutter is not None
     assert built.shutter.visible
-    assert built.shutter.axis_known
     assert built.camera.scan_direction == "top_to_bottom"
     apart = abs(built.camera.readout_time - 0.03)
     assert apart < max(4.0 * built.refined.readout_time_deviation, 1e-3)
