@@ -24,6 +24,7 @@ _RESAMPLES = 1000
 # Certain and smaller than this is certain, and of no interest: share of an error.
 _WORTH_A_LINE = 0.02
 _ERRORS = {"deg@s": "deg_s", "deg": "deg", "mm": "mm", "deg/s": "deg/s", "m/s": "m/s"}
+_SHARP = ("turn_s", "turn", "way", "angular", "linear")
 _SHARES = ("localized", "pose@s", "pose@m", "twist@m", "in/ref", "not>5s")
 
 
@@ -187,11 +188,18 @@ def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
         some = joined.localized
         for name, figure in _ERRORS.items():
             row[name] = quantile(joined.of(figure)[some], 0.5)
-        for name in ("turn_s", "turn", "way", "angular", "linear"):
+        for name in _SHARP:
             row[f"s_{name}"] = sharpness(joined.of(name)[some])
         row["ms"] = float(np.mean(joined.of("ms")))
         found[bench] = row
     return found
+
+
+def totals_line(label: str, row: Mapping[str, float] | None) -> str:
+    """One line of the table; without a row: the names of the columns."""
+    names = ("localized", *_SHARES[1:-1], ">5s", *_ERRORS, *(f"s_{name}" for name in _SHARP), "ms")
+    cells = (f"{name if row is None else f'{row[name]:.3g}':>10}" for name in names)
+    return f"{label:12}{''.join(cells)}"
 
 
 def changes_together(
@@ -245,12 +253,10 @@ def _write_totals(
 ) -> None:
     """Two rows for each bench, and what is certain of all its conditions together."""
     both = [totals({name: table[name] for name in changes}) for table in (before, after)]
-    columns = list(next(iter(both[0].values())))
-    sys.stdout.write("\n" + f"{'':15}" + "".join(f"{name:>10}" for name in columns) + "\n")
+    sys.stdout.write(f"\n{totals_line('', None)}\n")
     for bench, names in _by_bench(changes).items():
         for label, table in zip((bench, "  after"), both, strict=True):
-            cells = "".join(f"{table[bench][name]:10.3g}" for name in columns)
-            sys.stdout.write(f"{label:15}{cells}\n")
+            sys.stdout.write(f"{totals_line(label, table[bench])}\n")
         together = changes_together(before, after, {name: changes[name] for name in names})
         sys.stdout.write(f"{'':15}  {_line(together, False) or 'nothing certain'}\n")
 
