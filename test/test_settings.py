@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from rs_localizer.config import (
     DetectorConfig,
@@ -165,7 +166,7 @@ def test_assignments_that_are_none(text: str) -> None:
 @pytest.mark.parametrize(
     ("values", "fault"),
     [
-        ({"solver": "p4p"}, "solver must be one of p3p, .*; got 'p4p'"),
+        ({"solver": "epnp"}, "solver must be one of .*; got 'epnp'"),
         ({"seed": 1.5}, "seed must be of type int, got 1.5"),
         ({"velocity_prior.linear": -1.0}, "velocity_prior.linear must lie between"),
         ({"readout_time": "long"}, "readout_time must be of type float, got 'long'"),
@@ -189,5 +190,12 @@ def test_a_misspelled_keyword_names_the_one_that_was_meant() -> None:
         ValueError, match="'colour' is not a setting of the localizer; there are sol"
     ):
         localizer_config({"colour": 1})
-    with pytest.raises(ValueError, match="solver must be one of p3p"):
-        localizer_config({"solver": "p4p"})
+    with pytest.raises(ValueError, match="solver must be one of "):
+        localizer_config({"solver": "epnp"})
+
+
+@pytest.mark.parametrize("kind", [NodeConfig, DetectorConfig, FeatureConfig])
+def test_no_default_is_dumped_with_an_exponent(kind: Any) -> None:
+    # `ros2 param dump` writes 2e-05, which `ros2 param load` takes for text.
+    for name, item in settings(kind).items():
+        assert "e-" not in yaml.safe_dump(item.default), name
