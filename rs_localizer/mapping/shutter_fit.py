@@ -20,7 +20,7 @@ from rs_localizer.trajectory.problem import LIMIT
 # four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
 # third.
 _SIGNIFICANT = 4.0
-# And where the gains of the images are so by chance less often than this: a wrong model that absorbs
+# And where the images' gains are so by chance less often than this: a wrong model that absorbs
 # something else helps some images and harms others.
 _CHANCE = 0.01
 
