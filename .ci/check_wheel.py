@@ -22,11 +22,16 @@ WANTED = (
 )
 # Where all files are.
 PLACES = r"(rs_localizer/|rs_localizer-[^/]+\.(dist-info|data/data/share)/).*"
+# Beside the recording that the demo plays, in bytes of the wheel.
+MOST_BYTES = 3_000_000
 UNWANTED = r".*(__pycache__|\.pyc$|(^|/)tests?/|\.so$|\.orig$|~$)"
 
 
 def main() -> None:
-    names = zipfile.ZipFile(sys.argv[1]).namelist()
+    entries = zipfile.ZipFile(sys.argv[1]).infolist()
+    names = [entry.filename for entry in entries]
+    size = sum(e.compress_size for e in entries if "/webcam_chessboard/" not in e.filename)
+    assert size <= MOST_BYTES, f"{size} bytes beside the demo's recording"
     for pattern in WANTED:
         assert any(re.fullmatch(pattern, name) for name in names), f"nothing like {pattern}"
     for name in names:
@@ -39,7 +44,7 @@ def main() -> None:
         if parts[:2] == ["rs_localizer", "data"] and len(parts) > 3
     }
     assert data == attributed, f"data without its authors: {data - attributed}"
-    print(f"  {len(names)} files")
+    print(f"  {len(names)} files, {size} bytes beside the demo's recording")
 
 
 if __name__ == "__main__":

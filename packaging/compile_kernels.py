@@ -25,7 +25,7 @@ _ABOUT = """
 import json, sys
 import numba
 from numba.core.registry import cpu_target
-from rs_localizer.core.lanes import shipped
+from rs_localizer.core.simd import shipped
 features = cpu_target.target_context.codegen().magic_tuple()[2]
 python = "{}.{}".format(*sys.version_info)
 print(json.dumps({"python": python, "numba": numba.__version__, "cpus": shipped.levels(features)}))

@@ -22,7 +22,8 @@ def run() -> int:
     with StopSignals() as signals:
 
         def importing(name: str) -> AbstractContextManager[None]:
-            return signals.at_once(None, f"{name}: interrupted\n")
+            signals.last_words = f"{name}: interrupted\n"
+            return signals.at_once(None, signals.last_words)
 
         code = 0
         try:

@@ -9,6 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
+
+# How long an example takes says nothing on a machine that compiles, or does something else.
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
 
 # sensor_msgs/PointField: number of a type -> code of struct.
 STRUCT_CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer import data
+from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
@@ -26,7 +26,7 @@ SETTINGS = {
 
 @pytest.fixture(scope="module")
 def messages():
-    with open_bag(data.path(data.GLOBAL_SHUTTER_TAGS)) as bag:
+    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         return list(bag.messages(("/camera/camera_info", "/camera/correspondences")))
 
 

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from benchmarks.fuzzing import seeds
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
@@ -21,10 +22,9 @@ from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.messages import MessageError
-from rs_localizer.lab.checks.fuzzing import seeds
-from rs_localizer.lab.simulation.landmarks import map_rows
 from rs_localizer.settings import SettingsError, build, parse_assignment
 from rs_localizer.settings import settings as all_settings
+from rs_localizer.simulation.landmarks import map_rows
 
 quick = settings(max_examples=60, deadline=None)
 # Of a PointField; 32 bits hold all of these.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,13 +22,14 @@ from rs_localizer.cli.shots import clock_of, of_bag, of_files, tell_times
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.evaluation.calibration_plots import save_plots
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration.files import read_calibration, write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
-from rs_localizer.lab.measures.calibration_plots import save_plots
 from rs_localizer.markers.boards import BoardSizes
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
@@ -247,18 +248,22 @@ def _write(
         f"    readout_time_deviation: {found.deviation!r}\n"
         f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config)
     )
+    writers: dict[Path, Callable[[Path], object]] = {}
     if intrinsics:
         values = found.lens._asdict().items()
         text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
         lens = path.with_name(f"{path.stem}_camera_info.yaml")
-        write_calibration(lens, found.fit.camera)
-        print(f"written: {lens}")
+        writers[lens] = lambda part: write_calibration(part, found.fit.camera)
     if marker_map is not None and verdict.shape_is_free(found):
         shape = path.with_name(f"{path.stem}_map.yaml")
-        write_marker_map(shape, marker_map.with_points(verdict.moved(found, marker_map.points)))
-        print(f"written: {shape}")
-    path.write_text(text, encoding="utf-8")
-    print(f"written: {path}")
+        bent = marker_map.with_points(verdict.moved(found, marker_map.points))
+        writers[shape] = lambda part: write_marker_map(part, bent)
+    writers[path] = lambda part: part.write_text(text, encoding="utf-8")
+    with atomic_files(*writers) as parts:
+        for part, write in zip(parts, writers.values(), strict=True):
+            write(part)
+    for file in writers:
+        print(f"written: {file}")
     print(f"next: {_next(args, path, lens, shape)}")
 
 
@@ -267,8 +272,9 @@ def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | 
     recording: Path = args.recording
     seen, poses = (out.with_name(f"{out.stem}_{what}") for what in ("seen", "poses"))
     options = {"--map": shape, "--calibration": lens, "--rate": args.rate, "--image": args.image}
-    given = [word for name, value in options.items() if value is not None
-             for word in (name, str(value))]  # fmt: skip
+    given = [
+        word for name, value in options.items() if value is not None for word in (name, str(value))
+    ]
     replay = ["replay", str(recording), "--params", str(out), "--out", str(poses)]
     if shape is None:  # a recording of correspondences
         return shlex.join(["rs_localizer", *replay])

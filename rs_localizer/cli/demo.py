@@ -18,22 +18,21 @@ from rs_localizer.cli.demo_cube import CUBE, CubeScene
 from rs_localizer.cli.demo_room import play_room
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.measures import figures
-from rs_localizer.lab.measures.comparison import Recording, Result, compare, load_recording
-from rs_localizer.lab.measures.comparison_pictures import (
+from rs_localizer.evaluation import plots
+from rs_localizer.evaluation.comparison import Recording, Result, compare, load_recording, table
+from rs_localizer.evaluation.plots import (
     error_picture,
     inlier_picture,
     residual_picture,
     trajectory_picture,
 )
-from rs_localizer.lab.measures.comparison_table import table
-from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
-from rs_localizer.lab.simulation.recording import write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import RecordedMotion
+from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import build, load_params_file
+from rs_localizer.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.simulation.recording import write_simulated
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import RecordedMotion
 from rs_localizer.solvers.table import SOLVERS
 
 _GLOBAL, _ROLLING = "global_shutter", "rolling_shutter"
@@ -109,7 +108,7 @@ def run(args: argparse.Namespace) -> None:
         print(f"\n{args.out / CUBE}")
         for name, figure in _pictures(*acts[:2]).items():
             if figure is not None:
-                figures.save(figure, args.out / name)
+                plots.save(figure, args.out / name)
                 print(args.out / name)
     print(f"done in {time.monotonic() - started:.0f} s")
 

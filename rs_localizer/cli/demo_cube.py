@@ -9,11 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer import data
-from rs_localizer.io.bags import BagWriter
-from rs_localizer.io.recording import write_frame
-from rs_localizer.io.trajectories import read_tum
-from rs_localizer.io.video import Image
-from rs_localizer.lab.experiments.cube_clip import (
+from rs_localizer.evaluation.comparison import Recording, Result
+from rs_localizer.evaluation.cube_clip import (
     CLIP_SENSOR,
     OURS,
     P3P,
@@ -21,9 +18,12 @@ from rs_localizer.lab.experiments.cube_clip import (
     clip_stamps,
     draw_clip,
 )
-from rs_localizer.lab.experiments.marker_frames import CAMERA, MarkerWalls
-from rs_localizer.lab.measures.comparison import Recording, Result
-from rs_localizer.lab.simulation.recording import write_truth
+from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.recording import write_frame
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.io.video import Image
+from rs_localizer.simulation.marker_frames import CAMERA, MarkerWalls
+from rs_localizer.simulation.recording import write_truth
 
 CUBE = "cube.gif"
 

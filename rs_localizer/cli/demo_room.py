@@ -14,20 +14,19 @@ from tqdm import tqdm
 
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
+from rs_localizer.evaluation import plots
+from rs_localizer.evaluation.comparison import Recording, Result, compare, table
+from rs_localizer.evaluation.map_pictures import localized_picture
+from rs_localizer.evaluation.room_mapping import Piece, Room, without_refinement
 from rs_localizer.io.estimates import Motions
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.io.trajectories import Trajectory, Twists, read_tum
-from rs_localizer.lab.experiments.room_mapping import Piece, Room, without_refinement
-from rs_localizer.lab.measures import figures
-from rs_localizer.lab.measures.comparison import Recording, Result, compare
-from rs_localizer.lab.measures.comparison_table import table
-from rs_localizer.lab.measures.map_pictures import localized_picture
-from rs_localizer.lab.rendering.renderer import ImageSettings
-from rs_localizer.lab.simulation.frames import middle_stamp
 from rs_localizer.mapping.structure import Effort, require
 from rs_localizer.process.missing import explain
+from rs_localizer.simulation.frames import middle_stamp
+from rs_localizer.simulation.renderer import ImageSettings
 
 ROOM = "room.png"
 # A quarter of VGA: all of it within half a minute.
@@ -140,7 +139,7 @@ def play_room(
         )
     results = {names[name]: compare(answers[name], recording.truth) for name in methods}
     print(f"\n{table('A room mapped without markers', recording, results)}", flush=True)
-    figures.save(room.picture(recording, results), out / ROOM)
+    plots.save(room.picture(recording, results), out / ROOM)
     print(out / ROOM)
 
 

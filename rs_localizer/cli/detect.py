@@ -23,6 +23,7 @@ from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.shots import Source, opened
 from rs_localizer.config import DetectorConfig
 from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES
 from rs_localizer.offline.detect import Options, Recorded, record
 from rs_localizer.pipeline.images import FrameDetector
@@ -85,9 +86,9 @@ def detect_one(args: argparse.Namespace) -> Recorded:
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
     detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
     detector.warm_up()
-    with opened(args, args.images, args.start) as source:
-        recorded = _record(args, source, detector)
-    write_shutter(args)
+    with opened(args, args.images, args.start) as source, atomic_directory(args.out) as out:
+        recorded = _record(args, source, detector, out)
+        write_shutter(args, out)
     _tell(args, recorded, notices)
     for fault in (*recorded.faults, *time_faults(args, source.clock, recorded.period)):
         print(f"warning: {fault}")
@@ -104,12 +105,14 @@ def _tell_times(images: int, seconds: float, in_opencv: float) -> None:
     )
 
 
-def _record(args: argparse.Namespace, source: Source, detector: FrameDetector) -> Recorded:
+def _record(
+    args: argparse.Namespace, source: Source, detector: FrameDetector, out: Path
+) -> Recorded:
     with tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress:
         return record(
             source.shots,
             detector,
-            args.out,
+            out,
             Options(
                 args.storage,
                 args.with_images,

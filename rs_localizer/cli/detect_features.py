@@ -12,6 +12,7 @@ from rs_localizer.cli.image_source import tell_left_out, tell_next, time_faults,
 from rs_localizer.cli.shots import opened
 from rs_localizer.config import FeatureConfig, FeatureKind
 from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.offline.detect import Options
 from rs_localizer.offline.detect_features import Extraction, record_features
 from rs_localizer.pipeline.features import FrameExtractor
@@ -52,10 +53,11 @@ def run(args: argparse.Namespace) -> None:
     )
     with (
         opened(args, args.images, args.start) as source,
+        atomic_directory(args.out) as out,
         tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
     ):
-        extraction = record_features(source.shots, extractor, args.out, options, progress.update)
-    write_shutter(args)
+        extraction = record_features(source.shots, extractor, out, options, progress.update)
+        write_shutter(args, out)
     _tell(args, extraction)
     for fault in time_faults(args, source.clock, extraction.period):
         print(f"warning: {fault}")

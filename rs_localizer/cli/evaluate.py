@@ -10,26 +10,25 @@ import numpy as np
 from rs_localizer.cli import UsageError, many
 from rs_localizer.cli.fleet import add_fleet_arguments
 from rs_localizer.core.arrays import Array
+from rs_localizer.evaluation.metrics import (
+    Errors,
+    Summary,
+    TimeOffset,
+    aligned,
+    associate,
+    estimate_offset,
+    interpolated,
+    interpolated_twists,
+    pose_errors,
+    shifted,
+    summarize,
+    twist_errors,
+)
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
-from rs_localizer.lab.measures.alignment import aligned
-from rs_localizer.lab.measures.metrics import (
-    Errors,
-    Summary,
-    associate,
-    pose_errors,
-    summarize,
-    twist_errors,
-)
-from rs_localizer.lab.measures.time_offset import (
-    TimeOffset,
-    estimate_offset,
-    interpolated,
-    interpolated_twists,
-    shifted,
-)
 from rs_localizer.process.arguments import number
 
 _AUTO = "auto"
@@ -193,7 +192,7 @@ def _print_offset(found: TimeOffset | None) -> None:
 def _plot(
     directory: Path, estimate: Trajectory, truth: Trajectory, poses: Errors, twists: Errors | None
 ) -> None:
-    from rs_localizer.lab.measures import figures, plots
+    from rs_localizer.evaluation import plots
 
     directory.mkdir(parents=True, exist_ok=True)
     drawn = (
@@ -201,7 +200,8 @@ def _plot(
         plots.errors({"estimate": poses}, {"estimate": twists} if twists else {}),
     )
     for name, figure in zip(("trajectories.png", "errors.png"), drawn, strict=True):
-        figures.save(figure, directory / name)
+        with atomic_files(directory / name) as (part,):
+            plots.save(figure, part)
         print(f"{directory / name}")
 
 

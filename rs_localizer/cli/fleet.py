@@ -17,7 +17,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.io.whole import told
+from rs_localizer.io.atomic_files import write_errors
 from rs_localizer.offline.fleet.cluster import Where, perform_all
 from rs_localizer.offline.fleet.identity import identity, program, read_marker
 from rs_localizer.offline.fleet.names import folder_names
@@ -97,7 +97,7 @@ def run_fleet(args: Namespace, plan: Plan) -> None:
     out = args.out.resolve()
     tasks = _tasks(args, plan, out)
     _check(tasks, plan)
-    with told(out):
+    with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     with only_one(out):
         rows = {task.name: Row(task.recording, task.name, OPEN, {}) for task in tasks}

@@ -13,7 +13,6 @@ from rs_localizer.io.bags import is_bag
 from rs_localizer.io.calibration.files import CALIBRATION_KINDS
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.io.whole import told
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import settings, write_parameters
 
@@ -60,15 +59,14 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     bag.add_argument("--camera-info", metavar="TOPIC")
 
 
-def write_shutter(args: argparse.Namespace) -> None:
+def write_shutter(args: argparse.Namespace, out: Path) -> None:
     """The shutter: as given, or as simulate writes it beside the images of a recording."""
     beside = args.images / PARAMETERS
-    with told(args.out):
-        if args.readout_time is not None:
-            direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
-            write_parameters(args.out / PARAMETERS, args.readout_time, direction)
-        elif is_bag(args.images) and beside.exists():
-            shutil.copy(beside, args.out / PARAMETERS)
+    if args.readout_time is not None:
+        direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
+        write_parameters(out / PARAMETERS, args.readout_time, direction)
+    elif is_bag(args.images) and beside.exists():
+        shutil.copy(beside, out / PARAMETERS)
 
 
 def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:

@@ -14,6 +14,7 @@ from rs_localizer.cli.given import add_settings, given_settings, row_time
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.types import Estimate
+from rs_localizer.io.atomic_files import OutputError, atomic_files
 from rs_localizer.io.hloc import (
     HlocError,
     open_h5,
@@ -22,7 +23,6 @@ from rs_localizer.io.hloc import (
     result_line,
     result_name,
 )
-from rs_localizer.io.whole import OutputError, whole_files
 from rs_localizer.offline.hloc import Answer, Reference, localize_queries
 from rs_localizer.pipeline.moments import pose_at, twist_at
 from rs_localizer.solvers.table import find_solver
@@ -83,9 +83,11 @@ def run(args: argparse.Namespace) -> None:
         found = list(bar)
     if not any(isinstance(answer.result, Estimate) for answer in found):
         raise ValueError(f"none of {len(found)} queries was localized; {_why(found)}")
-    with whole_files(args.results, motion):
-        args.results.write_text("".join(_lines(found, args)), encoding="utf-8")
-        motion.write_text(json.dumps(_motions(found, args, config), indent=1), encoding="utf-8")
+    with atomic_files(args.results, motion) as (results_part, motion_part):
+        results_part.write_text("".join(_lines(found, args)), encoding="utf-8")
+        motion_part.write_text(
+            json.dumps(_motions(found, args, config), indent=1), encoding="utf-8"
+        )
     if unknown:
         print(f"{len(unknown)} paired images are not in the model, the first one: {unknown[0]}")
     _tell(found, args.results, motion, config)

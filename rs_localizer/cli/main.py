@@ -17,8 +17,9 @@ from dataclasses import dataclass
 
 import rs_localizer
 from rs_localizer.cli import UsageError
+from rs_localizer.io.atomic_files import remove_unfinished
 from rs_localizer.process.missing import explain
-from rs_localizer.process.stopping import INTERRUPTED
+from rs_localizer.process.stopping import INTERRUPTED, StopRequest
 
 # What shells report of a program whose output nobody reads any more: 128 + SIGPIPE.
 _SIGPIPE = 141
@@ -101,11 +102,6 @@ COMMANDS = {
         "compile all kernels now, for images and installers; the first start is then as any other",
         "rs_localizer warm",
     ),
-    "experiments": Command(
-        "rs_localizer.cli.experiments",
-        "the experiments of the literature and ours: curves, figures, a verdict on every claim",
-        "rs_localizer experiments motion noise --out figures",
-    ),
 }
 
 
@@ -141,6 +137,7 @@ def main(
         return int(end.code or 0)
     except ImportError as error:
         return _fail(name, explain(error), 1)
+    StopRequest.clean_up.append(remove_unfinished)
     try:
         module.run(arguments)
         sys.stdout.flush()

@@ -131,7 +131,7 @@ def evaluate(args: Namespace) -> None:
 def evaluate_of_many(args: Namespace, recording: Path, out: Path) -> Figures:
     """One of them: its result in ``out``, and figures for the summary."""
     from rs_localizer.cli.evaluate import evaluate_one, named_errors
-    from rs_localizer.lab.measures.metrics import summarize
+    from rs_localizer.evaluation.metrics import summarize
 
     truth = truth_of(recording, args.truths)
     if not truth.exists():

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer.cli import UsageError
-from rs_localizer.io.whole import whole_files
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import FAMILIES, family
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
@@ -108,9 +108,10 @@ def _make(args: argparse.Namespace) -> None:
     for path in written:
         if path.exists() and not args.overwrite:
             raise ValueError(f"{path} exists already; it is replaced with --overwrite")
-    with whole_files(*written):
-        files = write_pages(pages, target)
-        write_marker_map(map_file, marker_map)
+    with atomic_files(*written) as (*_, map_part):
+        write_pages(pages, map_part.with_name(target.name))
+        write_marker_map(map_part, marker_map)
+    files = written[:-1]
     shown = str(files[0]) if len(files) == 1 else f"{files[0]} ... {files[-1].name}"
     count = f"{len(pages)} page{'s' if len(pages) > 1 else ''} of {args.page}"
     print(f"{shown}: {count}; print at 100 % and measure the bar")

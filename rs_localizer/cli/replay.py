@@ -154,10 +154,12 @@ def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool
         localizer.load_map()
         if args.smooth and config.readout_time == 0.0:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
-        with fresh(out, args.overwrite):
+        with fresh(out, args.overwrite) as built:
             _hint(recording, args.params)
-            tally = _replay(bag, topics, localizer, notices, out, args)
-            write_file(args, bag, topics, localizer, tally, out)
+            tally = _replay(bag, topics, localizer, notices, built, args)
+            view = write_file(args, bag, topics, localizer, tally, built)
+        if view is not None:
+            print(f"to look at: rerun {out / view.name if view.parent == built else view}")
         _tell(tally, config, out, timed)
         open_viewer(args, bag, topics, localizer, tally)
         if not tally.frames:

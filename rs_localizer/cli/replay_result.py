@@ -14,12 +14,12 @@ from rs_localizer.cli.replay_exports import written_names
 from rs_localizer.config import NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.topics import TF
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms.rigid import TransformError, make_transform
-from rs_localizer.io.whole import told, whole
 from rs_localizer.offline.fleet.identity import MARKER
 from rs_localizer.offline.fleet.task import LOG
 from rs_localizer.offline.replay import TF_TYPE
@@ -33,25 +33,16 @@ VIEW = "view.rrd"
 
 
 @contextlib.contextmanager
-def fresh(out: Path, overwrite: bool) -> Iterator[None]:
-    """Within ``with``, a result is made; what is left of it after an exception is removed."""
-    is_empty = out.is_dir() and not any(out.iterdir())
-    if not out.exists() or is_empty:
-        with whole(out):
-            out.mkdir(parents=True)
-            yield
-        return
-    if not overwrite:
-        raise ValueError(f"{out} exists; choose another --out, or --overwrite")
-    if not _is_ours(out):
-        raise ValueError(f"{out} is not a result of replay; --overwrite leaves it as it is")
-    _remove_results(out)
-    try:
-        with told(out):
-            yield
-    except BaseException:
-        _remove_results(out)
-        raise
+def fresh(out: Path, overwrite: bool) -> Iterator[Path]:
+    """Within ``with``, make a result, which then takes the place of ``out``."""
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        if not overwrite:
+            raise ValueError(f"{out} exists; choose another --out, or --overwrite")
+        if not _is_ours(out):
+            raise ValueError(f"{out} is not a result of replay; --overwrite leaves it as it is")
+    with atomic_directory(out, _remove_results if overwrite else None) as built:
+        built.mkdir()
+        yield built
 
 
 def _remove_results(out: Path) -> None:

@@ -68,12 +68,13 @@ def write_file(
     localizer: FrameLocalizer,
     tally: Tally,
     out: Path,
-) -> None:
+) -> Path | None:
     """Write what ``--rerun`` asks for; of no pose there is nothing to be seen."""
-    if args.rerun is not None and tally.frames:
-        file = out / VIEW if args.rerun is _BESIDE_POSES else args.rerun
-        write_view(bag, topics, localizer, tally.written, file)
-        print(f"to look at: rerun {file}")
+    if args.rerun is None or not tally.frames:
+        return None
+    file: Path = out / VIEW if args.rerun is _BESIDE_POSES else args.rerun
+    write_view(bag, topics, localizer, tally.written, file)
+    return file
 
 
 def open_viewer(

@@ -20,21 +20,21 @@ from rs_localizer.cli.simulated_camera import (
 )
 from rs_localizer.cli.simulated_imu import add_imu_arguments, bag_of
 from rs_localizer.core.arrays import Array
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
-from rs_localizer.io.whole import whole
-from rs_localizer.lab.rendering.image_sequence import FORMATS, Encoding, rendered_frames
-from rs_localizer.lab.rendering.renderer import ImageSettings, Renderer
-from rs_localizer.lab.rendering.rooms import SCENES
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.landmarks import described, keypoint_rows
-from rs_localizer.lab.simulation.recording import write_rendered, write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import TrueMotion, sampled_way
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import write_parameters
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.image_sequence import FORMATS, Encoding, rendered_frames
+from rs_localizer.simulation.landmarks import described, keypoint_rows
+from rs_localizer.simulation.recording import write_rendered, write_simulated
+from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import TrueMotion, sampled_way
+from rs_localizer.simulation.walls import SCENES
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")
@@ -114,8 +114,8 @@ def _write_points(args: argparse.Namespace) -> None:
     rng = np.random.default_rng(args.seed)
     landmarks = described(room(_way(motion), rng), MAP_FRAME, rng)
     counts: list[int] = []
-    with whole(args.out):
-        with bag_of(args, motion) as bag:
+    with atomic_directory(args.out) as built:
+        with bag_of(args, built, motion) as bag:
             frames = simulate_frames(
                 camera, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
             )
@@ -130,9 +130,9 @@ def _write_points(args: argparse.Namespace) -> None:
             raise ValueError(
                 f"none of the {len(stamps)} frames sees any point; nothing is written to {args.out}"
             )
-        write_parameters(args.out / PARAMETERS, args.readout_time, args.scan_direction)
+        write_parameters(built / PARAMETERS, args.readout_time, args.scan_direction)
         if args.keypoints:
-            write_map_file(args.out / MAP, landmarks)
+            write_map_file(built / MAP, landmarks)
     print(
         f"{args.out}: {len(stamps)} frames in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s, "
         f"{np.mean(counts):.0f} points each{_fewer(counts, args.points)}"
@@ -152,14 +152,14 @@ def _write_images(args: argparse.Namespace) -> None:
     settings = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
     renderer = Renderer(camera, scene.planes, settings)
     encoding = Encoding(args.format, round(args.quality))
-    with whole(args.out):
-        with bag_of(args, motion) as bag:
+    with atomic_directory(args.out) as built:
+        with bag_of(args, built, motion) as bag:
             frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
             for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
                 write_rendered(bag, camera, frame)
-        write_parameters(args.out / PARAMETERS, args.readout_time, args.scan_direction)
+        write_parameters(built / PARAMETERS, args.readout_time, args.scan_direction)
         if scene.marker_map is not None:
-            write_marker_map(args.out / MARKER_MAP, scene.marker_map)
+            write_marker_map(built / MARKER_MAP, scene.marker_map)
     said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
     if scene.marker_map is None:
         print(said)

@@ -13,17 +13,17 @@ from rs_localizer.cli import UsageError
 from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps
-from rs_localizer.lab.simulation.true_motion import (
+from rs_localizer.process.arguments import integer, number
+from rs_localizer.settings import settings
+from rs_localizer.simulation.frames import FrameSettings, frame_stamps
+from rs_localizer.simulation.true_motion import (
     BODY_FROM_CAMERA,
     KNOT_SPACING,
     ConstantVelocity,
     RecordedMotion,
     TrueMotion,
+    shaken,
 )
-from rs_localizer.lab.simulation.vibration import shaken
-from rs_localizer.process.arguments import integer, number
-from rs_localizer.settings import settings
 
 # A still hand is no example: without any motion given, the camera turns and walks like this.
 _ANGULAR_VELOCITY = (0.0, 1.0, 0.0)

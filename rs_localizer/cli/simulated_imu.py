@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.simulated_camera import option
 from rs_localizer.io.bags import BagWriter
-from rs_localizer.lab.simulation.imu import ImuSettings, Lever, simulate_imu
-from rs_localizer.lab.simulation.imu_recording import ImuBagWriter
-from rs_localizer.lab.simulation.true_motion import TrueMotion
 from rs_localizer.process.arguments import number
+from rs_localizer.simulation.imu import ImuBagWriter, ImuSettings, Lever, simulate_imu
+from rs_localizer.simulation.true_motion import TrueMotion
 
 # Its random numbers are its own: the frames are the same with and without it.
 _STREAM = 14
@@ -51,14 +51,14 @@ def add_imu_arguments(group: argparse._ArgumentGroup) -> None:
     )  # fmt: skip
 
 
-def bag_of(args: argparse.Namespace, motion: TrueMotion) -> BagWriter:
+def bag_of(args: argparse.Namespace, out: Path, motion: TrueMotion) -> BagWriter:
     """The recording that is written; with ``--imu`` one that holds its readings besides."""
     defaults = ImuSettings()
     settings = ImuSettings(*(getattr(args, name) for name in _OPTIONS))
     if not args.imu:
         if settings != defaults:
             raise UsageError("options of the IMU need --imu")
-        return BagWriter(args.out, args.storage)
+        return BagWriter(out, args.storage)
     lever = Lever()
     track = simulate_imu(motion, settings, lever, np.random.default_rng([args.seed, _STREAM]))
-    return ImuBagWriter(args.out, args.storage, args.readout_time, track, settings, lever)
+    return ImuBagWriter(out, args.storage, args.readout_time, track, settings, lever)

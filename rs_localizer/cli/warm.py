@@ -10,8 +10,8 @@ import warnings
 from collections.abc import Callable
 
 from rs_localizer.config import NodeConfig
-from rs_localizer.core.lanes import shipped
-from rs_localizer.core.lanes.jit import cache_directory
+from rs_localizer.core.simd import shipped
+from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.markers import detection
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.solvers.table import SOLVERS

@@ -7,12 +7,6 @@ ranges here are what users see in ``ros2 param describe``.
 from rs_localizer.config.declared import (
     type_of,
 )
-from rs_localizer.config.detectors import (
-    DetectorConfig,
-    FeatureConfig,
-    FeatureKind,
-    ImageTransport,
-)
 from rs_localizer.config.method import (
     Acceleration,
     LocalizerConfig,
@@ -21,6 +15,10 @@ from rs_localizer.config.method import (
 )
 from rs_localizer.config.nodes import (
     LONGEST_READOUT_TIME,
+    DetectorConfig,
+    FeatureConfig,
+    FeatureKind,
+    ImageTransport,
     Imu,
     ImuUse,
     MatchBy,

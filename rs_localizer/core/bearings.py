@@ -11,8 +11,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera, DistortionModel
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
 
 # k1 k2 p1 p2 k3, k4 k5 k6, s1 s2 s3 s4; those behind them tilt the sensor.
 _COEFFICIENTS = 12

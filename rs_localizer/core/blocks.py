@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 
 @kernel

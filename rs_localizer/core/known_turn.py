@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.rate_spline import (
     change_at,
     place_of,
@@ -22,6 +21,7 @@ from rs_localizer.core.rate_spline import (
     turn_in,
     turn_on,
 )
+from rs_localizer.core.simd.jit import kernel
 
 # Gauss' rule on the readout; the sum of the weights is its length.
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(5))

@@ -14,7 +14,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import coefficients
 
 

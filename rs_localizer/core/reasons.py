@@ -19,6 +19,7 @@ class Reason(StrEnum):
     MIRRORED = "mirrored"
     MODEL_ERROR = "model_error"
     UNCERTAIN = "uncertain"
+    SCAN_AXIS = "scan_axis"
     # Messages that cannot be used, or not yet.
     NO_CAMERA_INFO = "no_camera_info"
     BAD_CAMERA_INFO = "bad_camera_info"

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 # Polynomials of the row time, from the second degree: the motion has a constant and a linear part.
 FIRST_DEGREE = 2

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 # Below this angle the series of the coefficients are exact to double precision.
 _SMALL_ANGLE = 1e-3

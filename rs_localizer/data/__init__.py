@@ -9,10 +9,6 @@ WEBCAM = "webcam_chessboard/recording"
 """Rosbag2 of a hand-held rolling-shutter webcam over a chessboard; see its parameters.yaml."""
 HAND_MOTION = "motion/tum_vi_room5.txt.gz"
 """TUM trajectory at 120 Hz of a hand-held rig, z up."""
-SLOW_HAND_MOTION = "motion/tum_rgbd_fr1_xyz.txt.gz"
-"""TUM trajectory at 100 Hz of a hand-held camera that moves slowly; optical axes."""
-GLOBAL_SHUTTER_TAGS = "global_shutter_tags/recording"
-"""Rosbag2 of a real global-shutter camera before surveyed AprilTags."""
 
 
 def path(name: str) -> Path:

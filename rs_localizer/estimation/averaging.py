@@ -8,7 +8,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import PARAMETERS, STATE_SIZE, TURN, step_between
 from rs_localizer.estimation.curvature import told_from
 from rs_localizer.estimation.model_error import Examined

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.lanes.jit import inlined, kernel
-from rs_localizer.core.lanes.simd import LANES, traced_products
 from rs_localizer.core.shake import FIRST_DEGREE, legendre, shake_basis
+from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.simd.tracing import LANES, traced_products
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms

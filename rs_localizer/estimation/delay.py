@@ -20,8 +20,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.rate_spline import multiplied
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import log
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
@@ -106,7 +106,7 @@ def _turned(errors: Array, by_turn: Array, shown: Array, rotations: Array, middl
     turned = np.empty_like(errors)
     back = middle.T.copy()
     for i in range(len(errors)):
-        # Of the steadied camera: from the turn that it was steadied by to the delayed one.
+        # Of the compensated camera: from the turn that it was compensated by to the delayed one.
         delayed = multiplied(rotations[i], back)
         phi = log(multiplied(delayed.T.copy(), shown[i]))
         for row in range(2):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.columns import Columns
 from rs_localizer.estimation.refine import LEAST_NOISE

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.types import Failure
 
 # Pixels may lie outside the image by this part of it: noise, and features at its border.

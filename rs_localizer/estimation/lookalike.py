@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ACCELERATIONS, PARAMETERS, TURN, step_between
 from rs_localizer.estimation.averaging import longest_axis
 from rs_localizer.estimation.curvature import told_from

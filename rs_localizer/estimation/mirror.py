@@ -11,7 +11,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.estimation.averaging import longest_axis
 from rs_localizer.estimation.posterior import Mirror
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.shake import FIRST_DEGREE
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.assumptions import FIELD_PRIOR
 from rs_localizer.estimation.columns import Columns, columns_of, with_prior

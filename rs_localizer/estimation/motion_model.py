@@ -15,9 +15,9 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shake import shake_in_the_middle
 from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import inverted

@@ -10,10 +10,10 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.bearings import bearings
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.gyro_compensated import gyro_compensated
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.lens import LensError
-from rs_localizer.core.steadied import steadied
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.inputs import distinct, near_image
 from rs_localizer.estimation.medians import median_point
@@ -32,7 +32,7 @@ class Usable(NamedTuple):
     indices: IntArray  # of those that are finite, distinct and inside the image
     shown: BoolArray  # (n,) which lie in the image
     centre: Array  # (3,) map frame: the median of the points
-    rays: Array  # (n,2), steadied
+    rays: Array  # (n,2), compensated
     by_ray: Array  # (n,2,2) derivatives of the pixels by them
     tau: Array  # (n,) row times
 
@@ -45,7 +45,7 @@ class Sighted:
     points: Array  # (n,3)
     pixels: Array  # (n,2)
     usable: Usable
-    turn: KnownTurn | None  # what the rays are steadied by
+    turn: KnownTurn | None  # what the rays are compensated by
 
     def by(self, camera: Camera) -> Observations | None:
         """The same points through another lens; None where it has no bearing for one."""
@@ -83,11 +83,11 @@ def find_usable(camera: Camera, points: Array, pixels: Array, turn: KnownTurn | 
 
 
 def _rays(camera: Camera, pixels: Array, tau: Array, turn: KnownTurn | None) -> tuple[Array, Array]:
-    """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, steadied."""
+    """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, compensated."""
     rays, by_ray = bearings(camera, pixels)
     if turn is None:
         return rays, by_ray
-    return steadied(rays, tau, by_ray, camera.row_time_gradient, turn)
+    return gyro_compensated(rays, tau, by_ray, camera.row_time_gradient, turn)
 
 
 @kernel

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.estimation.view import POINT_SIZE
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.shutter import Motion, Numbers, numbers_of
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 
 # Numbers whose squares are finite.

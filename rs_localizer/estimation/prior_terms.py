@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,

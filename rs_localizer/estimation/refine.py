@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 from rs_localizer.estimation.prior_kernels import add_prior

@@ -12,8 +12,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.gyro_compensated import gyro_compensated
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.steadied import steadied
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.residuals import linearized
 
@@ -34,7 +34,7 @@ def relinearized(
 
     Args:
         state: (24,) of the motion.
-        turn: what the observations are steadied by.
+        turn: what the observations are compensated by.
         fewest: points that are not few.
     """
     count = len(observations)
@@ -51,7 +51,9 @@ def relinearized(
             "nij,nj->ni", turn.at_rows(observations.tau)[0], np.column_stack([rays, np.ones(count)])
         )
         raw = local[:, :2] / local[:, 2:]
-        by_ray = steadied(raw, observations.tau, camera.pixel_jacobian(raw), gradient, turn)[1]
+        by_ray = gyro_compensated(
+            raw, observations.tau, camera.pixel_jacobian(raw), gradient, turn
+        )[1]
     return Observations.of(
         observations.points, observations.rays, observations.tau, by_ray, gradient
     )

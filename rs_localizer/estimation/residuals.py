@@ -14,8 +14,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced, traced_sums
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced, traced_sums
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 from rs_localizer.estimation.view import POINT_SIZE, SHAKE_SIZE, UNIFORM_SIZE, View, still_cost
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.state import STATE_SIZE
 from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
 from rs_localizer.estimation.refine import anneal, refine

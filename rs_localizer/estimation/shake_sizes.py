@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.model_error import RIDGE
 from rs_localizer.estimation.refine import LEAST_NOISE, half_inverse, inverted

@@ -15,7 +15,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.blocks import write
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.core.tones import MOST_CYCLES
 from rs_localizer.estimation.columns import Columns

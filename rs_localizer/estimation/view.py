@@ -15,8 +15,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from rs_localizer.core.lanes.algebra import cross, dot, multiply
-from rs_localizer.core.lanes.simd import Lanes, Vector, select
+from rs_localizer.core.simd.algebra import cross, dot, multiply
+from rs_localizer.core.simd.tracing import Lanes, Vector, select
 from rs_localizer.core.state import STATE_SIZE
 
 POINT_SIZE = 11  # X (3), ray (2), row time, pixel by ray (4), weight

@@ -1,4 +1,7 @@
-"""Images -> keypoints with descriptors."""
+"""Images -> keypoints with descriptors: good ones, and some of every part of the image.
+
+A pose is as certain as the points are spread; the best keypoints alone lie where most texture is.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,34 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.features.methods import METHODS, Descriptors, FeatureError, Gray
-from rs_localizer.features.selection import balanced
+
+# Keypoints that a cell of the grid holds on average.
+_PER_CELL = 8
+
+
+def balanced(pixels: Array, scores: Array, size: tuple[int, int], most: int) -> IntArray:
+    """Rows (k,) of at most so many keypoints: of each cell of a grid the best, then the second ...
+
+    Args:
+        pixels: (n,2)
+        scores: (n,) higher is better.
+        size: width and height of the image.
+        most: how many to keep.
+    """
+    count = len(pixels)
+    if count <= most:
+        return np.arange(count)
+    side = np.sqrt(size[0] * size[1] * _PER_CELL / most)
+    columns, rows = (pixels // side).astype(np.int64).T
+    cells = rows * (int(size[0] // side) + 1) + columns
+    order = np.lexsort((-scores, cells))
+    ranks = np.arange(count) - np.searchsorted(cells[order], cells[order])
+    return np.sort(order[np.lexsort((-scores[order], ranks))[:most]])
+
 
 # OpenCV's detectors fail on smaller images (px), in which there is nothing to find.
 _LEAST_SIDE = 16
@@ -100,3 +127,20 @@ class FeatureExtractor:
 def _single(values: Array) -> Array:
     """What is left of numbers in single precision."""
     return values.astype(np.float32).astype(np.float64)
+
+
+# Blue, green, red.
+_COLOR = (0, 230, 255)
+_LEAST_RADIUS = 2
+# Digits after the point of drawn coordinates, in bits.
+_SHIFT = 4
+
+
+def draw_features(image: NDArray[np.uint8], features: Features) -> NDArray[np.uint8]:
+    """The image (h,w,3) with a circle around what each descriptor describes."""
+    picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+    middles = np.rint(features.pixels * 2**_SHIFT).astype(int).tolist()
+    radii = np.maximum(features.sizes / 2, _LEAST_RADIUS) * 2**_SHIFT
+    for middle, radius in zip(middles, np.rint(radii).astype(int).tolist(), strict=True):
+        cv2.circle(picture, middle, radius, _COLOR, 1, cv2.LINE_AA, _SHIFT)
+    return picture

@@ -14,7 +14,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 # End of the spectrum, as a part of the sample rate, and noise beside it (variance).
 _BAND, _NOISE = 0.4, 1e-5

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 
 _EPSILON = float(np.finfo(np.float64).eps)
 # QL steps in all, for n eigenvalues: (least, for each); about two for each do.

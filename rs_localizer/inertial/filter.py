@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 # Readings farther apart than so many periods are a gap: one that is missing can be told from its
 # neighbours, as far as a vibration goes that they can show, two cannot.

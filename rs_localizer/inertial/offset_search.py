@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.inertial.settings import BIAS_DEVIATION, OFFSET_DEVIATION, SCALE_DEVIATION
 from rs_localizer.inertial.sight import Sight

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 
 MARGIN = 4
 """Samples before and after an interval that the spline through its samples wants to have: what

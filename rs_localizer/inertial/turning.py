@@ -15,8 +15,8 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.known_turn import KnownTurn, turn_of
-from rs_localizer.core.lanes.jit import kernel
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.so3 import coefficients, log
 from rs_localizer.inertial.band import densified
 from rs_localizer.inertial.samples import ImuSamples

@@ -10,7 +10,7 @@ import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.inertial.filter import GyroscopeFilter
 from rs_localizer.inertial.mounting import fit_mounting

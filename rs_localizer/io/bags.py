@@ -186,7 +186,7 @@ class BagWriter:
     """Writes a rosbag2 directory; a context manager.
 
     What was written before an exception (Ctrl-C among them) stays readable; without any message,
-    nothing is left (see :mod:`rs_localizer.io.whole` for all or nothing).
+    nothing is left (see :mod:`rs_localizer.io.atomic_files` for all or nothing).
 
     Args:
         path: the directory to create.

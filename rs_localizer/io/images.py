@@ -64,6 +64,8 @@ _FORMATS = (
 _DENSEST = 8 * 1032
 # No camera has more; decoded they take 8 bytes each at most.
 _MOST_PIXELS = 150_000_000
+# What a gray image depends on; PNG (third edition), section 5.6.
+_STILL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 # JPEG's markers of frames, by which the size is given.
 _FRAME_HEADERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _ALONE = {0x01, *range(0xD0, 0xD8)}
@@ -154,8 +156,8 @@ def read_compressed_image(message: Any) -> Image:
             f"the {name} image says that it is {size[0]} x {size[1]}, of which {len(data)} bytes "
             f"cannot tell, or which is more than {_MOST_PIXELS // 1_000_000} megapixels"
         )
-    if name == "PNG" and not _has_whole_chunks(data.tobytes()):
-        raise MessageError(f"the PNG image of {len(data)} bytes has a chunk that is longer than it")
+    if name == "PNG":
+        data = np.frombuffer(_still_png(data.tobytes()), np.uint8)
     try:
         decoded = cv2.imdecode(data, _AS_IT_IS)
     except cv2.error as error:
@@ -180,13 +182,21 @@ def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:
     return None
 
 
-def _has_whole_chunks(data: bytes) -> bool:
-    """Whether all chunks lie within a PNG; the decoder allocates them as long as they claim."""
-    position, kind = 8, b""
+def _still_png(data: bytes) -> bytes:
+    """The chunks of a still image; those of animations crash OpenCV 5.0 when they are damaged.
+
+    Raises:
+        MessageError: when a chunk is longer than the data; the decoder allocates what it claims.
+    """
+    chunks, position, kind = [data[:8]], 8, b""
     while position + 12 <= len(data) and kind != b"IEND":
-        kind = data[position + 4 : position + 8]
+        start, kind = position, data[position + 4 : position + 8]
         position += 12 + int.from_bytes(data[position : position + 4])
-    return position <= len(data) and kind == b"IEND"
+        if kind in _STILL_CHUNKS:
+            chunks.append(data[start:position])
+    if position > len(data) or kind != b"IEND":
+        raise MessageError(f"the PNG image of {len(data)} bytes has a chunk that is longer than it")
+    return b"".join(chunks)
 
 
 def _ends_with(data: Gray, mark: bytes) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.trajectory.normal_kernels import border_of
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, differentiate, make_row
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, differentiate, make_row
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL, ORDER
 

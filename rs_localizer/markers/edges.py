@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.markers.profiles import BLACK, CUT, SEEN, VARIANCE, WHITE, edge_points
 
 # Most points along a side, of each round: the first only has to get near.

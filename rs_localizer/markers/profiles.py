@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 
 # px between the samples of a profile; more for one that reaches farther than so many steps.
 _STEP, _MOST_STEPS = 0.5, 7

@@ -13,7 +13,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import inlined, kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 
 _BLOCK = 256  # landmarks whose words stay in the first cache
 _FAR = 1 << 30

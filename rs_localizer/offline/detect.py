@@ -18,7 +18,6 @@ from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, CORRESPONDENCES_TOPIC, IMAGE_TOPIC
-from rs_localizer.io.whole import whole
 from rs_localizer.localizer import Localizer
 from rs_localizer.markers.displaced import LeaveOneOut, Predict
 from rs_localizer.markers.maps import MarkerMap
@@ -94,7 +93,7 @@ def record(
     """
     tally = _Tally(detector.map)
     cameras = Cameras(options.scan_direction)
-    with whole(out), BagWriter(out, options.storage) as bag:
+    with BagWriter(out, options.storage) as bag:
         for shot in shots:
             if isinstance(shot, Carried):
                 tally.carried[shot.topic] += 1

@@ -11,7 +11,6 @@ import numpy as np
 
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.recording import CAMERA_INFO_TOPIC, IMAGE_TOPIC, KEYPOINTS_TOPIC
-from rs_localizer.io.whole import whole
 from rs_localizer.offline.detect import Cameras, DetectError, Options
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.features import Extracted, FrameExtractor, keypoints
@@ -56,7 +55,7 @@ def record_features(
     """
     told = Extraction()
     cameras = Cameras(options.scan_direction)
-    with whole(out), BagWriter(out, options.storage) as bag:
+    with BagWriter(out, options.storage) as bag:
         for shot in shots:
             if isinstance(shot, Carried):
                 told.carried[shot.topic] += 1

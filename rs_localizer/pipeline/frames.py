@@ -10,7 +10,6 @@ from typing import Any
 
 from rs_localizer.config import MatchBy, NodeConfig
 from rs_localizer.core.reasons import Notice, Reason
-from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import Correspondences, EmptyCloudError, read_correspondences
@@ -225,27 +224,25 @@ class FrameLocalizer:
             result = self.imu.track(
                 method.follower, method.config, time_ns, frame, self.transforms, given
             )
+        watch = self.readout_watch
+        config = watch.add(
+            method.config, method.camera, method.middle_row_ns(cloud.stamp_ns), result, cloud
+        )
+        wrong_axis = watch.wrong_axis
+        if config is not method.config:
+            self._use(method.calibration, config)
+        if wrong_axis:
+            return Refusal(Reason.SCAN_AXIS, wrong_axis)
         if not result:
             return Refusal(result.reason, result.detail)
-        if result.lens is not None:
+        if result.lens is not None and not watch.axis_in_doubt:
             self._notice(Notice.LENS, lens_is_off(result.lens))
-        self._watch_readout(cloud, result)
-        watch = self.readout_watch
         known = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
         return self.mounted(of_camera(cloud, result, method.config, method.camera, frame, known))
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""
         return of_body(localized, self.config, self.transforms)
-
-    def _watch_readout(self, cloud: Correspondences, estimate: Estimate) -> None:
-        method = self._method
-        time_ns = method.middle_row_ns(cloud.stamp_ns)
-        lens, camera = estimate.lens, method.camera
-        camera = camera if lens is None else lens.mended(camera)
-        config = self.readout_watch.add(method.config, camera, time_ns, estimate, cloud)
-        if config is not method.config:
-            self._use(method.calibration, config)
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""

@@ -12,9 +12,10 @@ from rs_localizer.config import LONGEST_READOUT_TIME, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Notice
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.core.types import Estimate
+from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.pipeline.refusal import Notify
+from rs_localizer.pipeline.scan_axis import ScanAxis
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.trajectory.measured_readout import MeasuredReadout, Measurement
 from rs_localizer.trajectory.online import REVERSED, ReadoutMonitor, warm_up
@@ -41,6 +42,7 @@ class _Kind(Enum):
     DURATION = auto()
     REVERSED = auto()
     GLOBAL = auto()
+    AXIS = auto()
 
 
 class ReadoutWatch:
@@ -54,6 +56,7 @@ class ReadoutWatch:
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
         self._monitor = ReadoutMonitor()
+        self._axis = ScanAxis()
         self._under_way: Measurement | None = None
         self._frames, self._next = 0, _AT_FIRST
         self._said: set[_Kind] = set()
@@ -80,6 +83,18 @@ class ReadoutWatch:
         return not (self.far_off or self.doubtful)
 
     @property
+    def axis_in_doubt(self) -> bool:
+        """Whether frames fit better with the other axis: then nothing else that they say holds."""
+        return self._axis.doubtful
+
+    @property
+    def wrong_axis(self) -> str:
+        """Why no pose may be published: the shutter moves along the other axis; empty: it may."""
+        if self._axis.undecided:
+            return "the image fits a shutter along the other axis better than scan_direction"
+        return self.fault if self._axis.wrong else ""
+
+    @property
     def may_be_reversed(self) -> bool:
         """Whether rows may run the other way: then an image begins where it is said to end."""
         return self._reversed or (self.doubtful and self._monitor.odds.may_be_reversed)
@@ -96,6 +111,7 @@ class ReadoutWatch:
     def reset(self) -> None:
         """Forget all frames."""
         self._monitor.reset()
+        self._axis.reset()
         self._under_way = None
         self._frames, self._next = 0, _AT_FIRST
         self._said.clear()
@@ -108,31 +124,58 @@ class ReadoutWatch:
         config: NodeConfig,
         camera: Camera,
         time_ns: int,
-        estimate: Estimate,
+        result: Estimate | Failure,
         cloud: Correspondences,
     ) -> NodeConfig:
-        """Take a localized frame whose middle row was exposed at ``time_ns``.
+        """Take a frame whose middle row was exposed at ``time_ns``, and what came of it.
 
         Returns:
-            the settings, with the readout time that was found where they ask for it.
+            the settings, with the readout time and scan direction that were measured where they
+            ask for it.
         """
         estimates = config.estimate_readout_time and config.readout_time == 0.0
         wanted = estimates or config.readout_time > 0.0
         if not (wanted and find_solver(config.solver).rolling_shutter):
             return config
+        self._axis.add(config, camera, time_ns, cloud, result)
+        if self._axis.wrong:
+            return self._other_axis(config, estimates)
+        if not result:
+            return config
+        lens = result.lens
+        camera = camera if lens is None else lens.mended(camera)
         try:
-            found = self._measure(camera, time_ns, estimate, cloud)
+            found = self._measure(camera, time_ns, result, cloud)
         except np.linalg.LinAlgError:  # a frame that says nothing must not stop the next ones
             self._monitor.reset()
             self._under_way, self.doubtful = None, False
             return config
+        if self._axis.doubtful:
+            return config
         if found is not None:
             self.measured = found
             if estimates:
-                return self._adopt(config, found)
+                return self._adopt(config, found, ScanDirection(config.scan_direction))
             self._judge(config, found, _wrong(config, found))
         self._doubt(config)
+        if _is_some(config, self.measured):
+            self._axis.confirm()
+        elif self.far_off or self.doubtful:
+            self._axis.suspect()
         return config
+
+    def _other_axis(self, config: NodeConfig, estimates: bool) -> NodeConfig:
+        """Say that the shutter moves along the other axis, or adopt it."""
+        found, direction = self._axis.measured, self._axis.direction
+        assert found is not None
+        assert direction is not None
+        value = _milliseconds(abs(found.readout_time), found.deviation)
+        self._contradict(
+            _Kind.AXIS,
+            f"the image shows a shutter that moves {direction} in {value}, not "
+            f"{config.scan_direction}; no poses are published until scan_direction is {direction}",
+        )
+        return self._adopt(config, found, direction) if estimates else config
 
     def _doubt(self, config: NodeConfig) -> None:
         """What a few frames tell, as long as a measurement says nothing else."""
@@ -187,13 +230,19 @@ class ReadoutWatch:
         found, self._under_way = self._under_way.found, None
         return found
 
-    def _adopt(self, config: NodeConfig, found: MeasuredReadout) -> NodeConfig:
+    def _adopt(
+        self, config: NodeConfig, found: MeasuredReadout, along: ScanDirection
+    ) -> NodeConfig:
+        """The settings with a measured readout time, once it is well known.
+
+        Args:
+            along: the direction in which it would be positive.
+        """
         value = abs(found.readout_time)
         known = found.relative_deviation < _WELL_KNOWN and found.triples >= _ENOUGH
         if not known or value > LONGEST_READOUT_TIME:
             return config
-        given = ScanDirection(config.scan_direction)
-        direction = given if found.readout_time > 0.0 else REVERSED[given]
+        direction = along if found.readout_time > 0.0 else REVERSED[along]
         self._notice(
             Notice.READOUT_TIME,
             f"estimated: {_milliseconds(value, found.deviation)}, {direction}; set readout_time to "

@@ -64,6 +64,12 @@ REASONS: dict[str, Meaning] = {
         "come nearer, use a larger board or markers on several walls; leave tracking on, give the "
         "velocity_prior of a slow camera, or raise the limit where a filter weighs each pose",
     ),
+    Reason.SCAN_AXIS: Meaning(
+        "the shutter moves over the columns, not the rows, or the other way about: scan_direction "
+        "names the wrong axis",
+        "set scan_direction to the direction that the message names; a driver that rotates images "
+        "rotates the scan, too",
+    ),
     Reason.NO_CAMERA_INFO: Meaning(
         "no usable camera_info came before it", "is it recorded, is its topic the right one?"
     ),

@@ -1,35 +1,49 @@
-"""Ctrl-C and SIGTERM as an orderly end.
+"""Ctrl-C, SIGTERM and SIGHUP as an orderly end.
 
 Imports nothing that takes time, so that a program can begin with it.
 """
 
 from __future__ import annotations
 
-import abc
 import contextlib
 import os
 import signal
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import ClassVar, Self
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # What shells report of a program that a signal ended: 130 for Ctrl-C, 143 for SIGTERM.
 _SIGNALLED = 128
 INTERRUPTED = _SIGNALLED + signal.SIGINT
 """Exit code after Ctrl-C."""
 
+# Packages whose Python is called back from C: an exception there is lost, comes out as a
+# SystemError, or leaves machine code half loaded (SIGSEGV, 11 of 147 random signals). An import
+# that breaks off leaves half a module.
+_FRAGILE = ("numba", "llvmlite", "importlib", "_frozen_importlib")
+# s: how often it is tried to interrupt them; so long compiling may take, of which nothing stays.
+_PERIOD, _PATIENCE = 0.02, 2.0
+# s until an exception that nobody handles counts as lost, as in a finalizer; unwinding takes less.
+_LOST = 0.5
 
-class _Signals(abc.ABC):
-    """Within ``with``, SIGINT and SIGTERM come to :meth:`_stop`.
 
-    Leaving ignores both for good, since the process is about to end: a launch file and a terminal
-    send theirs at the same time.
+class StopRequest:
+    """Within ``with``, signals set :attr:`requested` and raise nothing.
+
+    An exception in the middle of a callback, or of rclpy's own clean-up, is lost or breaks it.
+    Leaving ignores signals for good, since the process is about to end: a launch file and a
+    terminal send theirs at the same time.
     """
 
     code: ClassVar[int] = 0
     """What shells report of a program that was ended by the signal that came, to whichever of
     several that are entered within each other; 0: none has come."""
+
+    clean_up: ClassVar[list[Callable[[], None]]] = []
+    """Called before the process ends in the middle of its work."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -37,7 +51,8 @@ class _Signals(abc.ABC):
 
     def __enter__(self) -> Self:
         for number in _SIGNALS:
-            signal.signal(number, self._take)
+            if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGINT:  # nohup
+                signal.signal(number, self._take)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -58,51 +73,70 @@ class _Signals(abc.ABC):
         """
         before, self._at_once = self._at_once, (code, text)
         try:
+            if self.requested:
+                self._leave(code, text)
             yield
         finally:
             self._at_once = before
 
     def _take(self, number: int, frame: FrameType | None) -> None:
-        _Signals.code = _SIGNALLED + number
-        self._leave_if_at_once()
+        StopRequest.code = _SIGNALLED + number
+        if self._at_once is not None:
+            self._leave(*self._at_once)
         first, self.requested = not self.requested, True
         if first:
-            self._stop()
+            self._stop(frame)
 
-    def _leave_if_at_once(self) -> None:
-        if self._at_once is not None:
-            code, text = self._at_once
-            os.write(2, text.encode())
-            os._exit(self.code if code is None else code)
+    def _leave(self, code: int | None, text: str) -> None:
+        for function in self.clean_up:
+            function()
+        os.write(2, text.encode())
+        os._exit(self.code if code is None else code)
 
-    @abc.abstractmethod
-    def _stop(self) -> None:
+    def _stop(self, frame: FrameType | None) -> None:
         """Take the first signal."""
 
 
-class StopSignals(_Signals):
-    """The first signal raises KeyboardInterrupt wherever the main thread is; more change nothing.
+class StopSignals(StopRequest):
+    """The first signal raises KeyboardInterrupt in the main thread; more change nothing.
 
+    It waits until none of :data:`_FRAGILE` is on the stack, at most :data:`_PATIENCE`: then the
+    process ends. Where the exception gets lost, it is raised again.
     Enter it before ``rclpy.init``: rclpy's own handlers call those that they found.
     """
 
-    def _stop(self) -> None:
-        raise KeyboardInterrupt
+    last_words = "interrupted\n"
+    """Written to stderr where the process ends in the middle of its work."""
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+    def _stop(self, frame: FrameType | None) -> None:
+        self._deadline = time.monotonic() + _PATIENCE
+        signal.signal(signal.SIGALRM, lambda _, frame: self._interrupt(frame))
+        self._interrupt(frame)
+
+    def _interrupt(self, frame: FrameType | None) -> None:
+        fragile = _is_fragile(frame)
+        signal.setitimer(signal.ITIMER_REAL, _PERIOD if fragile else _LOST)
+        if fragile:
+            if time.monotonic() > self._deadline:
+                self._leave(None, self.last_words)
+        elif not _is_handled(sys.exception()):
+            raise KeyboardInterrupt
 
 
-class StopRequest(_Signals):
-    """Signals set :attr:`requested` and raise nothing.
+def _is_fragile(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in _FRAGILE:
+            return True
+        frame = frame.f_back
+    return False
 
-    An exception in the middle of a callback, or of rclpy's own clean-up, is lost or breaks it.
-    """
 
-    @contextlib.contextmanager
-    def at_once(self, code: int | None = 0, text: str = "") -> Iterator[None]:
-        """As of all; what was requested before it is not put off until it is over."""
-        with super().at_once(code, text):
-            if self.requested:
-                self._leave_if_at_once()
-            yield
-
-    def _stop(self) -> None:
-        pass
+def _is_handled(error: BaseException | None) -> bool:
+    """Whether a KeyboardInterrupt is what somebody cleans up after."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.algebra import multiply
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES, Vector
+from rs_localizer.core.simd.algebra import multiply
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES, Vector
 
 MODEL_SIZE = 18
 

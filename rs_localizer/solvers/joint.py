@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.solvers import r6p_two_step, r6p_vcwt
 
 SAMPLE_SIZE = 6

@@ -16,14 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rs_localizer.core.lanes.algebra import (
+from rs_localizer.core.simd.algebra import (
     back_substitute,
     least_squares,
     multiply,
     nearest_rotation,
     triangularize,
 )
-from rs_localizer.core.lanes.simd import Vector
+from rs_localizer.core.simd.tracing import Vector
 
 Column = tuple[Vector, Vector]  # coefficients of one unknown in the equations of either kind
 

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.algebra import cross, dot
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, select, sqrt, traced
+from rs_localizer.core.simd.algebra import cross, dot
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, select, sqrt, traced
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
 
 SAMPLE_SIZE = 3

@@ -26,11 +26,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.algebra import cross, dot, least_squares, triangularize
-from rs_localizer.core.lanes.eigenvalues import real_eigenvalues, reduce_to_hessenberg
-from rs_localizer.core.lanes.jit import inlined, kernel
-from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, select, traced
-from rs_localizer.core.lanes.vectors import lane_array
+from rs_localizer.core.simd.algebra import cross, dot, least_squares, triangularize
+from rs_localizer.core.simd.eigenvalues import real_eigenvalues, reduce_to_hessenberg
+from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, select, traced
+from rs_localizer.core.simd.vectors import lane_array
 from rs_localizer.solvers import linear, rank_drop
 from rs_localizer.solvers.batch import MODEL_SIZE, Sample, gather, inputs, scatter
 from rs_localizer.solvers.rank_drop import RELATIONS, SOLUTIONS

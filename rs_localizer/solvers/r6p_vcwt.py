@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.algebra import cross, multiply, nearest_rotation
-from rs_localizer.core.lanes.jit import kernel
-from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced
+from rs_localizer.core.simd.algebra import cross, multiply, nearest_rotation
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
 from rs_localizer.solvers import linear
 from rs_localizer.solvers.batch import Sample, gather, inputs, scatter
 

@@ -7,7 +7,7 @@ matrix, whose eigenvalues are the values of y at the 20 solutions (Cox, Little, 
 Algebraic Geometry", 2005, sec. 2.4); at each of them the relations are linear in the ten
 monomials of x and z.
 
-Everything happens in lanes (:mod:`rs_localizer.core.lanes.vectors`). The matrix is stored by rows
+Everything happens in lanes (:mod:`rs_localizer.core.simd.vectors`). The matrix is stored by rows
 of four entries of four coefficients: of 1, x, y and z.
 """
 
@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lanes.algebra import least_squares
-from rs_localizer.core.lanes.jit import inlined, kernel
-from rs_localizer.core.lanes.simd import LANES, Lanes, Vector, traced
-from rs_localizer.core.lanes.vectors import load, root, store, uniform, where_less
+from rs_localizer.core.simd.algebra import least_squares
+from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
+from rs_localizer.core.simd.vectors import load, root, store, uniform, where_less
 
 SOLUTIONS = 20
 RELATIONS = 10 * SOLUTIONS  # y m + sum_j relation[m, j] basis_j = 0
@@ -194,7 +194,7 @@ def _back_substitute(work: Array, relations: Array) -> None:
 
 @inlined
 def fill_multiplication(relations: Array, h: Array) -> None:
-    """Multiplication by y as a matrix, stored as in :mod:`rs_localizer.core.lanes.eigenvalues`."""
+    """Multiplication by y as a matrix, stored as in :mod:`rs_localizer.core.simd.eigenvalues`."""
     for i in range((SOLUTIONS + 1) ** 2):
         store(h, i, uniform(0.0))
     for i in range(SOLUTIONS):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 

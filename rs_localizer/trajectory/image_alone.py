@@ -8,8 +8,8 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import write
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.lanes.jit import inlined, kernel
 from rs_localizer.core.shutter import Motion
+from rs_localizer.core.simd.jit import inlined, kernel
 
 # Directions that the image does not see: least eigenvalue of the information, diagonal scaled to 1.
 _LEAST_EIGENVALUE = 1e-9

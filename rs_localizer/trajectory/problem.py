@@ -60,7 +60,8 @@ class Problem:
         self.shape_information: Array | None = None
         if freedom.paper and self.pieces.count:
             seen = observations.landmarks[self.pieces.slots >= 0]
-            self.shape_information = np.linalg.inv(paper_covariance(seen, freedom.landmarks))
+            covariance = paper_covariance(seen, freedom.landmarks)
+            self.shape_information = np.asarray(np.linalg.inv(covariance), np.float64)
         readout = 1 if freedom.readout_time else 0
         self.border = readout + self.lens_count + self.pieces.columns
         self.gyro: GyroTerms | None = None

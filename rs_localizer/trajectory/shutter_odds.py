@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.trajectory.online_kernels import SIDE, Equations
 
@@ -93,6 +93,11 @@ class ShutterOdds:
         scatter = float(self._left[0, _NONE]) / (SIDE * max(self._count, 1.0))
         against = min(self.logarithm, self._odds(_NONE, _REVERSED))
         return scatter < _MOST_SCATTER and against > _CERTAIN
+
+    @property
+    def rolling(self) -> float:
+        """Logarithm of the odds for the readout time that is set, either way, against none."""
+        return max(self._odds(_SET, _NONE), self._odds(_REVERSED, _NONE))
 
     @property
     def may_be_reversed(self) -> bool:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.core.lanes.jit import kernel
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.trajectory.spline_kernels import (
     CONTROL,
     LOCAL,

@@ -151,14 +151,14 @@ def test_sigterm_ends_a_running_command_in_one_line(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
     )
-    while not (tmp_path / "bag").exists():
+    while not list(tmp_path.glob(".unfinished-*/bag")):
         assert process.poll() is None
         time.sleep(0.02)
     time.sleep(0.5)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (143, "rs_localizer simulate: interrupted\n")
-    assert not (tmp_path / "bag").exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path: Path) -
         stderr=subprocess.PIPE,
         text=True,
     )
-    while not (tmp_path / "bag").exists():
+    while not list(tmp_path.glob(".unfinished-*/bag")):
         assert process.poll() is None
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)

@@ -18,10 +18,10 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.trajectories import read_tum, read_twists
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.recording import write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import ConstantVelocity
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.recording import write_simulated
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
 FRAMES = 6

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rs_localizer.cli.main import main
-from rs_localizer.core.lanes.jit import cache_directory
+from rs_localizer.core.simd.jit import cache_directory
 
 
 def test_it_says_where_the_kernels_are(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from rs_localizer import data
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
@@ -51,7 +52,7 @@ def test_hand_motion() -> None:
 
 
 def test_slow_hand_motion() -> None:
-    trajectory = read_tum(data.path(data.SLOW_HAND_MOTION))
+    trajectory = read_tum(SLOW_HAND_MOTION)
     assert len(trajectory) == 3000
     speeds = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
     seconds = np.diff(trajectory.stamps_ns) * 1e-9
@@ -59,7 +60,7 @@ def test_slow_hand_motion() -> None:
 
 
 def test_global_shutter_tags() -> None:
-    with open_bag(data.path(data.GLOBAL_SHUTTER_TAGS)) as bag:
+    with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         (info, *_) = (message for _, _, message in bag.messages(["/camera/camera_info"]))
         clouds = [read_correspondences(m) for _, _, m in bag.messages(["/camera/correspondences"])]
     assert len(clouds) == 450

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import itertools
 import re
 import shlex
 
 import pages
 import pytest
 
+from benchmarks.__main__ import EXPERIMENTS
 from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.settings import parse_assignment, settings
@@ -56,6 +58,9 @@ def test_modules_exist(page: str, module: str, words: str) -> None:
     if module == "pytest":
         for word in shlex.split(words):
             assert not word.startswith("test/") or (pages.ROOT / word).exists(), word
+    if module == "benchmarks":
+        names = itertools.takewhile(lambda word: word[0] not in "-#", words.split())
+        assert set(names) <= set(EXPERIMENTS), words
 
 
 @pytest.mark.parametrize(("page", "line"), _LAUNCHES)

@@ -14,9 +14,9 @@ import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.simulation.frames import FrameSettings, frame_stamps, simulate_frames
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import RecordedMotion
+from rs_localizer.simulation.frames import FrameSettings, frame_stamps, simulate_frames
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import RecordedMotion
 
 # The reference shows signatures, no examples.
 WITH_EXAMPLES = [p for p in pages.NAMES if p != "docs/api.md" and pages.fenced(p, "python")]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.frames.conditions import named
+from benchmarks.frames.judged import judge
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.curvature import along_arcs, told_from
 from rs_localizer.estimation.refine import apply_step
-from rs_localizer.lab.experiments.honesty.small_planes import Condition, measure
 
 CENTRE = np.array([0.3, -0.2, 3.0])
 TURNS, MOVES = np.diag([0.05, 0.03, 0.02]), np.diag([0.001, 0.002, 0.02])
@@ -67,7 +68,7 @@ def test_steps_from_one_state_are_told_from_another() -> None:
 
 def test_regions_before_a_small_tilted_plane_hold_under_motion() -> None:
     """Along the ellipsoid's own axes they held in half of the frames."""
-    found = measure(Condition(size=0.6, distance=3.0, tilt=30.0, turn=10.0), frames=40, seed=2)
-    assert np.mean(found.middle.localized) > 0.8
-    for scores in (found.stamp, found.middle):
-        assert np.mean(scores.inside("pose")) >= 0.85
+    found = judge(named("planes/0.6m/tilt 30/10deg/1px"), 40, 2, {})
+    assert np.mean(found.localized) > 0.8
+    for moment in ("pose_s", "pose"):
+        assert np.mean(found.inside(moment)) >= 0.85

@@ -8,22 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rs_localizer.core.lens import LensError
-from rs_localizer.core.reasons import Reason
-from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.experience import Experience
-from rs_localizer.estimation.lens import joined, odds_of
-from rs_localizer.lab.experiments.honesty.estimating import (
+from benchmarks.honesty.estimating import (
     believed,
     estimate,
     frames_of,
     scored,
     truth_of,
 )
-from rs_localizer.lab.independent.cameras import Camera
-from rs_localizer.lab.independent.motions import hand, vibration
-from rs_localizer.lab.independent.rotations import logarithm
-from rs_localizer.lab.independent.scenes import Rich, Wall
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.motions import hand, vibration
+from benchmarks.independent.rotations import logarithm
+from benchmarks.independent.scenes import Rich, Wall
+from rs_localizer.core.lens import LensError
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.experience import Experience
+from rs_localizer.estimation.lens import joined, odds_of
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.moments import pose_at
 from rs_localizer.tracking import Tracker

@@ -5,16 +5,16 @@ import pytest
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.lanes.simd import LANES
+from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Motion
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.observing import find_usable, packed
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.relinearized import relinearized
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.localizer import Localizer
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
 
 K = np.array([[250.0, 0.0, 319.5], [0.0, 250.0, 239.5], [0.0, 0.0, 1.0]])
 FISHEYE = Camera(

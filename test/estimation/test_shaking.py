@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.frames.conditions import named
+from benchmarks.frames.judged import judge
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.estimation.model_error import gain_of_shaking
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.shake_sizes import _share, sizes_and_step
 from rs_localizer.estimation.shaking import Scales, follow
-from rs_localizer.lab.experiments.honesty.vibration import Condition, measure
 from rs_localizer.localizer import assumptions
 from rs_localizer.solvers.table import find_solver
 
@@ -182,7 +183,7 @@ def test_sizes_step_and_noise_are_those_of_plain_matrices():
 
 def test_fast_shaking_that_the_rows_show_is_followed_and_not_refused():
     """A camera at rest before a wrong map explains much of it, but not that rows agree."""
-    found = measure(Condition(degrees=0.3, hertz=100.0, noise=0.1, tracking=False), 15, seed=1)
-    assert np.mean(found.middle.localized) > 0.9
-    assert np.mean(found.middle.inside("pose")) > 0.7
-    assert found.middle.median("orientation") < 0.03  # deg, of 0.3 that it shakes
+    found = judge(named("sine/0.3deg/100Hz/0.3px"), 15, 1, {})
+    assert np.mean(found.localized) > 0.9
+    assert np.mean(found.inside("pose")) > 0.7
+    assert np.median(found.of("deg")) < 0.03  # deg, of 0.3 that it shakes

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.honesty.estimating import believed
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.frames import simulate
+from benchmarks.independent.motions import hand, vibration
+from benchmarks.independent.scenes import Rich
 from rs_localizer.estimation.spectrum import CYCLES, SWINGS
 from rs_localizer.estimation.tone_memory import leaning, with_frame
-from rs_localizer.lab.experiments.honesty.estimating import believed
-from rs_localizer.lab.independent.cameras import Camera
-from rs_localizer.lab.independent.frames import simulate
-from rs_localizer.lab.independent.motions import hand, vibration
-from rs_localizer.lab.independent.scenes import Rich
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

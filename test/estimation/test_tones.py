@@ -5,6 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
+from benchmarks.frames.conditions import named
+from benchmarks.frames.judged import judge
 from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.columns import Columns
@@ -16,7 +18,6 @@ from rs_localizer.estimation.spectrum import CYCLES, SWINGS, loudest, powers, sp
 from rs_localizer.estimation.tone_mixture import averaged
 from rs_localizer.estimation.tone_search import find_tones
 from rs_localizer.estimation.tones import Tones, fitted, seen_at
-from rs_localizer.lab.experiments.honesty.vibration import Condition, measure
 
 from .projection import jacobian_of
 from .test_settling import ASSUMED, PRIOR, frame
@@ -235,7 +236,7 @@ def test_few_points_cannot_tell():
 
 def test_large_fast_shaking_is_followed_through_the_whole_method():
     """One degree at 200 Hz: seven pixels, six times in a readout."""
-    found = measure(Condition(degrees=1.0, hertz=200.0, noise=0.1, tracking=False), 15, seed=8)
-    assert found.middle.localized.all()
-    assert np.mean(found.middle.inside("pose")) > 0.85
-    assert found.middle.median("orientation") < 0.02  # deg
+    found = judge(named("sine/1deg/200Hz/0.3px"), 15, 8, {})
+    assert found.localized.all()
+    assert np.mean(found.inside("pose")) > 0.85
+    assert np.median(found.of("deg")) < 0.02  # deg

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rs_localizer.features.selection import balanced
+from rs_localizer.features.extraction import balanced
 
 
 def test_all_are_kept_where_they_are_few() -> None:

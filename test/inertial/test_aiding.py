@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.honesty.estimating import believed
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.gyroscopes import Imu
+from benchmarks.independent.motions import hand, shaken_hand
+from benchmarks.independent.scenes import Rich
+from benchmarks.inertial.recordings import follow, record
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.status import Alone
-from rs_localizer.lab.experiments.honesty.estimating import believed
-from rs_localizer.lab.experiments.inertial.recordings import follow, record
-from rs_localizer.lab.independent.cameras import Camera
-from rs_localizer.lab.independent.gyroscopes import Imu
-from rs_localizer.lab.independent.motions import hand, shaken_hand
-from rs_localizer.lab.independent.scenes import Rich
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

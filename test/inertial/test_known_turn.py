@@ -5,9 +5,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
+from rs_localizer.core.gyro_compensated import gyro_compensated
 from rs_localizer.core.known_turn import KnownTurn, late_at
 from rs_localizer.core.so3 import hat
-from rs_localizer.core.steadied import steadied
 from rs_localizer.inertial.band import densified
 
 TAU = np.linspace(-0.8, 0.8, 33)
@@ -67,25 +67,25 @@ def test_times_must_increase(tau):
         KnownTurn.of(tau, np.zeros((len(tau), 3)))
 
 
-def test_steadied_bearings_are_those_of_the_middle_row():
+def test_compensated_bearings_are_those_of_the_middle_row():
     rng = np.random.default_rng(1)
     rays, tau = rng.uniform(-0.6, 0.6, (20, 2)), rng.uniform(-0.5, 0.5, 20)
     turn = KnownTurn.of(TAU, shaking(TAU))
     by_ray = np.broadcast_to(400.0 * np.eye(2), (20, 2, 2)).copy()
-    found, _ = steadied(rays, tau, by_ray, np.zeros(2), turn)
+    found, _ = gyro_compensated(rays, tau, by_ray, np.zeros(2), turn)
     bearings = np.column_stack([rays, np.ones(20)])
     expected = np.einsum("nji,nj->ni", turn.at_rows(tau)[0], bearings)
     np.testing.assert_allclose(found, expected[:, :2] / expected[:, 2:], atol=1e-14)
 
 
-def test_derivatives_of_steadied_bearings_by_differences():
+def test_derivatives_of_compensated_bearings_by_differences():
     """Noise of the pixel moves the bearing and, with the row time, the turn."""
     turn, gradient, step = KnownTurn.of(TAU, shaking(TAU)), np.array([3e-4, 2e-3]), 1e-4
     ray, tau, focal = np.array([0.2, -0.3]), 0.21, 400.0
 
     def steady(pixel):  # where a pixel's own row time puts its bearing
         later = tau + gradient @ (pixel - focal * ray)
-        return steadied(
+        return gyro_compensated(
             pixel[None] / focal, np.array([later]), np.zeros((1, 2, 2)), gradient, turn
         )[0][0]
 
@@ -95,14 +95,14 @@ def test_derivatives_of_steadied_bearings_by_differences():
             for axis in np.eye(2)
         ]
     ).T
-    _, found = steadied(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
+    _, found = gyro_compensated(ray[None], np.array([tau]), focal * np.eye(2)[None], gradient, turn)
     np.testing.assert_allclose(found[0] @ by_pixel, np.eye(2), atol=1e-6)
 
 
 def test_bearings_that_turn_behind_the_camera_are_left_out():
     turn = KnownTurn.of(TAU, np.broadcast_to([0.0, 3.0, 0.0], (len(TAU), 3)).copy())
     rays = np.array([[0.0, 0.0], [-30.0, 0.0], [30.0, 0.0]])
-    found, _ = steadied(rays, np.full(3, 0.5), np.ones((3, 2, 2)), np.zeros(2), turn)
+    found, _ = gyro_compensated(rays, np.full(3, 0.5), np.ones((3, 2, 2)), np.zeros(2), turn)
     assert np.isfinite(found[0, 0])
     assert np.isnan(found[1:]).any()
 

@@ -6,14 +6,14 @@ from functools import partial
 import numpy as np
 import pytest
 
+from benchmarks.honesty.estimating import believed
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.gyroscopes import Imu
+from benchmarks.independent.motions import hand, rest, shaken_hand
+from benchmarks.independent.scenes import Rich
+from benchmarks.inertial.recordings import record
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.sight import sight_of
-from rs_localizer.lab.experiments.honesty.estimating import believed
-from rs_localizer.lab.experiments.inertial.recordings import record
-from rs_localizer.lab.independent.cameras import Camera
-from rs_localizer.lab.independent.gyroscopes import Imu
-from rs_localizer.lab.independent.motions import hand, rest, shaken_hand
-from rs_localizer.lab.independent.scenes import Rich
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import array
 import struct
+import subprocess
+import sys
 import zlib
 from types import SimpleNamespace
 from typing import Any
@@ -224,3 +226,25 @@ def test_a_jpeg_that_hides_its_size_is_not_decoded() -> None:
     hidden = JPEG[:2] + b"junk" + JPEG[2:]
     with pytest.raises(MessageError, match="cannot be decoded: no header tells its size"):
         read_compressed_image(compressed(hidden))
+
+
+def test_an_animated_png_is_read_as_its_still_image() -> None:
+    """OpenCV 5.0 ends the process by SIGSEGV; hence a process of its own."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return len(body).to_bytes(4) + kind + body + zlib.crc32(kind + body).to_bytes(4)
+
+    rows = chunk(b"IDAT", zlib.compress((b"\0" + bytes(range(16))) * 12))
+    control = struct.pack(">5I2H2B", 2, 8, 6, 3, 3, 1, 10, 0, 0)
+    animated = png_of(16, 12)[:33] + chunk(b"acTL", struct.pack(">II", 3, 0))
+    animated += rows + chunk(b"fcTL", control) + rows + chunk(b"IEND", b"")
+    program = (
+        "import sys; from types import SimpleNamespace as N\n"
+        "from rs_localizer.io.images import read_compressed_image\n"
+        "header = N(stamp=N(sec=0, nanosec=0), frame_id='camera')\n"
+        "data = sys.stdin.buffer.read()\n"
+        "print(read_compressed_image(N(header=header, format='png', data=data)).pixels.shape)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], input=animated, capture_output=True)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.split() == [b"(12,", b"16)"]

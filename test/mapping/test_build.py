@@ -16,11 +16,10 @@ from scipy.spatial.transform import Rotation
 from rs_localizer import data
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.evaluation.room_mapping import Errors, Piece, Room, without_refinement
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.lab.experiments.room_mapping import Errors, Piece, Room, without_refinement
-from rs_localizer.lab.rendering.renderer import ImageSettings
 from rs_localizer.mapping.build import Built
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.inertial_placing import InertialPlace
@@ -28,6 +27,7 @@ from rs_localizer.mapping.report import written
 from rs_localizer.mapping.similarity import through
 from rs_localizer.mapping.structure import DATABASE, SPARSE
 from rs_localizer.mapping.views import View
+from rs_localizer.simulation.renderer import ImageSettings
 
 pytest.importorskip("pycolmap")
 

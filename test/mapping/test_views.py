@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rs_localizer.lab.rendering.textures import collage
 from rs_localizer.mapping.views import Follower, sharpness
+from rs_localizer.simulation.walls import collage
 
 PICTURE = collage(900, 700, np.random.default_rng(0))
 

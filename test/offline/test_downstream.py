@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks import fusion
+from benchmarks.honesty.estimating import believed
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
@@ -22,8 +24,6 @@ from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.px4 import vehicle_odometry
 from rs_localizer.io.recording import CAMERA_FRAME, write_frame
 from rs_localizer.io.transforms.rigid import Transform, make_transform
-from rs_localizer.lab.checks import fusion
-from rs_localizer.lab.experiments.honesty.estimating import believed
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer

@@ -24,11 +24,11 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
 
 Make = Callable[..., SimpleNamespace]
 

@@ -20,13 +20,13 @@ from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
-from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.lab.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=4000)

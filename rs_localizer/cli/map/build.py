@@ -18,11 +18,11 @@ from rs_localizer.cli.image_source import add_source_arguments
 from rs_localizer.cli.map.build_images import Looked, Shutter, look_at_images, shutter_of
 from rs_localizer.cli.map.build_imu import add_imu_arguments, imu_of
 from rs_localizer.config import FeatureConfig
+from rs_localizer.evaluation.map_pictures import save_pictures
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.trajectories import Trajectory, write_tum
-from rs_localizer.io.whole import whole
-from rs_localizer.lab.measures.map_pictures import save_pictures
 from rs_localizer.mapping.anchors import Anchors, Distance
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
 from rs_localizer.mapping.inertial_placing import GivenImu
@@ -102,14 +102,14 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else _marker_map(args.markers)
     shutter, imu = shutter_of(args), imu_of(args)
-    with whole(args.out):
-        args.out.mkdir(parents=True)
+    with atomic_directory(args.out) as out:
+        out.mkdir()
         looker = Looker(args.max_keypoints, markers)
         looked = look_at_images(args, looker, shutter.scan_direction)
         built = _build(
-            args, looked, shutter, Anchors(markers, looked.points, tuple(args.distance)), imu
+            args, looked, shutter, Anchors(markers, looked.points, tuple(args.distance)), imu, out
         )
-        _write(args.out, built, looked)
+        _write(out, built, looked)
     _tell(args, built, looked)
 
 
@@ -135,7 +135,7 @@ def _marker_map(path: Path) -> MarkerMap:
 
 def _build(
     args: argparse.Namespace, looked: Looked, shutter: Shutter, anchors: Anchors,
-    imu: GivenImu | None,
+    imu: GivenImu | None, out: Path,
 ) -> Built:  # fmt: skip
     markers = anchors.marker_map
     given = Given(
@@ -146,7 +146,7 @@ def _build(
         frame=MAP_FRAME if markers is None else markers.map_frame,
         imu=imu,
     )
-    folder = args.out / COLMAP
+    folder = out / COLMAP
     folder.mkdir()
     return build_map(given, Workshop(folder, Effort(args.threads, args.seed), _stage))
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from rs_localizer.cli import UsageError
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.maps.landmarks import Map, make_map
 from rs_localizer.io.maps.ply import write_ply
-from rs_localizer.io.whole import whole_files
 from rs_localizer.markers.families import family
 from rs_localizer.markers.formats.common import USUAL_FAMILY, Unsaid
 from rs_localizer.markers.formats.files import (
@@ -98,15 +98,15 @@ def write(args: argparse.Namespace, found: Map | MarkerMap) -> None:
     path: Path = args.out
     if isinstance(found, Map) and path.suffix not in WRITERS:
         raise UsageError(f"{args.file} holds landmarks, which go to {' or '.join(WRITERS)}")
-    with whole_files(path):
+    with atomic_files(path) as (part,):
         if isinstance(found, MarkerMap) and path.suffix in SUFFIXES:
-            write_any(path, found, args.to or ("wpilib" if path.suffix == ".json" else OWN))
+            write_any(part, found, args.to or ("wpilib" if path.suffix == ".json" else OWN))
         else:
             landmarks = corners(found) if isinstance(found, MarkerMap) else found
             if args.text:
-                write_ply(path, landmarks, binary=False)
+                write_ply(part, landmarks, binary=False)
             else:
-                WRITERS[path.suffix](path, landmarks)
+                WRITERS[path.suffix](part, landmarks)
     print(f"written to {path}")
 
 

@@ -15,12 +15,12 @@ from rs_localizer.cli.map import contradiction
 from rs_localizer.cli.topics import add_topics, given_topics
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.calibration.files import read_calibration, write_calibration
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.topics import IMU
-from rs_localizer.io.whole import whole_files
 from rs_localizer.mapping.recorded import RecordedMap, from_recording
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.offline.recordings import Recorded, read_recording
@@ -163,10 +163,10 @@ def _write(args: argparse.Namespace, landmarks: Map, found: RefinedMap) -> None:
     refined = replace(landmarks, points=found.points, covariances=found.covariances)
     lens = args.out.with_name(f"{args.out.stem}_camera_info.yaml")
     files = [args.out, lens] if args.intrinsics else [args.out]
-    with whole_files(*files):
-        WRITERS[args.out.suffix](args.out, refined)
-        if args.intrinsics:
-            write_calibration(lens, found.camera)
+    with atomic_files(*files) as (part, *lens_part):
+        WRITERS[args.out.suffix](part, refined)
+        if lens_part:
+            write_calibration(lens_part[0], found.camera)
     print(f"written: {', '.join(map(str, files))}")
     left = np.count_nonzero(~found.refined)
     if left:

@@ -16,9 +16,9 @@ from rs_localizer.cli.shots import opened, tell_times
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.images import Image
-from rs_localizer.io.whole import whole_files
 from rs_localizer.mapping.spotting import LEAST_SIDE, Spotted, Spotter, every_marker
 from rs_localizer.mapping.survey import Survey, survey
 from rs_localizer.markers.consistency import problems
@@ -103,8 +103,8 @@ def run(args: argparse.Namespace) -> None:
         for marker, deviations in zip(found.markers, every, strict=True)
     )
     marker_map = MarkerMap(surveyed, map_frame=args.map_frame)
-    with whole_files(args.out):
-        write_marker_map(args.out, marker_map)
+    with atomic_files(args.out) as (part,):
+        write_marker_map(part, marker_map)
     print(f"written: {args.out}")
     for text in problems(marker_map):
         print(f"warning: {text}")

@@ -17,7 +17,7 @@ from typing import IO, Any
 import numba
 from llvmlite import binding
 
-from rs_localizer.core.lanes.jit import cache_directory
+from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.offline.fleet.identity import program
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rs_localizer.io.whole import told
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.offline.fleet.task import Figures
 
 if TYPE_CHECKING:  # half a second of importing, which workers do not need
@@ -48,13 +47,11 @@ def write_summary(out: Path, command: str, rows: Sequence[Row]) -> None:
     They say the same whoever did the work, in whatever order it was done.
     """
     columns = list(dict.fromkeys(name for row in rows for name in row.figures))
-    with told(out):
-        _replace(out / CSV, _as_csv(rows, columns))
-        _replace(out / MARKDOWN, _as_markdown(command, rows, columns))
-        picture = io.BytesIO()
+    with atomic_files(*(out / name for name in (CSV, MARKDOWN, PICTURE))) as (table, text, picture):
+        table.write_bytes(_as_csv(rows, columns))
+        text.write_bytes(_as_markdown(command, rows, columns))
         # Without the version of Matplotlib, which would change the bytes.
         _draw(rows, columns).savefig(picture, dpi=110, metadata={"Software": None})
-        _replace(out / PICTURE, picture.getvalue())
 
 
 def counted(rows: Sequence[Row]) -> str:
@@ -117,13 +114,3 @@ def _draw(rows: Sequence[Row], columns: Sequence[str]) -> Figure:
 def _is_number(row: Row, name: str) -> bool:
     value = row.figures.get(name)
     return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _replace(file: Path, content: bytes) -> None:
-    """Write a file so that who reads it sees the old or the new one."""
-    new = file.with_name(f".{file.name}.new")
-    try:
-        new.write_bytes(content)
-        os.replace(new, file)
-    finally:
-        new.unlink(missing_ok=True)

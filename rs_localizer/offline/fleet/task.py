@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rs_localizer.io.whole import told
+from rs_localizer.io.atomic_files import write_errors
 from rs_localizer.offline.fleet.first import alone_until_compiled
 from rs_localizer.offline.fleet.identity import program, read_marker, write_marker
 
@@ -120,7 +120,7 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
     inner = partial / task.name  # under its final name, which some files repeat
     said = io.StringIO()
     try:
-        with told(partial):
+        with write_errors(partial):
             partial.mkdir(parents=True)
         with (
             _PRINTING,
@@ -128,7 +128,7 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
             contextlib.redirect_stderr(said),
         ):
             figures = _work(task, inner)
-        with told(inner):
+        with write_errors(inner):
             inner.mkdir(exist_ok=True)
             text = said.getvalue().replace(str(inner), task.name)
             (inner / LOG).write_text(text, encoding="utf-8")

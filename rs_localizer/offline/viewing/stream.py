@@ -13,9 +13,9 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.whole import whole_files
 from rs_localizer.offline.replay import Topics
 from rs_localizer.offline.viewing import paths
 from rs_localizer.offline.viewing.blueprint import blueprint
@@ -80,9 +80,9 @@ def write_view(
         scene.log(items, landmarks)
         stream.flush(timeout_sec=_TIMEOUT)
         return
-    with whole_files(file):
-        file.touch()  # what cannot be written says so here
-        stream.save(file, default_blueprint=arranged)
+    with atomic_files(file) as (part,):
+        part.touch()  # what cannot be written says so here
+        stream.save(part, default_blueprint=arranged)
         scene.log(items, landmarks)
         stream.flush()
         stream.disconnect()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rs_localizer.config import FeatureConfig
-from rs_localizer.features.picture import draw_features
+from rs_localizer.features.extraction import draw_features
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.pipeline.features import Extracted, FrameExtractor, keypoints

@@ -11,9 +11,9 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
+from rs_localizer.evaluation.comparison import Answer
 from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.lab.measures.comparison import Answer
 
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # Of the diagnostics: frames that will never be answered.

@@ -19,8 +19,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from rs_localizer.config import PoseTime
+from rs_localizer.evaluation.comparison import Answer, Recording
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES
-from rs_localizer.lab.measures.comparison import Answer, Recording
 from rs_localizer.process.stopping import StopSignals
 from rs_localizer.ros.graph.demo_listener import Listener
 from rs_localizer.ros.node.conversion import copy_message

@@ -24,11 +24,11 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag, typestore
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.lab.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.lab.simulation.recording import write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.ros.node.conversion import copy_message, message_class
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.recording import write_simulated
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
 
 STAND_IN = Path(__file__).parents[1] / "stand_in"
 INSTALLED = importlib.util.find_spec("tf2_ros") is not None

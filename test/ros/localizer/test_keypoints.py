@@ -22,13 +22,13 @@ from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.lab.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
-from rs_localizer.lab.simulation.recording import write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.node.conversion import copy_message, make_message
+from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
+from rs_localizer.simulation.recording import write_simulated
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])

@@ -26,14 +26,14 @@ from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.lab.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.lab.simulation.landmarks import random_descriptors
-from rs_localizer.lab.simulation.recording import write_simulated
-from rs_localizer.lab.simulation.scene import room
-from rs_localizer.lab.simulation.true_motion import ConstantVelocity
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import copy_message
 from rs_localizer.ros.node.run import spin
+from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.landmarks import random_descriptors
+from rs_localizer.simulation.recording import write_simulated
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])

@@ -1,0 +1,1 @@
+"""Experiments, a second simulator to judge by, fuzzing, profiling and load; not installed."""

@@ -1,0 +1,187 @@
+"""``python -m benchmarks NAME``: the paper's experiments and ours, with a verdict on every claim.
+
+This is the only place that names them all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from tqdm import tqdm
+
+from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
+from benchmarks.experiments import (
+    augmented_reality,
+    bound,
+    convergence,
+    features,
+    linearisation,
+    matching,
+    motion,
+    noise,
+    p3p_initialisation,
+    planes,
+    readout_time,
+    real,
+    robustness,
+    timings,
+    tracking,
+    translation,
+)
+from benchmarks.experiments.report import (
+    SUMMARY,
+    count_verdicts,
+    write_result,
+    write_summary,
+)
+from benchmarks.experiments.results import Context, Result, Verdict
+from benchmarks.honesty import experiment as honesty
+from benchmarks.inertial import experiment as inertial
+from rs_localizer import data
+from rs_localizer.settings import load_params_file
+
+T = TypeVar("T")
+
+EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
+    "motion": motion.run,
+    "translation": translation.run,
+    "noise": noise.run,
+    "convergence": convergence.run,
+    "linearisation": linearisation.run,
+    "p3p-initialisation": p3p_initialisation.run,
+    "bound": bound.run,
+    "planes": planes.run,
+    "honesty": honesty.run,
+    "tracking": tracking.run,
+    "inertial": inertial.run,
+    "robustness": robustness.run,
+    "timings": timings.run,
+    "matching": matching.run,
+    "features": features.run,
+    "readout-time": readout_time.run,
+    "real": real.run,
+    "augmented-reality": augmented_reality.run,
+}
+
+# All experiments with so many trials take about a quarter of an hour on two cores.
+_TRIALS = 2000
+_TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
+  frames                           regions, errors and times of frames; two versions compared
+  honesty, mapping                 single benches, and single conditions of them
+  mapped_room, room_by_imu         maps of rendered rooms, by markers and by an IMU
+  fuzzing                          wrong input for everything that reads
+  profiling, frame_times           where the time of a frame goes
+  load, load.signals               a live node under load, and stopped at random moments
+  image_flight, marker_flight      rendered flights through live nodes and through commands
+  signals                          commands that are stopped at random moments
+  fusion                           estimates in the filter of robot_localization
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run experiments; the exit code: 0 done, 1 the work failed, 2 wrong usage."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description="The experiments of the literature and ours: curves, figures, a verdict on "
+        "every claim.",
+        epilog=_TOOLS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_arguments(parser)
+    args = parser.parse_args(argv)
+    unknown = [name for name in args.names if name not in EXPERIMENTS]
+    if unknown:
+        parser.error(f"no experiment {unknown[0]!r}; choose from {', '.join(EXPERIMENTS)}")
+    if args.trials < 1 or args.seed < 0:
+        parser.error(
+            f"--trials must be 1 or more and --seed 0 or more, got {args.trials} and {args.seed}"
+        )
+    try:
+        run(args)
+    except OSError as error:
+        sys.stderr.write(f"{parser.prog}: {error}\n")
+        return 1
+    return 0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"which ones, of {', '.join(EXPERIMENTS)} (default: all)",
+    )
+    parser.add_argument(
+        "--trials",
+        type=int,
+        default=_TRIALS,
+        metavar="N",
+        help="simulated frames per point of a curve; recordings and timings are cut in proportion, "
+        "and below 500 compile times are left out (default: %(default)s, a quarter of an hour in "
+        "all on two cores)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of all random numbers (default: 0)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("experiments"),
+        metavar="DIR",
+        help=f"directory for tables (CSV), figures (PNG) and {SUMMARY} (default: %(default)s)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    names = args.names or list(EXPERIMENTS)
+    args.out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Result] = {}
+    seconds: dict[str, float] = {}
+    for name in dict.fromkeys(names):
+        start = time.perf_counter()
+        results[name] = EXPERIMENTS[name](_context(name, args.trials, args.seed))
+        seconds[name] = time.perf_counter() - start
+        write_result(args.out, results[name])
+        # After each, so that an interrupted run leaves what it found.
+        write_summary(args.out, results, seconds, args.trials, args.seed)
+        _print(name, results[name], seconds[name])
+    claims = [claim for result in results.values() for claim in result.claims]
+    print(f"{count_verdicts(claims)}; written to {args.out / SUMMARY}")
+
+
+def _context(name: str, trials: int, seed: int) -> Context:
+    webcam = data.path(data.WEBCAM)
+    readout_time = load_params_file(webcam / "parameters.yaml")["readout_time"]
+    return Context(
+        trials,
+        seed,
+        partial(_track, name),
+        webcam,
+        readout_time,
+        data.path(data.HAND_MOTION),
+        SLOW_HAND_MOTION,
+        GLOBAL_SHUTTER_TAGS,
+    )
+
+
+def _track(name: str, items: Iterable[T], total: int) -> Iterator[T]:
+    # The bar is for a person who waits: none in a log file.
+    yield from tqdm(items, total=total, desc=name, leave=False, disable=None)
+
+
+def _print(name: str, result: Result, seconds: float) -> None:
+    print(f"{name} ({seconds:.0f} s)")
+    for claim in result.claims:
+        print(f"  {claim.verdict:13} {claim.statement}: {claim.finding}")
+        if claim.verdict is Verdict.NOT_HELD:
+            print(f"  {'':13}   expected: {claim.criterion}")
+    for note in result.notes:
+        print(f"\n{note}\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,12 @@
+"""Recordings that only benchmarks and tests use; each folder has an ATTRIBUTION.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_FOLDER = Path(__file__).parent
+
+SLOW_HAND_MOTION = _FOLDER / "motion" / "tum_rgbd_fr1_xyz.txt.gz"
+"""TUM trajectory at 100 Hz of a hand-held camera that moves slowly; optical axes."""
+GLOBAL_SHUTTER_TAGS = _FOLDER / "global_shutter_tags" / "recording"
+"""Rosbag2 of a real global-shutter camera before surveyed AprilTags."""

@@ -1,0 +1,165 @@
+"""The methods that are compared, and how each gets its estimate from a frame.
+
+Solvers with several solutions: the one with the least robust score over all points of the frame
+is taken, as a robust loop would. P3P alone gets the best of all triplets of the six points, as in
+the paper: the pose whose orientation is nearest to the truth, which no real method could pick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from benchmarks.experiments.errors import angles
+from benchmarks.experiments.kernels import best_solutions, refine_frames
+from benchmarks.experiments.trials import POINTS, Motions, Trials, camera
+from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.arrays import Array
+from rs_localizer.estimation.assumptions import assumptions
+from rs_localizer.solvers.minimal import solve_minimal
+from rs_localizer.solvers.table import SOLVERS, find_solver
+
+_SIX = 6
+_TRIPLETS = np.array(list(combinations(range(_SIX), 3)))
+# Minimal models are scored at this multiple of the inlier threshold, as by the Localizer.
+_SCORE_SCALE = 4.0
+# px: no point of the image is farther off, so that none is cut off.
+_ALL_POINTS_SCALE = 1e4
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A row of the tables and a line of the figures; labels begin with the setting ``solver``."""
+
+    name: str
+    label: str
+    solver: str
+    iterations: int = 5
+    as_published: bool = True
+    refined: bool = False
+
+
+P3P = Method("p3p", "p3p", "p3p")
+R6P = Method("r6p", "r6p", "r6p")
+VC_WT = Method("r6p_vc_wt", "r6p_vc_wt", "r6p_vc_wt")
+VCT_W = Method("r6p_vct_w", "r6p_vct_w", "r6p_vct_w")
+VCT_WT = Method("r6p_vct_wt", "r6p_vct_wt", "r6p_vct_wt")
+VCWT = Method("r6p_vcwt", "r6p_vcwt", "r6p_vcwt")
+R9P = Method("r9p", "r9p", "r9p")
+VCWT_ONCE = Method("r6p_vcwt_1", "r6p_vcwt, one iteration", "r6p_vcwt", iterations=1)
+VCWT_OURS = Method("r6p_vcwt_relinearized", "r6p_vcwt, relinearized", "r6p_vcwt",
+                   as_published=False)  # fmt: skip
+R9P_OURS = Method("r9p_trace_fixed", "r9p, trace fixed", "r9p", as_published=False)
+JOINT = Method("joint", "joint", "joint", as_published=False)
+REFINED = Method("refined", f"ours, refined on {POINTS} points", "r6p_vcwt", as_published=False,
+                 refined=True)  # fmt: skip
+
+PAPERS = (P3P, R6P, VC_WT, VCT_W, VCT_WT, VCWT, R9P)
+TWO_STEP = (VC_WT, VCT_W, VCT_WT)
+OURS = (VCWT_OURS, R9P_OURS, JOINT, REFINED)
+ALL = PAPERS + OURS
+
+
+def available(methods: Iterable[Method]) -> tuple[Method, ...]:
+    """Those whose solver is part of this version."""
+    return tuple(method for method in methods if method.solver in SOLVERS)
+
+
+def estimate(
+    method: Method, trials: Trials, initial: Array | None = None, noise: float = 0.0
+) -> Motions:
+    """Estimates of all frames; NaN where there is none.
+
+    Args:
+        initial: initial rotations (h,3,3); the true ones by default.
+        noise: px, by which a user would choose the inlier threshold.
+    """
+    if method.solver == "p3p":
+        return best_triplet(trials)
+    models = _models(method, trials, trials.truth.rotation if initial is None else initial)
+    threshold = LocalizerConfig().inlier_threshold * max(1.0, noise)
+    if models.shape[1] > 1:
+        models = _best(models, trials, _SCORE_SCALE * threshold)[:, None]
+    if method.refined:
+        return _refined(models[:, 0], trials, threshold)
+    return _motions(models[:, 0])
+
+
+def best_triplet(trials: Trials) -> Motions:
+    """P3P's pose of any three of the first six points, nearest to the true orientation."""
+    models = _triplet_models(trials)
+    apart = angles(models[:, :, :9].reshape(*models.shape[:2], 3, 3),
+                   trials.truth.rotation[:, None])  # fmt: skip
+    best = np.argmin(np.where(np.isnan(apart), np.inf, apart), axis=1)
+    return _motions(models[np.arange(len(models)), best])
+
+
+def plausible_triplet(trials: Trials) -> Motions:
+    """P3P's pose of three of the first six points with the least squared error over all points.
+
+    What can be had without the truth.
+    """
+    return _motions(_best(_triplet_models(trials), trials, _ALL_POINTS_SCALE))
+
+
+def states(motions: Motions) -> Array:
+    """Model B states (h,24) of the reprojection kernels: ``omega = -w``, ``v = w x C - t``."""
+    velocity = np.cross(motions.w, motions.translation) - motions.t
+    rotation = motions.rotation.reshape(-1, 9)
+    still = np.zeros((len(rotation), 6))
+    return np.hstack([rotation, motions.translation, -motions.w, velocity, still])
+
+
+def _models(method: Method, trials: Trials, initial: Array) -> Array:
+    n = find_solver(method.solver).sample_size
+    solutions = solve_minimal(
+        method.solver, trials.points[:, :n], trials.rays[:, :n], trials.tau[:, :n], initial,
+        method.iterations, method.as_published,
+    )  # fmt: skip
+    return _stacked(solutions)
+
+
+def _triplet_models(trials: Trials) -> Array:
+    models = _stacked(
+        solve_minimal(
+            "p3p",
+            trials.points[:, _TRIPLETS].reshape(-1, 3, 3),
+            trials.rays[:, _TRIPLETS].reshape(-1, 3, 2),
+            trials.tau[:, _TRIPLETS].reshape(-1, 3),
+        )
+    )
+    return models.reshape(len(trials), -1, models.shape[-1])
+
+
+def _stacked(solutions: tuple[Array, Array, Array, Array]) -> Array:
+    rotations, *rest = solutions
+    return np.concatenate([rotations.reshape(*rotations.shape[:2], 9), *rest], axis=2)
+
+
+def _motions(models: Array) -> Motions:
+    return Motions(models[:, :9].reshape(-1, 3, 3), models[:, 9:12], models[:, 12:15],
+                   models[:, 15:18])  # fmt: skip
+
+
+def view_arguments(trials: Trials) -> tuple[Array, Array, Array, Array, Array]:
+    """What the kernels of many frames need to know of them."""
+    view = camera()
+    by_ray = view.pixel_jacobian(trials.rays[0])
+    return trials.points, trials.rays, trials.tau, by_ray, view.row_time_gradient
+
+
+def _best(models: Array, trials: Trials, scale: float) -> Array:
+    chosen: Array = best_solutions(models, *view_arguments(trials), scale)
+    return chosen
+
+
+def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
+    prior, _ = assumptions(camera(), LocalizerConfig(), find_solver("r6p_vcwt"))
+    found = refine_frames(np.ascontiguousarray(models), *view_arguments(trials), threshold, prior)
+    w, velocity = -found[:, 12:15], found[:, 15:18]
+    translation = found[:, 9:12]
+    return Motions(found[:, :9].reshape(-1, 3, 3), translation, w,
+                   np.cross(w, translation) - velocity)  # fmt: skip

@@ -1,0 +1,5 @@
+"""Frames judged and two versions compared: are the regions true, sharp, and what do they cost?
+
+Truth comes from the independent simulator, estimates from the public interfaces of whichever
+version of the package Python finds (``PYTHONPATH``). See ``python -m benchmarks.frames --help``.
+"""

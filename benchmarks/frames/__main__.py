@@ -1,0 +1,141 @@
+"""The commands: ``python -m benchmarks.frames run``, ``compare`` and ``times``.
+
+Another version of the package is judged by the same benches from any other folder:
+
+    cd /tmp; PYTHONPATH=/path/to/other/version:/path/to/this python -m benchmarks.frames run ...
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: one core, as in a node
+
+import argparse
+import csv
+import math
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from benchmarks.frames.compared import compare
+from benchmarks.frames.conditions import BENCHES, Condition, conditions
+from benchmarks.frames.judged import Judged, judge
+from benchmarks.frames.timed import times
+
+_SHOWN = {
+    "frames": "frames", "localized": "loc", "pose@stamp": "pose@s", "pose@mid": "pose@m",
+    "twist@mid": "twist@m", "over_5_sigma": ">5s", "deg_50": "deg", "deg_95": "deg95",
+    "mm_50": "mm", "deg/s_50": "deg/s", "m/s_50": "m/s", "sharp_turn_s": "shp_t@s",
+    "sharp_turn": "shp_turn", "sharp_way": "shp_way", "sharp_angular": "shp_w",
+    "sharp_linear": "shp_v", "ms": "ms",
+}  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    options = _parser().parse_args(arguments)
+    result: int = options.command(options)
+    return result
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.frames", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    run = commands.add_parser("run", help="judge the version that Python finds")
+    run.add_argument("--out", type=Path, required=True, metavar="FILE.csv",
+                     help="table; every frame goes to FILE.npz")  # fmt: skip
+    run.add_argument("--bench", nargs="+", choices=tuple(BENCHES), metavar="NAME",
+                     default=tuple(BENCHES), help=", ".join(BENCHES))  # fmt: skip
+    run.add_argument("--only", nargs="+", default=(), metavar="WORD",
+                     help="conditions with all these parts in their names")  # fmt: skip
+    run.add_argument("--frames", type=int, default=40, metavar="N", help="of a condition (40)")
+    run.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
+    run.add_argument("--set", nargs="+", default=(), metavar="NAME:=VALUE", dest="settings",
+                     help="settings of the localizer, velocity_prior.angular:=0.5")  # fmt: skip
+    run.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
+    run.set_defaults(command=_run)
+    against = commands.add_parser("compare", help="two tables, condition by condition")
+    against.add_argument("before", type=Path, metavar="BEFORE.csv")
+    against.add_argument("after", type=Path, metavar="AFTER.csv")
+    against.add_argument("--plot", type=Path, metavar="FILE.png")
+    against.add_argument("--all", action="store_true", help="also conditions that hardly differ")
+    against.set_defaults(command=compare)
+    timed = commands.add_parser("times", help="CPU time beside PoseLib's, and calls of a frame")
+    timed.add_argument("--frames", type=int, default=20, metavar="N", help="of a condition (20)")
+    timed.add_argument("--rounds", type=int, default=7, metavar="N", help="of each frame (7)")
+    timed.set_defaults(command=times)
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    wanted = [one for one in conditions() if one.bench in options.bench and _has(one, options.only)]
+    if not wanted:
+        sys.stderr.write(f"no condition has {' and '.join(options.only)} in its name\n")
+        return 2
+    try:
+        settings = dict(_setting(text) for text in options.settings)
+    except ValueError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    each = [(one, options.frames, options.seed, settings) for one in wanted]
+    judged: list[Judged] = []
+    width = max(len(one.name) for one in wanted)
+    with options.out.open("w", newline="", encoding="utf-8") as file:
+        table: Any = None
+        pool = ProcessPoolExecutor(options.jobs) if options.jobs > 1 else None
+        found = (pool.map if pool else map)(_judge, each)
+        for condition, one in zip(wanted, found, strict=True):
+            row = one.row(condition)
+            if table is None:
+                table = csv.DictWriter(file, list(row))
+                table.writeheader()
+            if not judged or wanted[len(judged) - 1].bench != condition.bench:
+                heads = " ".join(f"{name:>8}" for name in _SHOWN.values())
+                sys.stdout.write(f"{condition.bench:{width}} {heads}\n")
+            judged.append(one)
+            table.writerow(row)
+            file.flush()
+            cells = " ".join(f"{_short(row[name]):>8}" for name in _SHOWN)
+            sys.stdout.write(f"{condition.name:{width}} {cells}  {row['reasons']}\n")
+            sys.stdout.flush()
+        if pool:
+            pool.shutdown()
+    np.savez_compressed(
+        options.out.with_suffix(".npz"),
+        names=[f"{one.bench}/{one.name}" for one in wanted],
+        counts=[len(one.reasons) for one in judged],
+        figures=np.concatenate([one.figures for one in judged]),
+        reasons=np.concatenate([one.reasons for one in judged]),
+    )
+    return 0
+
+
+def _judge(work: tuple[Condition, int, int, dict[str, Any]]) -> Judged:
+    return judge(*work)
+
+
+def _has(condition: Condition, words: Sequence[str]) -> bool:
+    parts = condition.name.split("/")
+    return all(word in parts for word in words)
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    name, assigned, value = text.partition(":=")
+    if not assigned:
+        raise ValueError(f"settings are NAME:=VALUE, got {text!r}")
+    return name, yaml.safe_load(value)
+
+
+def _short(value: str | float | int) -> str:
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+    return str(value)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,248 @@
+"""Two versions on the same frames: what is certainly better or worse, and a picture."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
+from benchmarks.frames.judged import REGION, Judged, far_off, quantile, sharpness
+from benchmarks.independent.rotations import Array
+
+BoolArray = NDArray[np.bool_]
+
+# One condition in a hundred is called certain by chance, and as often better as worse.
+_CHANCE = 0.01
+_RESAMPLES = 1000
+# Certain and smaller than this is certain, and of no interest: share of an error.
+_WORTH_A_LINE = 0.02
+_ERRORS = {"deg@s": "deg_s", "deg": "deg", "mm": "mm", "deg/s": "deg/s", "m/s": "m/s"}
+_SHARES = ("localized", "pose@s", "pose@m", "twist@m", "in/ref", "not>5s")
+
+
+@dataclass(frozen=True)
+class Change:
+    """One figure of both versions; ``sign`` 1: certainly better, -1: worse, 0: who knows."""
+
+    before: float
+    after: float
+    low: float  # of a share: Wilson's interval of the second version; of an error: of the ratio
+    high: float
+    sign: int
+
+
+def compare(options: argparse.Namespace) -> int:
+    """The command; 1 if anything is certainly worse."""
+    before, after = read(options.before), read(options.after)
+    names = [name for name in before if name in after]
+    if not names:
+        sys.stderr.write("the tables have no condition in common\n")
+        return 2
+    changes: dict[str, dict[str, Change]] = {}
+    for name in names:
+        one, other = before[name], after[name]
+        if len(one.reasons) != len(other.reasons) or np.any(
+            one.of("recording") != other.of("recording")
+        ):
+            sys.stderr.write(f"{name}: frames differ; take the same --seed and --frames\n")
+            return 2
+        changes[name] = changes_of(one, other)
+    width = max(map(len, names))
+    for name, figures in changes.items():
+        notable = any(change.sign for change in figures.values())
+        if notable or options.all:
+            sys.stdout.write(f"{name:{width}}  {_line(figures, options.all)}\n")
+    _totals(before, after, names)
+    if options.plot is not None:
+        _draw(changes, options.plot)
+    return int(any(change.sign < 0 for each in changes.values() for change in each.values()))
+
+
+def read(table: Path) -> dict[str, Judged]:
+    """The frames beside a table, by ``bench/condition``."""
+    kept = np.load(table.with_suffix(".npz"))
+    ends = np.cumsum(kept["counts"])[:-1]
+    parts = zip(np.split(kept["figures"], ends), np.split(kept["reasons"], ends), strict=True)
+    return {
+        str(name): Judged(figures, [str(reason) for reason in reasons])
+        for name, (figures, reasons) in zip(kept["names"], parts, strict=True)
+    }
+
+
+def changes_of(before: Judged, after: Judged) -> dict[str, Change]:
+    """Every figure that is compared, by its name."""
+    found = {}
+    hits = [_hits(one) for one in (before, after)]
+    for name in _SHARES:
+        change = _share(hits[0][name], hits[1][name], before.of("recording"))
+        if change is not None:
+            found[name] = change
+    both = before.localized & after.localized
+    for name, figure in _ERRORS.items():
+        errors = [one.of(figure)[both] for one in (before, after)]
+        if len(errors[0]) and np.isfinite(errors[0]).all() and np.isfinite(errors[1]).all():
+            found[name] = _error(errors[0], errors[1], before.of("recording")[both])
+    low, high = (float(np.mean(one.of("ms"))) for one in (before, after))
+    found["ms"] = Change(low, high, np.nan, np.nan, 0)
+    return found
+
+
+def _hits(judged: Judged) -> dict[str, tuple[BoolArray, BoolArray]]:
+    """Which frames are right, and which count, by the name of the share."""
+    some, every = judged.localized, np.ones(len(judged.reasons), np.bool_)
+    twists = some & np.isfinite(judged.of("deg/s"))
+    inside = {name: judged.of(name) < REGION for name in ("pose_s", "pose", "twist")}
+    return {
+        "localized": (some, every),
+        "pose@s": (inside["pose_s"], some),
+        "pose@m": (inside["pose"], some),
+        "twist@m": (inside["twist"], twists),
+        "in/ref": (inside["pose"] | ~some, every),
+        "not>5s": (~far_off(judged), every),
+    }
+
+
+def _share(
+    before: tuple[BoolArray, BoolArray], after: tuple[BoolArray, BoolArray], recording: Array
+) -> Change | None:
+    """Recording by recording: does the second have more right ones (McNemar's, or sign test)?"""
+    shares = [
+        float(np.mean(hits[some])) if some.any() else np.nan for hits, some in (before, after)
+    ]
+    if np.isnan(shares).any():
+        return None
+    both = before[1] & after[1]
+    gain = (after[0].astype(float) - before[0])[both]
+    each = np.bincount(recording[both].astype(np.int64), gain) if both.any() else np.zeros(1)
+    more, fewer = int(np.sum(each > 0.0)), int(np.sum(each < 0.0))
+    certain = more + fewer > 0 and binomtest(more, more + fewer).pvalue < _CHANCE
+    low, high = wilson(after[0][after[1]])
+    return Change(shares[0], shares[1], low, high, int(np.sign(more - fewer)) * certain)
+
+
+def _error(before: Array, after: Array, recording: Array) -> Change:
+    """The ratio of the medians, by resampling recordings."""
+    groups = [np.flatnonzero(recording == one) for one in np.unique(recording)]
+    rng = np.random.default_rng(0)
+    if len(groups) == len(recording):
+        picks = rng.integers(len(before), size=(_RESAMPLES, len(before)))
+        medians = [np.median(one[picks], axis=1) for one in (before, after)]
+    else:
+        drawn = (rng.integers(len(groups), size=len(groups)) for _ in range(_RESAMPLES))
+        some = [np.concatenate([groups[k] for k in pick]) for pick in drawn]
+        medians = [np.array([np.median(one[k]) for k in some]) for one in (before, after)]
+    tiny = np.finfo(float).tiny
+    ratios = (medians[1] + tiny) / (medians[0] + tiny)
+    low, high = np.quantile(ratios, [0.5 * _CHANCE, 1.0 - 0.5 * _CHANCE])
+    sign = int(high < 1.0 - _WORTH_A_LINE) - int(low > 1.0 + _WORTH_A_LINE)
+    return Change(float(np.median(before)), float(np.median(after)), low, high, sign)
+
+
+def wilson(hits: BoolArray) -> tuple[float, float]:
+    """95 % interval of a share."""
+    interval = binomtest(int(np.sum(hits)), len(hits)).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def _line(figures: Mapping[str, Change], every: bool) -> str:
+    marks = {-1: " WORSE", 0: "", 1: " better"}
+    parts = []
+    for name, change in figures.items():
+        if not (every or change.sign):
+            continue
+        if name in _SHARES:
+            text = (
+                f"{100 * change.before:.0f} -> {100 * change.after:.0f} % "
+                f"[{100 * change.low:.0f}, {100 * change.high:.0f}]"
+            )
+        elif name == "ms":
+            text = f"{change.before:.2f} -> {change.after:.2f}"
+        else:
+            text = (
+                f"{change.before:.3g} -> {change.after:.3g} "
+                f"(x {change.low:.2f} to {change.high:.2f})"
+            )
+        parts.append(f"{name} {text}{marks[change.sign]}")
+    return "; ".join(parts)
+
+
+def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
+    """Of each bench and of all: shares of all frames (%), medians, sharpness, ms."""
+    found = {}
+    benches = dict.fromkeys(name.split("/")[0] for name in judged)
+    for bench in (*benches, "all"):
+        those = [one for name, one in judged.items() if bench in ("all", name.split("/")[0])]
+        joined = Judged(np.concatenate([one.figures for one in those]),
+                        [reason for one in those for reason in one.reasons])  # fmt: skip
+        row = {
+            name: 100.0 * float(np.mean(hits[some])) if some.any() else np.nan
+            for name, (hits, some) in _hits(joined).items()
+        }
+        row[">5s"] = 100.0 * float(np.mean(far_off(joined)[joined.localized]))
+        del row["not>5s"]
+        some = joined.localized
+        for name, figure in _ERRORS.items():
+            row[name] = quantile(joined.of(figure)[some], 0.5)
+        for name in ("turn_s", "turn", "way", "angular", "linear"):
+            row[f"s_{name}"] = sharpness(joined.of(name)[some])
+        row["ms"] = float(np.mean(joined.of("ms")))
+        found[bench] = row
+    return found
+
+
+def _totals(before: Mapping[str, Judged], after: Mapping[str, Judged], names: list[str]) -> None:
+    both = [totals({name: table[name] for name in names}) for table in (before, after)]
+    columns = list(next(iter(both[0].values())))
+    sys.stdout.write("\n" + f"{'':15}" + "".join(f"{name:>10}" for name in columns) + "\n")
+    for bench in both[0]:
+        for label, table in zip((bench, "  after"), both, strict=True):
+            cells = "".join(f"{table[bench][name]:10.3g}" for name in columns)
+            sys.stdout.write(f"{label:15}{cells}\n")
+
+
+def _draw(changes: Mapping[str, Mapping[str, Change]], file: Path) -> None:
+    """Before across, after upwards; what is certainly different has an edge."""
+    from matplotlib.figure import Figure
+
+    names = ("localized", "pose@s", "pose@m", "twist@m", "deg@s", "deg", "deg/s", "ms")
+    benches = list(dict.fromkeys(name.split("/")[0] for name in changes))
+    picture = Figure(figsize=(16.0, 8.5), layout="constrained")
+    for axes, name in zip(picture.subplots(2, 4).flat, names, strict=True):
+        for index, bench in enumerate(benches):
+            those = [
+                each[name]
+                for key, each in changes.items()
+                if key.split("/")[0] == bench and name in each
+            ]
+            axes.scatter(
+                [one.before for one in those], [one.after for one in those], 22,
+                color=_colour(index, len(benches)), label=bench, linewidths=1.2,
+                edgecolors=[("none", "#0a7d22", "#c01515")[one.sign] for one in those],
+            )  # fmt: skip
+        if name not in _SHARES:
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+        low, high = axes.get_xlim()
+        axes.plot([low, high], [low, high], color="0.6", linewidth=0.8, zorder=0)
+        axes.set_title(name, fontsize=10)
+        axes.set_xlabel("before")
+        axes.set_ylabel("after")
+    handles, labels = picture.axes[0].get_legend_handles_labels()
+    picture.legend(handles, labels, loc="outside lower center", ncols=10, fontsize=8)
+    picture.suptitle(
+        "Conditions before and after; certainly better: green, worse: red", fontsize=11
+    )
+    picture.savefig(file, dpi=110)
+
+
+def _colour(index: int, count: int) -> tuple[float, ...]:
+    from matplotlib import colormaps
+
+    colour: tuple[float, ...] = colormaps["tab20"](index / max(count, 1))
+    return colour

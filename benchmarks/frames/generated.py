@@ -1,0 +1,212 @@
+"""Frames of a condition: points, pixels and the truth, the same for the same seed."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from benchmarks.frames.conditions import Condition, Motion, Points
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.frames import (
+    Displaced,
+    Frames,
+    first_row_times,
+    simulate,
+)
+from benchmarks.independent.motions import IntArray, Moving, States, directions
+from benchmarks.independent.rotations import Array, exponential
+from benchmarks.independent.scenes import Scene
+
+_MARGIN = 12.0  # px, of wrong points to the edge
+_SHIFTED = 0.6  # of the matches of a bad frame
+# Of the other body: a person or a vehicle that passes.
+_BODY_SHARE, _BODY_PLACE, _BODY_SPEED, _BODY_RATE = 1 / 3, 0.3, 0.5, math.radians(30.0)
+_BENT_METRES = (3.0, 8.0)  # lengths of the waves of a bent map
+# A gyroscope of a phone, whose bias and time offset are known by now.
+_GYRO_HERTZ, _GYRO_NOISE, _GYRO_BIAS = 400.0, math.radians(0.01), math.radians(0.05)
+# Fewer recordings than this say little, however long they are.
+_FEWEST = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Gyroscope:
+    """Body rates that a gyroscope says of a frame."""
+
+    tau: Array  # (k,) row times
+    rates: Array  # (k,3) rad/s
+    bias_deviation: float  # rad/s
+    rate_deviation: float  # rad/s, of each sample
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What an estimator gets of one frame, and the truth."""
+
+    recording: int
+    place: int  # in its recording
+    middle_ns: int
+    points: Array  # (n,3)
+    pixels: Array  # (n,2)
+    counts: bool
+    stamp: tuple[Array, ...]  # as ``States``, at the first row
+    middle: tuple[Array, ...]
+    gyroscope: Gyroscope | None
+
+
+def generate(condition: Condition, frames: int, seed: int) -> Iterator[Frame]:
+    """At least so many frames that count, one recording after the other."""
+    first, last = condition.sequence.counted
+    if condition.sequence.length == 1:
+        recordings = frames
+    else:
+        recordings = max(min(_FEWEST, frames), -(-frames // (last - first)))
+    made = _simulated(
+        condition.camera,
+        condition.motion,
+        condition.scene,
+        recordings,
+        condition.sequence.length,
+        seed,
+        condition.points.body,
+    )
+    key = zlib.crc32(f"{condition.bench}/{condition.name}".encode())
+    spoil = _Spoiler(condition, recordings, np.random.default_rng([seed, key]))
+    for frame in range(len(made.frames)):
+        place = int(made.frames.place[frame])
+        yield Frame(
+            int(made.frames.recording[frame]),
+            place,
+            made.frames.middle_ns(frame),
+            *spoil(made.frames, frame),
+            first <= place < last,
+            _state(made.frames.first, frame),
+            _state(made.frames.middle, frame),
+            _gyroscope(made, frame, spoil.rng) if condition.points.gyroscope else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    frames: Frames
+    motions: Moving
+    times: Array  # (f,) s of the middle rows
+
+
+@lru_cache(maxsize=4)
+def _simulated(
+    camera: Camera,
+    motion: Motion,
+    scene: Scene,
+    recordings: int,
+    length: int,
+    seed: int,
+    body: bool,
+) -> _Made:
+    made: list[Moving] = []
+
+    def remembered(count: int, rng: np.random.Generator) -> Moving:
+        made.append(motion(count, rng))
+        return made[0]
+
+    key = zlib.crc32(repr((camera, motion, scene, length)).encode())
+    number = int(np.random.SeedSequence([seed, key]).generate_state(1)[0])
+    other = _other_body(recordings, np.random.default_rng([seed, key])) if body else None
+    frames = simulate(camera, remembered, scene, recordings, length, number, other)
+    times = first_row_times(camera, length)[frames.place] + 0.5 * camera.readout_time
+    return _Made(frames, made[0], times)
+
+
+def _other_body(recordings: int, rng: np.random.Generator) -> Displaced:
+    """A third of the points turns about their middle, moves on, and was elsewhere in the map."""
+    aside = _BODY_PLACE * directions(recordings, rng)
+    velocity = _BODY_SPEED * directions(recordings, rng)
+    rate = _BODY_RATE * directions(recordings, rng)
+
+    def displaced(true: Array, time: Array, which: IntArray) -> Array:
+        count = round(_BODY_SHARE * true.shape[1])
+        own, now = true[:, :count], time[:, :count, None]
+        middle = own.mean(axis=1, keepdims=True)
+        turned = exponential(now * rate[which][:, None]) @ (own - middle)[..., None]
+        moved = middle + turned[..., 0] + aside[which][:, None] + now * velocity[which][:, None]
+        return np.concatenate([moved, true[:, count:]], axis=1)
+
+    return displaced
+
+
+class _Spoiler:
+    """Makes measurements of exact frames: noise, wrong matches, a map that is off."""
+
+    def __init__(self, condition: Condition, recordings: int, rng: np.random.Generator) -> None:
+        self._condition, self.rng = condition, rng
+        angle = rng.uniform(0.0, 2.0 * np.pi, (recordings, 1))
+        self._direction = np.hstack([np.cos(angle), np.sin(angle)])
+        self._map = _BentMap(recordings, rng)
+
+    def __call__(self, frames: Frames, frame: int) -> tuple[Array, Array]:
+        """Points (n,3) and pixels (n,2)."""
+        condition, points, rng = self._condition, self._condition.points, self.rng
+        recording, place = int(frames.recording[frame]), int(frames.place[frame])
+        shown = frames.visible[frame]
+        noise = condition.noise * frames.unit_noise[frame, shown]
+        if np.isfinite(points.tails):
+            # Both coordinates of a point are bad together: a multivariate t.
+            spread = rng.chisquare(points.tails, (len(noise), 1)) / points.tails
+            noise = noise / np.sqrt(spread)
+        pixels = frames.exact[frame, shown] + noise + points.shift * self._direction[recording]
+        mapped = frames.points[frame, shown]
+        mapped = mapped + self._map_error(mapped, recording, points)
+        begin, end, shift = condition.sequence.bad
+        if begin <= place < end:
+            some = rng.permutation(len(pixels))[: round(_SHIFTED * len(pixels))]
+            pixels[some] += shift * self._direction[recording]
+        count = round(points.wrong * len(pixels))
+        if count:
+            far = np.array([frames.camera.width, frames.camera.height]) - 1.0 - _MARGIN
+            some = rng.permutation(len(pixels))[:count]
+            pixels[some] = rng.uniform(_MARGIN, far, (count, 2))
+        return mapped, pixels
+
+    def _map_error(self, places: Array, recording: int, points: Points) -> Array:
+        rough = points.rough_map * self.rng.normal(size=places.shape)
+        error: Array = rough + points.bent_map * self._map(places, recording)
+        return error
+
+
+class _BentMap:
+    """Long waves through space, of deviation 1 in each coordinate."""
+
+    def __init__(self, recordings: int, rng: np.random.Generator) -> None:
+        number = 2.0 * np.pi / rng.uniform(*_BENT_METRES, (recordings, 6, 1))
+        self._waves = number * directions(recordings * 6, rng).reshape(recordings, 6, 3)
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, (recordings, 6))
+        self._way = rng.normal(size=(recordings, 6, 3)) / math.sqrt(3.0)
+
+    def __call__(self, places: Array, recording: int) -> Array:
+        waves = np.sin(places @ self._waves[recording].T + self._phase[recording])
+        error: Array = waves @ self._way[recording]
+        return error
+
+
+def _state(states: States, frame: int) -> tuple[Array, ...]:
+    return (
+        states.rotation[frame],
+        states.position[frame],
+        states.angular[frame],
+        states.linear[frame],
+    )
+
+
+def _gyroscope(made: _Made, frame: int, rng: np.random.Generator) -> Gyroscope:
+    readout = made.frames.camera.readout_time
+    delays = np.arange(-readout, readout, 1.0 / _GYRO_HERTZ)
+    which = np.full(len(delays), made.frames.recording[frame])
+    rates = made.motions.states(which, made.times[frame] + delays).angular
+    bias = _GYRO_BIAS * rng.normal(size=3)
+    deviation = _GYRO_NOISE * math.sqrt(_GYRO_HERTZ)
+    noise = deviation * rng.normal(size=rates.shape)
+    return Gyroscope(delays / readout, rates + bias + noise, _GYRO_BIAS, deviation)

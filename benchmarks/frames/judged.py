@@ -1,0 +1,260 @@
+"""Conditions through the public interfaces of the package, and the figures of each."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+import rs_localizer as rsl
+from benchmarks.frames.conditions import EXACT, Condition
+from benchmarks.frames.generated import Frame, Gyroscope, generate
+from benchmarks.independent.rotations import Array, logarithm
+from rs_localizer.pipeline.moments import pose_at, twist_at
+
+REGION = float(chi2.ppf(0.95, 6))
+# As unlikely as five standard deviations are of one variable (6 in 10 million).
+FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), 6))
+_MEDIAN = float(chi2.median(3))
+# The errors of a calibration point there, by turns.
+_DIRECTIONS = np.array([(0.6, 0.8), (-0.8, 0.6), (-0.6, -0.8), (0.8, -0.6)])
+
+Row = dict[str, str | float | int]
+
+FIGURES = (
+    "recording", "ms",
+    # Squared normalised errors, of 6 and of 3 dimensions; at the stamp (s) and at mid-frame.
+    "pose_s", "pose", "twist", "turn_s", "turn", "way", "angular", "linear",
+    "deg_s", "deg", "mm", "deg/s", "m/s",
+)  # fmt: skip
+"""Of a frame; NaN without a pose, or where a camera has no velocities."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """The frames of a condition that count."""
+
+    figures: Array  # (n, len(FIGURES))
+    reasons: list[str]  # (n,) why there is no pose; empty: there is one
+
+    def of(self, name: str) -> Array:
+        column: Array = self.figures[:, FIGURES.index(name)]
+        return column
+
+    @property
+    def localized(self) -> NDArray[np.bool_]:
+        return np.array([not reason for reason in self.reasons])
+
+    def inside(self, name: str) -> NDArray[np.bool_]:
+        """Of the localized frames (k,), which truths lie in a 95 % region: pose_s, pose, twist."""
+        held: NDArray[np.bool_] = self.of(name)[self.localized] < REGION
+        return held
+
+    def row(self, condition: Condition) -> Row:
+        """A line of the table; shares in %, of the frames with a pose."""
+        some = self.localized
+
+        def share(hits: NDArray[np.bool_]) -> float:
+            return 100.0 * float(np.mean(hits)) if len(hits) else math.nan
+
+        twists = np.isfinite(self.of("deg/s")[some]).any()
+        return {
+            "bench": condition.bench,
+            "condition": condition.name,
+            "frames": len(some),
+            "localized": 100.0 * float(np.mean(some)),
+            "pose@stamp": share(self.inside("pose_s")),
+            "pose@mid": share(self.inside("pose")),
+            "twist@mid": share(self.inside("twist")) if twists else math.nan,
+            "inside_or_refused": 100.0 * float(np.mean((self.of("pose") < REGION) | ~some)),
+            "over_5_sigma": share(far_off(self)[some]),
+            **{
+                f"{name}_50": quantile(self.of(name), 0.5)
+                for name in ("deg_s", "deg", "mm", "deg/s", "m/s")
+            },
+            **{
+                f"{name}_95": quantile(self.of(name), 0.95)
+                for name in ("deg", "mm", "deg/s", "m/s")
+            },
+            **{
+                f"sharp_{name}": sharpness(self.of(name))
+                for name in ("turn_s", "turn", "way", "angular", "linear")
+            },
+            "ms": float(np.mean(self.of("ms"))),
+            "reasons": ", ".join(
+                f"{count} {reason}"
+                for reason, count in Counter(filter(None, self.reasons)).most_common()
+            ),
+        }
+
+
+def quantile(values: Array, q: float) -> float:
+    """Of the known ones; NaN of none."""
+    known = values[~np.isnan(values)]
+    return float(np.quantile(known, q)) if len(known) else math.nan
+
+
+def sharpness(squared: Array) -> float:
+    """Claimed over actual deviation, from squared normalised errors of three dimensions."""
+    median = quantile(squared, 0.5)
+    return math.sqrt(_MEDIAN / median) if median > 0.0 else math.nan
+
+
+def far_off(judged: Judged) -> NDArray[np.bool_]:
+    """Frames (n,) whose pose at one of the moments is beyond five standard deviations."""
+    localized = judged.localized
+    beyond: NDArray[np.bool_] = localized & ~(
+        (judged.of("pose_s") < FIVE_SIGMA) & (judged.of("pose") < FIVE_SIGMA)
+    )
+    return beyond
+
+
+def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, Any]) -> Judged:
+    """All frames of a condition, in their order."""
+    own = dict(condition.settings) | dict(settings)
+    # As users are told: the final inliers may miss by twice the threshold, 3.5 deviations have to.
+    own.setdefault("inlier_threshold", max(2.0, 2.0 * condition.noise))
+    config = configured(rsl.LocalizerConfig(), own, condition.calibration == EXACT)
+    variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
+    localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]
+    trackers = [rsl.Tracker(one) for one in localizers] if condition.sequence.length > 1 else None
+    figures: list[list[float]] = []
+    reasons: list[str] = []
+    for frame in generate(condition, frames, seed):
+        variant = frame.recording % variants
+        localize: Any
+        first: tuple[int, ...]
+        if trackers is None:
+            localize, first = localizers[variant].localize, ()
+        else:
+            if frame.place == 0:
+                trackers[variant].reset()
+            localize, first = trackers[variant].localize, (frame.middle_ns,)
+        readout = localizers[variant].camera.readout_time
+        known: dict[str, Any] = (
+            {} if frame.gyroscope is None else {"turn": _turn(frame.gyroscope, readout)}
+        )
+        start = time.process_time()
+        try:
+            result = localize(*first, frame.points, frame.pixels, **known)
+            reason = "" if result else str(result.reason)
+        except (ArithmeticError, ValueError) as error:
+            result, reason = None, f"crashed_{type(error).__name__}"
+        taken = 1e3 * (time.process_time() - start)
+        if frame.counts:
+            reasons.append(reason)
+            scored = _scored(result, frame, condition) if result else [math.nan] * 13
+            figures.append([frame.recording, taken, *scored])
+    return Judged(np.array(figures), reasons)
+
+
+def camera_of(condition: Condition, variant: int) -> rsl.Camera:
+    """What the user believes of the camera."""
+    true, off = condition.camera, condition.calibration
+    direction = _DIRECTIONS[variant]
+    matrix = true.matrix.copy()
+    matrix[:2, 2] += off.centre * direction
+    matrix[[0, 1], [0, 1]] *= 1.0 + off.focal * math.copysign(1.0, direction[0])
+    return rsl.Camera(
+        width=true.width,
+        height=true.height,
+        K=matrix,
+        D=(1.0 - off.distortion) * np.array(true.distortion),
+        distortion_model="plumb_bob",
+        readout_time=true.readout_time if off.readout_time is None else off.readout_time,
+        scan_direction=str(off.scan or true.scan),
+    )
+
+
+def configured(config: Any, settings: Mapping[str, Any], exact: bool) -> Any:
+    """A configuration with settings by dotted name.
+
+    Args:
+        exact: the calibration has no errors, and versions that know how well calibrations are
+            known are told so.
+
+    Raises:
+        ValueError: a name is no setting.
+    """
+    if exact and hasattr(config, "calibration"):
+        none = {f"calibration.{item.name}": 0.0 for item in fields(config.calibration)}
+        settings = none | dict(settings)
+    for name, value in settings.items():
+        config = _with(config, name, value)
+    return config
+
+
+def _with(config: Any, name: str, value: Any) -> Any:
+    own, _, inner = name.partition(".")
+    if not is_dataclass(config) or own not in {item.name for item in fields(config)}:
+        raise ValueError(f"{name} is not a setting of the localizer")
+    changed = _with(getattr(config, own), inner, value) if inner else value
+    return replace(config, **{own: changed})  # type: ignore[type-var]
+
+
+def _turn(gyroscope: Gyroscope, readout: float) -> Any:
+    from rs_localizer.core.known_turn import KnownTurn
+
+    noise = readout * gyroscope.rate_deviation
+    # Of a line through the samples of one readout.
+    mean = noise**2 * float(np.mean(np.diff(gyroscope.tau)))
+    constant = mean + (readout * gyroscope.bias_deviation) ** 2
+    error = np.diag(np.repeat([constant, 12.0 * mean], 3))
+    return KnownTurn.of(gyroscope.tau, readout * gyroscope.rates, error, noise)
+
+
+def _scored(result: Any, frame: Frame, condition: Condition) -> list[float]:
+    """Behind recording and time, in the order of FIGURES."""
+    believed = condition.calibration.readout_time
+    readout = condition.camera.readout_time if believed is None else believed
+    pose_s, turn_s, _, deg_s, _ = _pose(pose_at(result, -0.5), frame.stamp)
+    pose, turn, way, deg, mm = _pose(pose_at(result, 0.0), frame.middle)
+    twist = [math.nan] * 5
+    if condition.camera.readout_time > 0.0:
+        twist = _twist(twist_at(result, 0.0, readout), frame.middle)
+    return [pose_s, pose, twist[0], turn_s, turn, way, *twist[1:3], deg_s, deg, mm, *twist[3:]]
+
+
+def _pose(pose: Any, truth: tuple[Array, ...]) -> tuple[float, ...]:
+    turn = logarithm(truth[0] @ pose.rotation.T)  # in the axes of the map, as the covariance
+    way = truth[1] - pose.position
+    return (
+        normalised(np.concatenate([way, turn]), pose.covariance),
+        normalised(turn, pose.covariance[3:, 3:]),
+        normalised(way, pose.covariance[:3, :3]),
+        math.degrees(np.linalg.norm(turn)),
+        1e3 * float(np.linalg.norm(way)),
+    )
+
+
+def _twist(twist: Any, truth: tuple[Array, ...]) -> list[float]:
+    angular, linear = truth[2] - twist.angular, truth[3] - twist.linear
+    return [
+        normalised(np.concatenate([linear, angular]), twist.covariance),
+        normalised(angular, twist.covariance[3:, 3:]),
+        normalised(linear, twist.covariance[:3, :3]),
+        math.degrees(np.linalg.norm(angular)),
+        float(np.linalg.norm(linear)),
+    ]
+
+
+def normalised(error: Array, covariance: Array) -> float:
+    """Squared Mahalanobis length; infinite where a covariance denies that there is an error."""
+    if not np.any(error):
+        return 0.0
+    deviations = np.sqrt(np.diag(covariance))
+    if not np.all(deviations > 0.0):
+        return math.inf
+    try:
+        # Metres and radians differ by far: scaled, rounding does not decide.
+        factor = np.linalg.cholesky(covariance / np.outer(deviations, deviations))
+    except np.linalg.LinAlgError:
+        return math.inf
+    return float(np.sum(np.linalg.solve(factor, error / deviations) ** 2))

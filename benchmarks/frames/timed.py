@@ -1,0 +1,151 @@
+"""What frames cost beside PoseLib's global-shutter estimate, and how many calls they take."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import importlib
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from types import CodeType, FrameType
+from typing import Any
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+import rs_localizer as rsl
+from benchmarks.frames.conditions import NARROW, REST, Condition, Points, moving, turning
+from benchmarks.frames.generated import Frame, generate
+from benchmarks.frames.judged import camera_of
+from benchmarks.independent.scenes import Rich, SmallPlane
+
+_SEED = 1
+# PoseLib's own limit is 100 000 samples: where few points fit a global shutter it takes them all.
+_OPTIONS = {"max_reproj_error": 2.0, "max_iterations": 1000}
+# Without distortion: PoseLib would have to undistort, too.
+_CAMERA = replace(NARROW, distortion=(0.0,) * 5)
+_PLANE = SmallPlane(0.6, 2.0, 20.0, 60)
+_WRONG = {share: Points(wrong=share) for share in (0.2, 0.3, 0.5)}
+
+# 17 deg and 0.3 m per readout, of which global-shutter estimates keep one inlier in eight.
+_READOUT = _CAMERA.readout_time
+_FAST = moving("steady", rate=np.radians(17.0) / _READOUT, speed=0.3 / _READOUT)
+
+CONDITIONS = (
+    Condition("times", "200 points, half wrong, moving", _FAST, Rich(200), 0.5,
+              points=_WRONG[0.5], camera=_CAMERA),
+    Condition("times", "200 points, half wrong, static", REST, Rich(200), 0.5,
+              points=_WRONG[0.5], camera=_CAMERA),
+    Condition("times", "50 points, static", REST, Rich(50), 0.5,
+              points=_WRONG[0.2], camera=_CAMERA),
+    Condition("times", "60 points of a plane, static", REST, _PLANE, 0.5,
+              points=_WRONG[0.2], camera=_CAMERA),
+    Condition("times", "60 points of a plane, moving", turning(3.0), _PLANE, 0.5,
+              points=_WRONG[0.2], camera=_CAMERA),
+    Condition("times", "5000 points, static", REST, Rich(5000), 0.5,
+              points=_WRONG[0.3], camera=_CAMERA),
+)  # fmt: skip
+"""What is timed."""
+
+
+def times(options: argparse.Namespace) -> int:
+    """The command: CPU time of both in turns, and the calls of one frame."""
+    try:
+        poselib: Any = importlib.import_module("poselib")
+    except ImportError:
+        poselib = None
+        sys.stdout.write("PoseLib is not installed (pip install poselib): no ratios\n")
+    heads = ("ours, ms", "PoseLib, ms", "ratio", "calls", "kernels", "files")
+    sys.stdout.write(f"{'':32}" + "".join(f"{head:>13}" for head in heads) + "\n")
+    for condition in CONDITIONS:
+        true = camera_of(condition, 0)
+        camera = rsl.Camera(true.width, true.height, true.K, readout_time=true.readout_time)
+        localizer = rsl.Localizer(camera)
+        frames = list(generate(condition, options.frames, _SEED))
+        methods: list[Callable[[Frame], object]] = [_ours(localizer)]
+        if poselib is not None:
+            methods.append(_poselib(poselib, camera))
+        spent = in_turns(methods, frames, options.rounds)
+        each = [1e3 * statistics.fmean(one) for one in spent]
+        figures = [each[0], *(each[1:] or [np.nan])]
+        calls = calls_of(methods[0], frames)
+        cells = "".join(f"{figure:13.3f}" for figure in (*figures, figures[0] / figures[1]))
+        sys.stdout.write(f"{condition.name:32}{cells}" + "".join(f"{n:13}" for n in calls) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+def _ours(localizer: rsl.Localizer) -> Callable[[Frame], object]:
+    return lambda frame: localizer.localize(frame.points, frame.pixels)
+
+
+def _poselib(poselib: Any, camera: rsl.Camera) -> Callable[[Frame], object]:
+    K = camera.K
+    model = {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+    }
+    return lambda frame: poselib.estimate_absolute_pose(
+        frame.pixels, frame.points, model, _OPTIONS, {}
+    )
+
+
+def in_turns(
+    methods: list[Callable[[Frame], object]], frames: list[Frame], rounds: int
+) -> list[list[float]]:
+    """Seconds of CPU of each method on each frame: the median of the rounds.
+
+    Methods take turns on each frame, so that what else the machine does hits them alike.
+    """
+    for method in methods:
+        method(frames[0])  # compiles, fills caches
+    spent: list[list[float]] = [[] for _ in methods]
+    for frame in frames:
+        turns: list[list[float]] = [[] for _ in methods]
+        for _ in range(rounds):
+            for method, own in zip(methods, turns, strict=True):
+                start = time.process_time()
+                method(frame)
+                own.append(time.process_time() - start)
+        for every, own in zip(spent, turns, strict=True):
+            every.append(statistics.median(own))
+    return spent
+
+
+def calls_of(method: Callable[[Frame], object], frames: list[Frame]) -> tuple[int, int, int]:
+    """Of a frame, the median: calls of Python functions of the package, calls of its kernels, and
+    files that both are in.
+    """
+    _called(method, frames[0])  # Numba makes the code that a profiler gets when it first asks
+    compiled = {one.py_func.__code__ for one in gc.get_objects() if isinstance(one, Dispatcher)}
+    counts = []
+    for frame in frames:
+        called = _called(method, frame)
+        kernels = sum(code in compiled for code in called)
+        files = {code.co_filename for code in called}
+        counts.append((len(called) - kernels, kernels, len(files)))
+    every = [round(statistics.median(each)) for each in zip(*counts, strict=True)]
+    return every[0], every[1], every[2]
+
+
+def _called(method: Callable[[Frame], object], frame: Frame) -> list[CodeType]:
+    """The functions of the package, each as often as it is called."""
+    home = os.path.dirname(rsl.__file__)
+    called: list[CodeType] = []
+
+    def note(inside: FrameType, event: str, _: object) -> None:
+        if event == "call" and inside.f_code.co_filename.startswith(home):
+            called.append(inside.f_code)
+
+    sys.setprofile(note)
+    try:
+        method(frame)
+    finally:
+        sys.setprofile(None)
+    return called

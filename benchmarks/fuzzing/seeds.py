@@ -1,0 +1,254 @@
+"""Right input of every kind, small, to be damaged."""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+import struct
+import tempfile
+import zlib
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.npz import write_npz
+from rs_localizer.io.maps.ply import write_ply
+from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
+from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
+
+_COUNT = 5
+
+
+def _header(frame: str) -> SimpleNamespace:
+    return SimpleNamespace(stamp=SimpleNamespace(sec=5, nanosec=7), frame_id=frame)
+
+
+def cloud(*kinds: tuple[Any, ...], big_endian: bool = False, height: int = 1) -> SimpleNamespace:
+    """A PointCloud2 with fields of these NumPy types."""
+    rng = np.random.default_rng(0)
+    rows = np.zeros(_COUNT * height, list(kinds))
+    fields = []
+    for name, (kind, offset, *_) in (rows.dtype.fields or {}).items():
+        rows[name] = rng.integers(0, 200, rows[name].shape)
+        if name == "id":
+            rows[name] = np.arange(len(rows))
+        datatype = "i1 u1 i2 u2 i4 u4 f4 f8".split().index(kind.base.str[1:]) + 1
+        count = kind.shape[0] if kind.shape else 1
+        fields.append(SimpleNamespace(name=name, offset=offset, datatype=datatype, count=count))
+    return SimpleNamespace(
+        header=_header("map"),
+        height=height,
+        width=_COUNT,
+        fields=fields,
+        is_bigendian=big_endian,
+        point_step=rows.dtype.itemsize,
+        row_step=rows.dtype.itemsize * _COUNT,
+        data=rows.tobytes(),
+        is_dense=True,
+    )
+
+
+XYZ = tuple((name, "<f4") for name in "xyz")
+UV = (("u", "<f4"), ("v", "<f8"))
+BITS, NUMBERS = ("descriptor", "u1", (32,)), ("descriptor", "<f4", (8,))
+
+
+def camera_info(*, plain: bool = False) -> SimpleNamespace:
+    """A calibrated camera; a plain one has neither distortion nor binning nor region."""
+    message = SimpleNamespace(
+        header=_header("camera"),
+        width=640,
+        height=480,
+        distortion_model="plumb_bob",
+        d=[0.1, -0.05, 0.001, 0.0, 0.0],
+        k=[500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0],
+        binning_x=1,
+        binning_y=2,
+        roi=SimpleNamespace(x_offset=8, y_offset=4, width=320, height=240, do_rectify=False),
+    )
+    if plain:
+        message.d, message.binning_y = [], 1
+        message.roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
+    return message
+
+
+def imu() -> SimpleNamespace:
+    """A reading of gyroscope and accelerometer."""
+    turn, force = {"x": 0.1, "y": -0.2, "z": 0.3}, {"x": 0.2, "y": -9.7, "z": 0.4}
+    return SimpleNamespace(
+        header=_header("imu"),
+        angular_velocity=SimpleNamespace(**turn),
+        angular_velocity_covariance=[1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4],
+        linear_acceleration=SimpleNamespace(**force),
+        linear_acceleration_covariance=[0.0] * 9,
+    )
+
+
+@cache
+def _flight() -> tuple[Map, list[SimulatedFrame]]:
+    """A small world and some frames of a fast camera."""
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+    camera = Camera(640, 480, K, readout_time=0.03)
+    motion = ConstantVelocity(np.array([0.5, -1.0, 1.0]), np.array([0.5, 0.2, 0.3]), 0.2)
+    points = room(np.zeros((1, 3)), np.random.default_rng(0), count=1500)
+    rng = np.random.default_rng(1)
+    world = Map(points, np.arange(len(points)), random_descriptors(len(points), rng), "map")
+    seen = FrameSettings(points=30, noise=0.5, outliers=0.1)
+    return world, list(simulate_frames(camera, motion, points, seen))[:3]
+
+
+def _message(frame: SimulatedFrame, rows: NDArray[Any]) -> SimpleNamespace:
+    """A cloud of these rows, of plain values as the damages want them."""
+    made = make_cloud(make_message, frame.stamp_ns, "map", rows)
+    fields = [
+        SimpleNamespace(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count)
+        for f in made.fields
+    ]
+    names = "height width is_bigendian point_step row_step is_dense".split()
+    return SimpleNamespace(
+        header=SimpleNamespace(
+            stamp=SimpleNamespace(sec=made.header.stamp.sec, nanosec=made.header.stamp.nanosec),
+            frame_id="map",
+        ),
+        fields=fields,
+        data=made.data.tobytes(),
+        **{name: getattr(made, name) for name in names},
+    )
+
+
+@cache
+def frames() -> tuple[list[SimpleNamespace], list[SimpleNamespace]]:
+    """Clouds of correspondences and of keypoints of the same frames."""
+    world, flight = _flight()
+    correspondences, keypoints = [], []
+    for frame in flight:
+        rows = np.zeros(len(frame.ids), [*((n, "<f8") for n in "xyz"), ("u", "<f4"), ("v", "<f4")])
+        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
+            rows[name] = column
+        correspondences.append(_message(frame, rows))
+        rng = np.random.default_rng(frame.stamp_ns)
+        keypoints.append(_message(frame, keypoint_rows(frame, world, rng)))
+    return correspondences, keypoints
+
+
+def landmarks() -> SimpleNamespace:
+    """The map of those keypoints."""
+    world, flight = _flight()
+    return _message(flight[0], map_rows(world))
+
+
+def image(encoding: str = "mono8") -> SimpleNamespace:
+    """A small picture."""
+    depth = {"mono8": 1, "bgr8": 3, "mono16": 2, "yuv422_yuy2": 2}[encoding]
+    return SimpleNamespace(
+        header=_header("camera"),
+        height=6,
+        width=8,
+        encoding=encoding,
+        is_bigendian=False,
+        step=8 * depth,
+        data=bytes(6 * 8 * depth),
+    )
+
+
+def compressed(suffix: str) -> bytes:
+    """The same packed."""
+    picture: NDArray[np.uint8] = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    return bytes(cv2.imencode(suffix, picture)[1].tobytes())
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def animated_png() -> bytes:
+    """Two pictures, one after the other."""
+    png = compressed(".png")
+    head, pixels = png[:33], zlib.compress((b"\0" + bytes(8)) * 6)
+    control = [struct.pack(">5I2H2B", number, 8, 6, 0, 0, 1, 10, 0, 0) for number in (0, 1)]
+    first = _chunk(b"acTL", struct.pack(">II", 2, 0)) + _chunk(b"fcTL", control[0])
+    second = _chunk(b"fcTL", control[1]) + _chunk(b"fdAT", struct.pack(">I", 2) + pixels)
+    return head + first + _chunk(b"IDAT", pixels) + second + png[-12:]
+
+
+def with_check_sums(png: bytes) -> bytes:
+    """A damaged PNG whose chunks are whole again, as far as they can be told."""
+    parts, position = [png[:8]], 8
+    while position + 12 <= len(png):
+        length = min(int.from_bytes(png[position : position + 4]), len(png) - position - 12)
+        body = png[position + 8 : position + 8 + length]
+        parts.append(_chunk(png[position + 4 : position + 8], body))
+        position += 12 + length
+    return b"".join(parts)
+
+
+def _maps() -> list[Map]:
+    rng = np.random.default_rng(0)
+    points, ids = rng.normal(size=(_COUNT, 3)), np.arange(_COUNT) * 3 - 5
+    return [
+        Map(points, ids, None, "map"),
+        Map(points, None, rng.integers(0, 256, (_COUNT, 4), dtype=np.uint8), "map"),
+        Map(points, ids, rng.normal(size=(_COUNT, 3)).astype(np.float32), "map"),
+    ]
+
+
+def map_files() -> dict[str, list[bytes]]:
+    """Maps by the suffix of their files."""
+    found: dict[str, list[bytes]] = {".npz": [], ".ply": []}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map"
+        for landmarks in _maps():
+            write_npz(path, landmarks)
+            found[".npz"].append(path.read_bytes())
+            for binary in (True, False):
+                write_ply(path, landmarks, binary=binary)
+                found[".ply"].append(path.read_bytes())
+    return found
+
+
+def arrays() -> list[bytes]:
+    """What an archive holds, each by itself."""
+    found = []
+    for array in (np.zeros((_COUNT, 3)), np.arange(_COUNT), np.zeros((_COUNT, 4), np.uint8)):
+        stream = io.BytesIO()
+        np.save(stream, array)
+        found.append(stream.getvalue())
+    return found
+
+
+def model() -> tuple[bytes, bytes]:
+    """Points of COLMAP, binary and as text: two, seen by two images."""
+    binary, text = struct.pack("<Q", 2), "# ID X Y Z R G B ERROR TRACK\n"
+    for point in (4, 9):
+        binary += struct.pack("<Q3d3BdQ", point, 1.0, 2.0, point, 1, 2, 3, 0.5, 2)
+        binary += struct.pack("<4I", 1, point % 3, 2, 1)
+        text += f"{point} 1.0 2.0 {point} 1 2 3 0.5 1 {point % 3} 2 1\n"
+    return binary, text.encode()
+
+
+def database() -> bytes:
+    """COLMAP's, with the descriptors of those images."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "database.db"
+        tables = sqlite3.connect(path)
+        tables.execute("PRAGMA page_size = 512")
+        tables.execute(
+            "CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY, type, rows, cols, data)"
+        )
+        for image_id in (1, 2):
+            data = bytes(range(128)) * 3
+            tables.execute("INSERT INTO descriptors VALUES (?, 0, 3, 128, ?)", (image_id, data))
+        tables.commit()
+        tables.close()
+        return path.read_bytes()

@@ -1,0 +1,5 @@
+"""Honesty: are the covariances what they say, on motion and calibrations as they really are?
+
+All frames are of the independent simulator (:mod:`benchmarks.independent`), of rendered
+images or of a real recording, and the estimator is used through its public interfaces only.
+"""

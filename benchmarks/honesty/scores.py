@@ -1,0 +1,166 @@
+"""Errors of estimates in their own units: what a covariance promises, against the truth."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from benchmarks.independent.rotations import logarithm
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.io.outputs import Pose, Twist
+from rs_localizer.pipeline.moments import pose_at, twist_at
+
+REGION = float(chi2.ppf(0.95, 6))
+# As unlikely as five standard deviations are of one variable (6 in 10 million).
+FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), 6))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """The camera at one instant."""
+
+    rotation: Array  # (3,3) map_from_camera
+    position: Array  # (3,)
+    angular: Array  # (3,) rad/s, camera axes
+    linear: Array  # (3,) m/s, camera axes
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One frame at one moment: squared normalised errors of 6 dimensions, and plain errors.
+
+    Infinite without a pose; those of the twist are NaN where there is none.
+    """
+
+    recording: int
+    reason: str = ""  # why there is no pose
+    pose: float = np.inf
+    twist: float = np.inf
+    orientation: float = np.inf  # deg
+    position: float = np.inf  # m
+    angular: float = np.inf  # deg/s
+    linear: float = np.inf  # m/s
+    # Squared normalised distance of the velocities from zero.
+    moving: float = np.nan
+
+
+def score(pose: Pose, twist: Twist | None, truth: Truth, recording: int = 0) -> Score:
+    """What is published, against the truth of that moment."""
+    turn = logarithm(truth.rotation @ pose.rotation.T)  # in the axes of the map, as the covariance
+    way = truth.position - pose.position
+    found = Score(
+        recording,
+        pose=normalised(np.concatenate([way, turn]), pose.covariance),
+        orientation=float(np.degrees(np.linalg.norm(turn))),
+        position=float(np.linalg.norm(way)),
+        twist=np.nan,
+        angular=np.nan,
+        linear=np.nan,
+    )
+    if twist is None:
+        return found
+    linear, angular = truth.linear - twist.linear, truth.angular - twist.angular
+    return replace(
+        found,
+        twist=normalised(np.concatenate([linear, angular]), twist.covariance),
+        angular=float(np.degrees(np.linalg.norm(angular))),
+        linear=float(np.linalg.norm(linear)),
+        moving=motion_evidence(twist),
+    )
+
+
+def score_at(
+    result: Estimate | Failure, tau: float, readout_time: float, truth: Truth, recording: int
+) -> Score:
+    """An estimate at row time ``tau``; ``readout_time`` in s, 0: unknown, then no twist."""
+    if not result:
+        return Score(recording, reason=str(result.reason))
+    twist = twist_at(result, tau, readout_time) if readout_time > 0.0 else None
+    found = score(pose_at(result, tau), twist, truth, recording)
+    if readout_time > 0.0:
+        return found
+    # Per readout the velocities are known all the same.
+    return replace(found, moving=motion_evidence(twist_at(result, tau, 1.0)))
+
+
+def motion_evidence(twist: Twist) -> float:
+    """Squared normalised distance of the velocities from zero; 0 of a camera held to be at rest."""
+    return normalised(np.concatenate([twist.linear, twist.angular]), twist.covariance)
+
+
+def normalised(error: Array, covariance: Array) -> float:
+    """Squared Mahalanobis length; infinite where a covariance denies that there is an error."""
+    if not np.any(error):
+        return 0.0
+    deviations = np.sqrt(np.diag(covariance))
+    if not np.all(deviations > 0.0):
+        return np.inf
+    try:
+        # Metres and radians differ by far: scaled, rounding does not decide.
+        factor = np.linalg.cholesky(covariance / np.outer(deviations, deviations))
+    except np.linalg.LinAlgError:
+        return np.inf
+    return float(np.sum(np.linalg.solve(factor, error / deviations) ** 2))
+
+
+def percent(hits: BoolArray) -> float:
+    """Share of true ones in %; NaN of none."""
+    return 100.0 * float(np.mean(hits)) if len(hits) else np.nan
+
+
+class Scores:
+    """Many of them, as columns."""
+
+    def __init__(self, scores: Sequence[Score]) -> None:
+        self.scores = scores
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def of(self, name: str) -> Array:
+        """A column (n,) of figures."""
+        return np.array([getattr(one, name) for one in self.scores], dtype=np.float64)
+
+    @property
+    def recordings(self) -> NDArray[np.int64]:
+        return np.array([one.recording for one in self.scores], dtype=np.int64)
+
+    @property
+    def localized(self) -> BoolArray:
+        return np.array([one.reason == "" for one in self.scores], dtype=np.bool_)
+
+    @property
+    def refused(self) -> float:
+        """Share without a pose."""
+        return 1.0 - float(np.mean(self.localized)) if len(self) else 0.0
+
+    def reasons(self) -> str:
+        """``12 residual, 3 mirrored``: most frequent first; empty when nothing was refused."""
+        counts = Counter(one.reason for one in self.scores if one.reason)
+        return ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
+
+    def inside(self, name: str) -> BoolArray:
+        """Of the localized frames (k,), which truths lie in the 95 % region of a column."""
+        known: BoolArray = self.of(name)[self.localized] < REGION
+        return known
+
+    def far_off(self, name: str = "pose") -> BoolArray:
+        """Of the localized frames (k,), which are beyond five standard deviations."""
+        beyond: BoolArray = ~(self.of(name)[self.localized] < FIVE_SIGMA)
+        return beyond
+
+    def groups(self) -> NDArray[Any]:
+        """Recordings (k,) of the localized frames."""
+        return self.recordings[self.localized]
+
+    def median(self, name: str) -> float:
+        """Of the localized frames."""
+        known = self.of(name)[self.localized]
+        return float(np.median(known)) if len(known) else np.nan

@@ -1,0 +1,1 @@
+"""Load on a live node: ``python -m benchmarks.load --help``."""

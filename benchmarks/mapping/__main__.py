@@ -1,0 +1,36 @@
+"""The figures of ``docs/mapping.md`` and of an IMU in ``docs/map_build.md``:
+
+python -m benchmarks.mapping bend bound large surveys rendered weighing
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+
+from benchmarks.mapping.refining import bend, bound, large
+from benchmarks.mapping.surveying import rendered, surveys
+from benchmarks.mapping.weighing import weighing
+from rs_localizer.process.arguments import integer
+
+_PARTS: dict[str, Callable[[int], Iterator[str]]] = {
+    "bend": bend, "bound": bound, "large": large, "surveys": surveys,
+    "rendered": rendered, "weighing": weighing,
+}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.mapping")
+    parser.add_argument("names", nargs="+", metavar="PART", choices=_PARTS, help=", ".join(_PARTS))
+    parser.add_argument("--seed", type=integer(0), default=0, metavar="N")
+    options = parser.parse_args()
+    for name in options.names:
+        for text in _PARTS[name](options.seed):
+            sys.stdout.write(f"{text}\n")
+            sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

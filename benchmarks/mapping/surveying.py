@@ -1,0 +1,171 @@
+"""Markers surveyed: a printed wall, and twelve around a room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.independent.cameras import Camera
+from benchmarks.mapping.rendered import Lighting, rendered_spots
+from benchmarks.mapping.rooms import (
+    SQUARE,
+    Film,
+    a_walk,
+    estimators_camera,
+    grid,
+    ring,
+)
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.mapping.spotting import Spotted, every_marker
+from rs_localizer.mapping.survey import Survey, survey
+from rs_localizer.markers.families import family
+from rs_localizer.trajectory.fit import Fit
+from rs_localizer.trajectory.problem import LIMIT
+
+FAMILY = "4x4_50"
+_NOISE = 0.1  # px
+_SMALL, _LARGE = Camera(), Camera(width=1280, height=960, focal=840.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    name: str
+    camera: Camera = _SMALL
+    walls: bool = False
+    seconds: float = 30.0
+    wide: float = 0.5  # m, of the walk
+
+
+_SCENES = (
+    _Scene("printed wall 3x2 of 0.06 m, VGA", walls=True),
+    _Scene("12 of 0.15 m around a room, VGA"),
+    _Scene("the same, a minute, up to the walls", seconds=60.0, wide=1.2),
+    _Scene("12 around a room, 1280x960", _LARGE),
+)
+_RENDERED = (
+    (_Scene("printed wall, rendered, 2 ms", walls=True, seconds=6.0), Lighting(0.002)),
+    (_Scene("12 around a room, rendered, 2 ms", seconds=15.0), Lighting(0.002)),
+    (_Scene("12 around a room, rendered, 8 ms", seconds=12.0), Lighting(0.008)),
+)
+_HEAD = (
+    "scene                                markers    mm     deg  shape: mm    deg  "
+    "in 3: frame, shape (%)  by own deviations  T off by its own"
+)
+
+
+def surveys(seed: int, trials: int = 3) -> Iterator[str]:
+    """Errors of the markers and what they are told to be, where corners have white noise."""
+    yield f"{_HEAD}  by the bound"
+    for scene in _SCENES:
+        found = [_one(scene, [seed, trial], None) for trial in range(trials)]
+        bound = np.sqrt(np.mean([error.squared_by_bound for error in found]))
+        yield f"{_line(scene, found)} {bound:13.2f}"
+
+
+def rendered(seed: int, trials: int = 3) -> Iterator[str]:
+    """The same with corners that were found in rendered images."""
+    yield _HEAD
+    for scene, lighting in _RENDERED:
+        yield _line(scene, [_one(scene, [seed, trial], lighting) for trial in range(trials)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Errors:
+    """Of all markers of one survey, but for the origin in its own frame."""
+
+    places: Array  # mm
+    turns: Array  # deg
+    places_of_shape: Array
+    turns_of_shape: Array
+    within: BoolArray  # of each: share of the coordinates within three deviations
+    within_of_shape: BoolArray
+    squared: float  # mean squared error by the own covariance
+    squared_by_bound: float
+    readout: float  # in its own deviations
+
+
+def _line(scene: _Scene, found: Sequence[_Errors]) -> str:
+    def every(name: str) -> Array:
+        return np.concatenate([np.ravel(getattr(error, name)) for error in found])
+
+    middle = [
+        np.median(every(name)) for name in ("places", "turns", "places_of_shape", "turns_of_shape")
+    ]
+    shares = [100 * np.mean(every(name)) for name in ("within", "within_of_shape")]
+    readout = ", ".join(f"{value:.1f}" for value in every("readout"))
+    return (
+        f"{scene.name:36} {len(every('places')):5} {middle[0]:8.2f} {middle[1]:7.3f} "
+        f"{middle[2]:8.2f} {middle[3]:8.3f} {shares[0]:12.1f} {shares[1]:6.1f} "
+        f"{np.sqrt(np.mean(every('squared'))):15.2f}    {readout:>18}"
+    )
+
+
+def _one(scene: _Scene, seeds: list[int], lighting: Lighting | None) -> _Errors:
+    rng = np.random.default_rng(seeds)
+    walk = a_walk(rng, 0.0, 0.15) if scene.walls else a_walk(rng, 0.6, scene.wide)
+    poses = grid(3, 2, 0.06, 0.02) if scene.walls else ring(rng, 12)
+    size = 0.06 if scene.walls else 0.15
+    film = Film(scene.camera, walk, np.arange(0.0, scene.seconds, 1.0 / 30.0))
+    spotted: list[Spotted]
+    if lighting is None:
+        spotted = film.spot(poses, size, _NOISE, rng)
+    else:
+        spotted = rendered_spots(film, poses, size, FAMILY, lighting)
+    markers = every_marker([family(FAMILY)], size, {})
+    camera = estimators_camera(scene.camera, scene.camera.readout_time)
+    return _errors(survey(camera, spotted, markers), poses, size)
+
+
+def _errors(found: Survey, poses: list[tuple[Array, Array]], size: float) -> _Errors:
+    """In the frame of the first marker, and of the shape: all corners laid over the truth."""
+    turn, origin = poses[found.markers[0].id]
+    true = [(turn.T @ poses[m.id][0], turn.T @ (poses[m.id][1] - origin)) for m in found.markers]
+    off = _off(found, true, np.eye(3), np.zeros(3))
+    squares = np.concatenate([size * SQUARE @ axes.T + place for axes, place in true])
+    ours = np.concatenate([marker.corners for marker in found.markers])
+    back = Rotation.align_vectors(squares - squares.mean(axis=0), ours - ours.mean(axis=0))[0]
+    over = back.as_matrix()
+    shape = _off(found, true, over, squares.mean(axis=0) - over @ ours.mean(axis=0))
+    own, free = off[1:].ravel(), found.covariance[6:, 6:]
+    squared = float(own @ np.linalg.solve(free, own)) / len(own)
+    asked = found.asked_readout
+    return _Errors(
+        *_sizes(off[1:]),
+        *_sizes(shape),
+        np.abs(off[1:]) < 3.0 * found.deviations[1:],
+        np.abs(shape) < 3.0 * found.deviations_of_shape,
+        squared,
+        squared * _by_bound(found.fit),
+        np.nan if asked is None else (asked.asked - asked.given) / asked.deviation,
+    )
+
+
+def _by_bound(found: Fit) -> float:
+    """The survey's covariance by that of the bound: the inverse of the normal matrix at the true
+    noise, all weights one.
+    """
+    squared, limit = found.squared_errors[found.inliers], (LIMIT * found.deviation) ** 2
+    weight = float(np.mean((1.0 - squared / limit) ** 2))
+    return found.inflation * found.deviation**2 / (weight * _NOISE**2)
+
+
+def _off(found: Survey, true: list[tuple[Array, Array]], turn: Array, shift: Array) -> Array:
+    """Errors (m,6) of places and turns after a motion of the whole."""
+    return np.array([
+        np.concatenate([
+            turn @ marker.pose.position + shift - place,
+            Rotation.from_matrix(turn @ marker.pose.rotation @ axes.T).as_rotvec(),
+        ])
+        for marker, (axes, place) in zip(found.markers, true, strict=True)
+    ])  # fmt: skip
+
+
+def _sizes(off: Array) -> tuple[Array, Array]:
+    """Of errors (m,6): mm and deg."""
+    return (
+        1e3 * np.linalg.norm(off[:, :3], axis=1),
+        np.degrees(np.linalg.norm(off[:, 3:], axis=1)),
+    )

@@ -1,0 +1,1 @@
+"""Real videos of boards, judged without a truth: repeatability, held-out corners, neighbours."""

@@ -1,0 +1,215 @@
+"""What the poses of one video say of themselves: nobody knows the truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from benchmarks.real.clips import Clip, Shutter, halved
+from rs_localizer.config import LocalizerConfig
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.core.shutter import project_rolling
+from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.experienced import ExperiencedFrames
+from rs_localizer.tracking import Tracker
+from rs_localizer.trajectory.observe import Observed
+from rs_localizer.trajectory.online import REVERSED
+
+Poses = list[Estimate | Failure]
+METHODS = ("default", "tracked", "single")
+# 95 % quantile of chi-squared with six degrees of freedom, and the median with three.
+_INSIDE, _MEDIAN = 12.592, 2.366
+# Images in one block of the bootstrap: neighbours show nearly the same.
+_BLOCK, _RESAMPLES = 10, 1000
+
+
+def judged(clip: Clip, lens: Camera, shutter: Shutter, config: LocalizerConfig) -> dict[str, float]:
+    """One row of the table."""
+    row: dict[str, float] = {"images": len(clip.images), "readout_ms": 1e3 * shutter.readout_time}
+    camera = replace(lens, readout_time=shutter.readout_time, scan_direction=shutter.scan_direction)
+    whole = list(clip.images)
+    poses: dict[str, Poses] = {}
+    for name in (*METHODS, "p3p"):
+        begin = time.process_time()
+        poses[name] = localized(name, camera, whole, config)
+        row[f"{name}_localized"] = sum(map(bool, poses[name]))
+        row[f"{name}_ms"] = 1e3 * (time.process_time() - begin) / len(whole)
+        for reason, count in Counter(str(x.reason) for x in poses[name] if not x).items():
+            row[f"{name}_{reason}"] = count
+    found = [one for name in METHODS for one in poses[name] if one]
+    row["lens_notices"] = float(np.mean([one.lens is not None for one in found] or [False]))
+    row["solvepnp_localized"] = sum(_solve_pnp(lens, image) for image in whole)
+    for name in METHODS:
+        row |= {f"{name}_{key}": x for key, x in _jitter(clip, poses[name], poses["p3p"]).items()}
+    row |= _twists(clip, poses["single"], poses["p3p"], shutter.readout_time)
+    row |= _halves(camera, whole, config)
+    return row
+
+
+def localized(
+    name: str, camera: Camera, images: Sequence[Observed], config: LocalizerConfig
+) -> Poses:
+    """Each image, by one of the methods.
+
+    default: as a node without any parameter; single: with the readout time, each image alone;
+    tracked: with it, one after the other.
+    """
+    if name == "default":
+        frames = ExperiencedFrames(Localizer(replace(camera, readout_time=0.0), config))
+        return [frames.localize(image.points, image.pixels) for image in images]
+    if name == "tracked":
+        tracker = Tracker(Localizer(camera, config))
+        return [tracker.localize(image.stamp_ns, image.points, image.pixels) for image in images]
+    localizer = Localizer(camera, replace(config, solver="p3p") if name == "p3p" else config)
+    return [localizer.localize(image.points, image.pixels) for image in images]
+
+
+def _solve_pnp(lens: Camera, image: Observed) -> bool:
+    return bool(cv2.solvePnP(image.points, image.pixels, lens.K, lens.D)[0])
+
+
+def _jitter(clip: Clip, poses: Poses, others: Poses) -> dict[str, float]:
+    """Second differences of a method over those of another, on the images that both localize."""
+    turns: list[tuple[float, float]] = []
+    moves: list[tuple[float, float]] = []
+    stamps = np.array([image.stamp_ns for image in clip.images]) * 1e-9
+    for k in range(1, len(poses) - 1):
+        triples = [[one for one in of[k - 1 : k + 2] if one] for of in (poses, others)]
+        if any(len(triple) < 3 for triple in triples) or (
+            stamps[k + 1] - stamps[k - 1] > 3.0 * clip.interval
+        ):
+            continue
+        first, second = (_second_difference(triple) for triple in triples)
+        turns.append((first[0], second[0]))
+        moves.append((first[1], second[1]))
+    found = {}
+    for name, pairs in (("turn", turns), ("move", moves)):
+        values = np.array(pairs or [(math.nan, math.nan)])
+        for part in (50, 95):
+            own, other = np.percentile(values, part, axis=0)
+            found[f"{name}{part}"] = float(own / other)
+    return found
+
+
+def _second_difference(triple: Sequence[Estimate]) -> tuple[float, float]:
+    """rad, m."""
+    a, b, c = triple
+    turn = so3.log(c.rotation @ b.rotation.T) - so3.log(b.rotation @ a.rotation.T)
+    move = a.position - 2.0 * b.position + c.position
+    return float(np.linalg.norm(turn)), float(np.linalg.norm(move))
+
+
+def _twists(clip: Clip, single: Poses, p3p: Poses, readout_time: float) -> dict[str, float]:
+    """Turn rates of single images against the poses (P3P) of their neighbours."""
+    own, between = [], []
+    for k in range(1, len(single) - 1):
+        before, here, after = p3p[k - 1], single[k], p3p[k + 1]
+        seconds = 1e-9 * (clip.images[k + 1].stamp_ns - clip.images[k - 1].stamp_ns)
+        if before and here and after and seconds < 3.0 * clip.interval:
+            own.append(here.angular_velocity / readout_time)
+            between.append(so3.log(before.rotation @ after.rotation.T) / seconds)
+    if not own:
+        return {}
+    rates, truth = np.array(own), np.array(between)
+    error = np.linalg.norm(rates - truth, axis=1)
+    return {
+        "twist_error": float(np.degrees(np.median(error))),
+        "twist_size": float(np.degrees(np.median(np.linalg.norm(truth, axis=1)))),
+    }
+
+
+def _halves(
+    camera: Camera, images: Sequence[Observed], config: LocalizerConfig
+) -> dict[str, float]:
+    """Poses from random halves of the corners against each other, and what each says of the other's
+    corners: rolling over global shutter, the direction of the scan, and the reversed one.
+    """
+    parts: list[list[Observed]] = [[], []]
+    for seed, image in enumerate(images):
+        for part, chosen in zip(parts, halved(len(image.points), seed), strict=True):
+            part.append(replace(image, points=image.points[chosen], pixels=image.pixels[chosen]))
+    reverse = replace(camera, scan_direction=str(REVERSED[ScanDirection(camera.scan_direction)]))
+    cameras = {"single": camera, "tracked": camera, "reversed": reverse, "p3p": camera}
+    fits = {
+        name: [
+            localized("tracked" if name == "reversed" else name, by, part, config)
+            for part in (parts if name in ("single", "tracked") else parts[:1])
+        ]
+        for name, by in cameras.items()
+    }
+    row: dict[str, float] = {}
+    for name in ("single", "tracked"):
+        row |= {f"{name}_{key}": x for key, x in _agreement(*fits[name]).items()}
+    errors = {name: _errors(by, fits[name][0], parts[1]) for name, by in cameras.items()}
+    for name in ("single", "tracked", "reversed"):
+        low, middle, high = _ratio(errors[name], errors["p3p"])
+        row |= {f"{name}_held": middle, f"{name}_held_low": low, f"{name}_held_high": high}
+    row["tracked_over_single"] = _ratio(errors["tracked"], errors["single"])[1]
+    row["held_px"] = float(np.sqrt(np.nanmean(errors["p3p"])))
+    return row
+
+
+def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
+    """How two poses of each image agree, and whether their covariances say so."""
+    inside, turns, moves = [], [], []
+    for one, other in zip(ones, others, strict=True):
+        if not (one and other):
+            continue
+        step = np.concatenate(
+            [
+                so3.log(one.rotation @ other.rotation.T),
+                one.rotation @ (other.position - one.position),
+            ]
+        )
+        spread = own_covariance(one) + own_covariance(other)
+        inside.append(step @ np.linalg.solve(spread, step) < _INSIDE)
+        turns.append(step[:3] @ np.linalg.solve(spread[:3, :3], step[:3]))
+        moves.append(step[3:] @ np.linalg.solve(spread[3:, 3:], step[3:]))
+    if not inside:
+        return {"halves": 0}
+    return {
+        "halves": len(inside),
+        "inside": float(np.mean(inside)),
+        "turn_claimed": math.sqrt(_MEDIAN / np.median(turns)),
+        "move_claimed": math.sqrt(_MEDIAN / np.median(moves)),
+    }
+
+
+def own_covariance(estimate: Estimate) -> Array:
+    """Of the pose, less what all images of a calibration share: it is no difference of halves."""
+    shared = getattr(estimate, "calibration_covariance", np.zeros((12, 12)))
+    return estimate.covariance[:6, :6] - shared[:6, :6]
+
+
+def _errors(camera: Camera, poses: Poses, held_out: Sequence[Observed]) -> Array:
+    """Mean squared errors (f,) of corners that no pose has seen, px^2; NaN without a pose."""
+    errors = np.full(len(poses), np.nan)
+    for k, (pose, image) in enumerate(zip(poses, held_out, strict=True)):
+        if pose:
+            by = camera if pose.lens is None else pose.lens.mended(camera)
+            pixels = project_rolling(by, pose.at_rows, image.points)[0]
+            errors[k] = np.mean(np.sum((pixels - image.pixels) ** 2, axis=1))
+    return errors
+
+
+def _ratio(errors: Array, others: Array) -> tuple[float, float, float]:
+    """Of the root mean squares on common images: 2.5 %, value, 97.5 %, by a bootstrap of blocks."""
+    common = np.flatnonzero(np.isfinite(errors) & np.isfinite(others))
+    if len(common) == 0:
+        return math.nan, math.nan, math.nan
+    blocks = np.array_split(common, max(len(common) // _BLOCK, 1))
+    sums = np.array([[errors[block].sum(), others[block].sum()] for block in blocks])
+    picks = np.random.default_rng(0).integers(len(sums), size=(_RESAMPLES, len(sums)))
+    drawn = sums[picks].sum(axis=1)
+    low, high = np.percentile(np.sqrt(drawn[:, 0] / drawn[:, 1]), [2.5, 97.5])
+    return float(low), float(np.sqrt(sums[:, 0].sum() / sums[:, 1].sum())), float(high)

@@ -1,0 +1,252 @@
+"""The cube in a few seconds of a shaking hand, drawn by P3P and by the localizer: an animation."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from PIL import Image as Pillow
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.io.video import Image
+from rs_localizer.markers.prints import Marker
+from rs_localizer.simulation.frames import true_poses_at
+from rs_localizer.simulation.marker_frames import CAMERA, RATE, MarkerWalls
+from rs_localizer.simulation.renderer import ImageSettings
+from rs_localizer.simulation.true_motion import TrueMotion
+
+_BAR, _GAP = 30, 6  # px
+_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
+_PALETTE = 64
+
+
+def side_by_side(
+    pictures: Sequence[Image],
+    captions: Sequence[Sequence[str]],
+    colors: Sequence[tuple[int, int, int]],
+    width: int,
+) -> Image:
+    """Pictures (h,w,3) in a row, each ``width`` px wide below a bar with two words on it.
+
+    The first stands on the left of the bar, the second on the right.
+    """
+    height = round(width * pictures[0].shape[0] / pictures[0].shape[1])
+    columns = []
+    for picture, caption, color in zip(pictures, captions, colors, strict=True):
+        small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        bar = np.full((_BAR, width, 3), 255, np.uint8)
+        for text, right in zip(caption, (False, True), strict=True):
+            (length, _), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
+            x = width - length - 4 if right else 4
+            cv2.putText(bar, text, (x, 20), _FONT, _FONT_SCALE, color, 1, cv2.LINE_AA)
+        columns += [np.vstack([bar, small]), np.full((_BAR + height, _GAP, 3), 255, np.uint8)]
+    return np.asarray(np.hstack(columns[:-1]), np.uint8)
+
+
+def gif(pictures: Sequence[Image], frame_rate: float) -> bytes:
+    """An animated GIF of pictures (h,w,3), blue first, that is shown again and again.
+
+    All share one palette, made of a few of them: colors do not flicker, and what stays the same
+    costs nothing.
+    """
+    chosen = pictures[:: max(1, len(pictures) // 8)]
+    sample = Pillow.fromarray(cv2.cvtColor(np.vstack(chosen), cv2.COLOR_BGR2RGB))
+    palette = sample.quantize(_PALETTE)
+    frames = [
+        Pillow.fromarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)).quantize(
+            palette=palette, dither=Pillow.Dither.NONE
+        )
+        for picture in pictures
+    ]
+    file = io.BytesIO()
+    # GIF counts in hundredths of a second.
+    duration = 10 * max(2, round(100.0 / frame_rate))
+    frames[0].save(
+        file, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0,
+        optimize=True,
+    )  # fmt: skip
+    return file.getvalue()
+
+
+# Of a marker's side: the cube stands on the paper around it.
+_SIDE = 1.5
+# Points along an edge: the shutter bends it.
+_POINTS = 24
+# Binary digits of a pixel that OpenCV's drawing takes.
+_SHIFT = 4
+_OPACITY = 0.35
+_LINE_WIDTH = 3
+
+# Corner k is at the digits of k: x, y, z; the cube's frame is that of the marker below it.
+_CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)]) - np.array([0.5, 0.5, 0.0])
+# Corners of each face around it, anticlockwise from outside.
+_FACES = np.array(
+    [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+)
+
+PosesAt = Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cube:
+    """A cube by its corners (8,3), m in the map frame."""
+
+    corners: Array
+
+
+def cube_on(marker: Marker) -> Cube:
+    """A cube that stands on a marker like a box on a carpet."""
+    return Cube(marker.pose(_SIDE * marker.size * _CORNERS))
+
+
+def corner_pixels(camera: Camera, poses_at: PosesAt, cube: Cube) -> Array:
+    """Raw pixels (8,2) where a moving camera sees the corners; NaN where it does not."""
+    return project_rolling(camera, poses_at, cube.corners)[0]
+
+
+def draw_cube(
+    picture: Image, camera: Camera, poses_at: PosesAt, cube: Cube, color: tuple[int, int, int]
+) -> None:
+    """Draw a cube into a picture (height, width, 3), each of its points at its own row's pose.
+
+    Args:
+        poses_at: row times (n,) to poses camera_from_map, as of ``Motion.at_rows``.
+    """
+    rotations, translations = poses_at(np.zeros(1))
+    centre = -rotations[0].T @ translations[0]
+    outlines = [_outline(camera, poses_at, cube.corners[face]) for face in _FACES]
+    if not all(np.all(np.isfinite(outline)) for outline in outlines):
+        return  # partly behind the camera
+    near = [_faces_viewer(cube.corners[face], centre) for face in _FACES]
+    fixed = [np.rint(outline * 2**_SHIFT).astype(np.int32) for outline in outlines]
+    for outline, seen in zip(fixed, near, strict=True):
+        if not seen:
+            cv2.polylines(picture, [outline], True, color, 1, cv2.LINE_AA, _SHIFT)
+    filled = picture.copy()
+    for outline, seen in zip(fixed, near, strict=True):
+        if seen:
+            cv2.fillPoly(filled, [outline], color, cv2.LINE_AA, _SHIFT)
+    cv2.addWeighted(filled, _OPACITY, picture, 1.0 - _OPACITY, 0.0, dst=picture)
+    for outline, seen in zip(fixed, near, strict=True):
+        if seen:
+            cv2.polylines(picture, [outline], True, color, _LINE_WIDTH, cv2.LINE_AA, _SHIFT)
+
+
+def _outline(camera: Camera, poses_at: PosesAt, face: Array) -> Array:
+    """Raw pixels (n,2) of points all around a face (4,3)."""
+    share = np.arange(_POINTS)[:, None] / _POINTS
+    edges = [a + share * (b - a) for a, b in zip(face, np.roll(face, -1, axis=0), strict=True)]
+    return project_rolling(camera, poses_at, np.concatenate(edges))[0]
+
+
+def _faces_viewer(face: Array, centre: Array) -> bool:
+    normal = np.cross(face[1] - face[0], face[2] - face[1])
+    return bool(normal @ (centre - face[0]) > 0.0)
+
+
+# Of the bundled motion: the hand turns the camera to and fro about all axes, up to 200 deg/s, and
+# this marker is in view nearly all the time.
+_START, _DURATION, _MARKER = 21.7, 3.2, 121
+# Images before these, in which the tracking finds its feet; a camera in use has run for long.
+RUN_UP = 10
+# A picture for people, who do not need every second image, nor noise in it.
+CLIP_SENSOR = ImageSettings(exposure=0.001)
+_EVERY = 2
+# Pictures per second: slower than it was, for the eye to follow.
+_SHOWN_RATE = 10.0
+_WIDTH = 360
+# The two methods. Orange and blue differ for everyone, and in lightness.
+P3P, OURS = "p3p", "localizer"
+_COLORS = {P3P: (36, 138, 240), OURS: (190, 84, 10)}
+_CAPTIONS = {P3P: "P3P: one pose per image", OURS: "ours: a pose for every row"}
+
+Motions = Mapping[str, Motion | None]  # by method; None: no pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clip:
+    """What the eye sees, and how far the cube is from its place."""
+
+    animation: bytes  # GIF
+    errors: Mapping[str, Array]  # method -> (images,) px, of the cube's farthest corner
+
+
+def clip_stamps(walls: MarkerWalls, most: int | None = None) -> list[int]:
+    """The images of the clip, or its first ones, after RUN_UP that are not shown."""
+    stamps = walls.stamps()
+    start_ns = stamps[0] + round(_START * 1e9)
+    first = next(k for k, stamp in enumerate(stamps) if stamp >= start_ns)
+    whole = round(_DURATION * RATE)
+    return stamps[first - RUN_UP : first + (whole if most is None else min(most, whole))]
+
+
+def clip_cube(walls: MarkerWalls) -> Cube:
+    """The cube of the clip."""
+    return cube_on(walls.markers[_MARKER])
+
+
+def draw_clip(
+    walls: MarkerWalls,
+    middles_ns: Sequence[int],
+    images: Sequence[Image],
+    motions: Sequence[Motions],
+) -> Clip:
+    """The cube in all images by the motions of both methods.
+
+    Images in which the cube is cut off are shown, but not counted.
+    """
+    cube = clip_cube(walls)
+    pictures: list[Image] = []
+    errors: dict[str, list[float]] = {P3P: [], OURS: []}
+    for middle_ns, image, found in zip(middles_ns, images, motions, strict=True):
+        off = cube_errors(walls.motion, middle_ns, cube, found)
+        pictures.append(_picture(image, cube, found, off))
+        for name, value in off.items():
+            errors[name].append(value)
+    return Clip(gif(pictures[::_EVERY], _SHOWN_RATE), {k: np.array(v) for k, v in errors.items()})
+
+
+def cube_errors(
+    motion: TrueMotion, middle_ns: int, cube: Cube, motions: Motions
+) -> dict[str, float]:
+    """How far the cube's farthest corner is off in the image, px, for each method.
+
+    Infinite without a pose; empty when the cube is not all in the image.
+    """
+    true = corner_pixels(CAMERA, true_poses_at(CAMERA, motion, middle_ns), cube)
+    if not np.all(CAMERA.inside(true)):
+        return {}
+    errors = {}
+    for name, found in motions.items():
+        if found is None:
+            errors[name] = np.inf
+        else:
+            off = np.linalg.norm(corner_pixels(CAMERA, found.at_rows, cube) - true, axis=1).max()
+            errors[name] = float(np.nan_to_num(off, nan=np.inf))
+    return errors
+
+
+def _picture(
+    image: Image,
+    cube: Cube,
+    motions: Motions,
+    off: Mapping[str, float],
+) -> Image:
+    """The image once for each method, with its cube and what it is off by."""
+    pictures: list[Image] = []
+    captions: list[Sequence[str]] = []
+    for name, motion in motions.items():
+        picture = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+        if motion is not None:
+            draw_cube(picture, CAMERA, motion.at_rows, cube, _COLORS[name])
+        pictures.append(picture)
+        error = "no pose" if motion is None else ""
+        if motion is not None and name in off:
+            error = f"off by {off[name]:.0f} px" if off[name] >= 1.0 else "off by less than 1 px"
+        captions.append((_CAPTIONS[name], error))
+    return side_by_side(pictures, captions, [_COLORS[name] for name in motions], _WIDTH)

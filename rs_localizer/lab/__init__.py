@@ -1,1 +1,0 @@
-"""Simulated and recorded data, and how far an estimate is from the truth."""

@@ -1,1 +1,0 @@
-"""Programs that look for faults and for lost time."""

@@ -1,5 +1,0 @@
-"""Wrong input for everything that reads messages, files and settings.
-
-``python -m rs_localizer.lab.checks.fuzzing --executions 1000000`` runs for long, the
-tests for a moment.
-"""

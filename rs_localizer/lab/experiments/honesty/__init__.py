@@ -1,5 +1,0 @@
-"""Honesty: are the covariances what they say, on motion and calibrations as they really are?
-
-All frames are of the independent simulator (:mod:`rs_localizer.lab.independent`), of rendered
-images or of a real recording, and the estimator is used through its public interfaces only.
-"""

@@ -1,1 +1,0 @@
-"""Simulated frames, their truth, and their recordings."""

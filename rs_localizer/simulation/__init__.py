@@ -1,0 +1,1 @@
+"""Simulated frames, rendered images, an IMU, their truth and their recordings."""

@@ -1,0 +1,203 @@
+"""Simulated frames of a rolling-shutter camera, with their truth.
+
+Every point is projected at the time of its own row along the true motion; noise and outliers are
+added to the raw pixels, so that they disturb the row time too, as in a real image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.simulation.true_motion import TrueMotion, TrueState
+
+# No points closer than this (m): a lens sees them as a blur.
+_NEAREST = 0.3
+# Points whose true pixel is this many standard deviations of the noise inside the image keep
+# their noise Gaussian: it need not be cut at the border.
+_BORDER_SIGMAS = 4.0
+# A lens model may fold far points back into the image; these bearings do not return (rad).
+_FOLD_TOLERANCE = 1e-3
+# How far a middle-row view may differ from the rolling one, in image sizes.
+_VIEW_MARGIN = 0.15
+# Row times beyond this are of no interest (the image ends at 0.5).
+_FARTHEST_ROW = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSettings:
+    """What is seen in each frame, and how badly."""
+
+    points: int = 150  # at most; fewer where the map shows fewer
+    noise: float = 1.0  # standard deviation of u and of v, raw pixels
+    outliers: float = 0.3  # share of the points whose pixel is uniform in the image
+    rate: float = 30.0  # frames per second
+
+    def __post_init__(self) -> None:
+        if self.points < 0:
+            raise ValueError(f"points must be 0 or more, got {self.points}")
+        if not 0.0 <= self.noise < np.inf:
+            raise ValueError(f"noise must be 0 or more pixels, got {self.noise}")
+        if not 0.0 <= self.outliers <= 1.0:
+            raise ValueError(f"outliers must lie between 0 and 1, got {self.outliers}")
+        if not 0.0 < self.rate < np.inf:
+            raise ValueError(f"rate must be more than 0 frames per second, got {self.rate}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedFrame:
+    """One frame; ``stamp_ns`` is the exposure of the first row, the middle row follows."""
+
+    stamp_ns: int
+    middle_ns: int
+    ids: NDArray[np.int64]  # (n,) rows of the map
+    points: Array  # (n,3) m, map frame
+    pixels: Array  # (n,2) raw, with noise and outliers
+    inliers: NDArray[np.bool_]  # (n,)
+    first_row: TrueState  # one instant: at stamp_ns
+    middle_row: TrueState  # one instant: at middle_ns
+    readout_time: float
+
+    @property
+    def motion(self) -> Motion:
+        """The truth as the localizer reports it: pose at the middle row, velocities per readout."""
+        rotation = self.middle_row.rotations[0].T
+        return Motion(
+            rotation,
+            -rotation @ self.middle_row.positions[0],
+            self.middle_row.angular[0] * self.readout_time,
+            self.middle_row.linear[0] * self.readout_time,
+        )
+
+
+def frame_stamps(motion: TrueMotion, camera: Camera, rate: float) -> list[int]:
+    """Times in ns of all frames whose readout lies within a stretch of the motion.
+
+    The camera runs on through the gaps of a recorded motion, but what it saw there is unknown:
+    these frames are left out.
+    """
+    intervals = motion.intervals_ns
+    readout_ns = round(camera.readout_time * 1e9)
+    start, end = intervals[0][0], intervals[-1][1]
+    stamps = [start + round(k * 1e9 / rate) for k in range(int((end - start) * 1e-9 * rate) + 1)]
+    return [
+        stamp
+        for stamp in stamps
+        if any(first <= stamp and stamp + readout_ns <= last for first, last in intervals)
+    ]
+
+
+def middle_stamp(camera: Camera, stamp_ns: int) -> int:
+    """When the sensor's middle row is exposed, of a frame whose first row is at ``stamp_ns``."""
+    return stamp_ns + round(-camera.first_row_time * camera.readout_time * 1e9)
+
+
+def true_poses_at(
+    camera: Camera, motion: TrueMotion, middle_ns: int
+) -> Callable[[Array], tuple[Array, Array]]:
+    """Row times (n,) to poses camera_from_map along a motion, for ``project_rolling``."""
+
+    def poses_at(tau: Array) -> tuple[Array, Array]:
+        # The search for the row may stray, or end as NaN: no such row is ever inside the image.
+        near = np.clip(np.nan_to_num(tau), -_FARTHEST_ROW, _FARTHEST_ROW)
+        state = motion.state(middle_ns, near * camera.readout_time)
+        rotations = np.swapaxes(state.rotations, 1, 2)
+        return rotations, -np.einsum("nij,nj->ni", rotations, state.positions)
+
+    return poses_at
+
+
+def simulate_frames(
+    camera: Camera,
+    motion: TrueMotion,
+    map_points: Array,
+    settings: FrameSettings,
+    *,
+    stamps_ns: list[int] | None = None,
+    seed: int = 0,
+) -> Iterator[SimulatedFrame]:
+    """The frames that a camera sees of a map (m,3) along a motion.
+
+    Args:
+        camera: its readout time and scan direction decide when each row is exposed.
+        stamps_ns: exposure of the first row of each frame; default: :func:`frame_stamps`.
+        seed: each frame has its own random numbers, from this and its place in the list.
+    """
+    if stamps_ns is None:
+        stamps_ns = frame_stamps(motion, camera, settings.rate)
+    for index, stamp_ns in enumerate(stamps_ns):
+        rng = np.random.default_rng([seed, index])
+        yield _frame(camera, motion, map_points, settings, stamp_ns, rng)
+
+
+def _frame(
+    camera: Camera,
+    motion: TrueMotion,
+    map_points: Array,
+    settings: FrameSettings,
+    stamp_ns: int,
+    rng: np.random.Generator,
+) -> SimulatedFrame:
+    middle_ns = middle_stamp(camera, stamp_ns)
+    now = np.zeros(1)
+    middle_row = motion.state(middle_ns, now)
+    ids, pixels = _visible(camera, motion, middle_ns, map_points, settings, rng)
+    inliers = np.ones(len(ids), dtype=bool)
+    inliers[: round(settings.outliers * len(ids))] = False
+    inliers = rng.permutation(inliers)
+    pixels = pixels + rng.normal(0.0, settings.noise, size=pixels.shape)
+    uniform = rng.uniform(-0.5, np.array(camera.size) - 0.5, size=pixels.shape)
+    return SimulatedFrame(
+        stamp_ns=stamp_ns,
+        middle_ns=middle_ns,
+        ids=ids,
+        points=map_points[ids],
+        pixels=np.where(inliers[:, None], pixels, uniform),
+        inliers=inliers,
+        first_row=motion.state(stamp_ns, now),
+        middle_row=middle_row,
+        readout_time=camera.readout_time,
+    )
+
+
+def _visible(
+    camera: Camera,
+    motion: TrueMotion,
+    middle_ns: int,
+    map_points: Array,
+    settings: FrameSettings,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.int64], Array]:
+    """A random choice of the points that some row sees: their ids (n,) and true pixels (n,2)."""
+
+    poses_at = true_poses_at(camera, motion, middle_ns)
+    size = np.array(camera.size)
+    rotations, translations = poses_at(np.zeros(1))
+    local = map_points @ rotations[0].T + translations
+    ahead = np.flatnonzero(local[:, 2] > 0.0)
+    rough = camera.project(local[ahead])
+    near_view = np.all(np.abs(rough - 0.5 * size) < (0.5 + _VIEW_MARGIN) * size, axis=1)
+    candidates = rng.permutation(ahead[near_view])
+    border = min(_BORDER_SIGMAS * settings.noise, 0.25 * float(size.min()))
+    ids = np.zeros(0, dtype=np.int64)
+    pixels = np.zeros((0, 2))
+    # Twice as many as needed is mostly enough; the rolling projection of all would be slow.
+    for start in range(0, len(candidates), max(1, 2 * settings.points)):
+        if len(ids) >= settings.points:
+            break
+        block = candidates[start : start + 2 * settings.points]
+        seen, tau = project_rolling(camera, poses_at, map_points[block])
+        inside = np.all((seen > border - 0.5) & (seen < size - 0.5 - border), axis=1)
+        block, seen, tau = block[inside], seen[inside], tau[inside]
+        rotations, translations = poses_at(tau)
+        local = np.einsum("nij,nj->ni", rotations, map_points[block]) + translations
+        folded = np.abs(camera.rays(seen) - local[:, :2] / local[:, 2:]).max(axis=1)
+        kept = (local[:, 2] > _NEAREST) & (folded < _FOLD_TOLERANCE)
+        ids, pixels = np.concatenate([ids, block[kept]]), np.concatenate([pixels, seen[kept]])
+    return ids[: settings.points], pixels[: settings.points]

@@ -1,0 +1,214 @@
+"""What an IMU on a camera's true motion measures, and its messages in a recording.
+
+Every reading is of one instant: the body rate of the motion, and the specific force ``R' (a - g)``
+at the IMU's own place, ``a`` by the difference of the true velocities around that instant. Nothing
+of it is made of what the estimators assume.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.io import topics
+from rs_localizer.io.bags import BagWriter, make_message
+from rs_localizer.io.messages import make_header
+from rs_localizer.io.recording import CAMERA_FRAME
+from rs_localizer.io.transforms.rigid import Transform, make_transform
+from rs_localizer.simulation.true_motion import BODY_FROM_CAMERA, TrueMotion
+
+_GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up
+_STEP = 1e-5  # s, of the difference that gives accelerations
+_CHUNK = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSettings:
+    """How good an IMU is: that of a phone or a drone."""
+
+    rate: float = 400.0  # Hz
+    gyroscope_noise: float = math.radians(0.01)  # rad/s/sqrt(Hz)
+    gyroscope_bias: float = math.radians(0.5)  # rad/s, in any direction
+    gyroscope_bias_walk: float = math.radians(0.002)  # rad/s^2/sqrt(Hz)
+    accelerometer_noise: float = 2e-3  # m/s^2/sqrt(Hz)
+    accelerometer_bias: float = 0.05  # m/s^2, in any direction
+    time_offset: float = 0.0  # s to be added to its stamps to get the camera's time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lever:
+    """Where the IMU sits: a reading in its axes, ``rotation @ reading`` in the camera's."""
+
+    rotation: Array = field(  # (3,3) camera_from_imu; REP-103's body, x forward and z up
+        default_factory=lambda: BODY_FROM_CAMERA["forward_left_up"].T
+    )
+    position: Array = field(  # (3,) m, in camera axes
+        default_factory=lambda: np.array([0.03, -0.02, -0.01])
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuTrack:
+    """n readings of a recording."""
+
+    stamps_ns: IntArray  # (n,) by the IMU's clock
+    times_ns: IntArray  # (n,) when they were taken
+    angular_velocities: Array  # (n,3) rad/s, IMU axes
+    specific_forces: Array  # (n,3) m/s^2, IMU axes
+    biases: Array  # (n,3) rad/s, the gyroscope's, IMU axes: part of what it measures
+
+
+def simulate_imu(
+    motion: TrueMotion, settings: ImuSettings, lever: Lever, rng: np.random.Generator
+) -> ImuTrack:
+    """The readings all along a motion; none where a recorded motion has gaps."""
+    times = np.concatenate(
+        [
+            first + np.round(np.arange(0.0, last - first, 1e9 / settings.rate)).astype(np.int64)
+            for first, last in motion.intervals_ns
+        ]
+    )
+    parts = [_true(motion, chunk, lever) for chunk in _chunks(times)]
+    rates, forces = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    shape, root = (len(times), 3), math.sqrt(settings.rate)
+    walk = rng.normal(0.0, settings.gyroscope_bias_walk / root, shape)
+    walk[0] = settings.gyroscope_bias * _direction(rng)
+    biases = np.cumsum(walk, axis=0)
+    force_bias = settings.accelerometer_bias * _direction(rng)
+    return ImuTrack(
+        stamps_ns=times - round(settings.time_offset * 1e9),
+        times_ns=times,
+        angular_velocities=rates + biases
+        + rng.normal(0.0, settings.gyroscope_noise * root, shape),
+        specific_forces=forces + force_bias
+        + rng.normal(0.0, settings.accelerometer_noise * root, shape),
+        biases=biases,
+    )  # fmt: skip
+
+
+def _chunks(times: IntArray) -> Iterator[IntArray]:
+    """Cut where a motion has gaps, and where rounding of seconds would begin to show."""
+    steps = np.diff(times, prepend=times[:1])[1:]
+    ends = np.flatnonzero(steps > 2 * np.median(steps)) + 1
+    for part in np.split(times, ends):
+        yield from np.split(part, range(_CHUNK, len(part), _CHUNK))
+
+
+def _true(motion: TrueMotion, times: IntArray, lever: Lever) -> tuple[Array, Array]:
+    """Body rates and specific forces (n,3) in IMU axes."""
+    offsets = (times - times[0]) * 1e-9
+    state = motion.state(int(times[0]), offsets)
+    ends = [_velocity(motion, times, offsets + shift, lever) for shift in (-_STEP, _STEP)]
+    acceleration = (ends[1] - ends[0]) / (2.0 * _STEP)
+    force = np.einsum("nji,nj->ni", state.rotations, acceleration - _GRAVITY)
+    return state.angular @ lever.rotation, force @ lever.rotation
+
+
+def _velocity(motion: TrueMotion, times: IntArray, offsets: Array, lever: Lever) -> Array:
+    """Velocities (n,3) of the IMU in the map."""
+    state = motion.state(int(times[0]), offsets)
+    velocity = state.linear + np.cross(state.angular, lever.position)
+    return np.asarray(np.einsum("nij,nj->ni", state.rotations, velocity), np.float64)
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    vector = rng.normal(size=3)
+    return np.asarray(vector / np.linalg.norm(vector), np.float64)
+
+
+IMU_TOPIC = f"/{topics.IMU}"
+IMU_FRAME = "imu_link"
+# Readings go on for so long after the last frame.
+_REST_NS = 100_000_000
+_BEFORE_NS = 700_000_000
+
+
+class ImuBagWriter(BagWriter):
+    """Writes a recording of a camera and an IMU.
+
+    What is written with the stamp of a frame is recorded when its last row has been read, as from a
+    real camera; between the frames come the readings, recorded when they were taken.
+
+    Args:
+        path, storage: as for :class:`BagWriter`.
+        readout_time: s.
+        track, settings, lever: of the IMU.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        storage: str,
+        readout_time: float,
+        track: ImuTrack,
+        settings: ImuSettings,
+        lever: Lever,
+    ) -> None:
+        super().__init__(path, storage)
+        self._delay_ns = round(readout_time * 1e9)
+        self._track, self._settings, self._lever = track, settings, lever
+        self._next: int | None = None  # reading to be written
+
+    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        recorded_ns = stamp_ns + self._delay_ns
+        if self._next is None:
+            begin_ns = stamp_ns - _BEFORE_NS
+            self._next = int(np.searchsorted(self._track.times_ns, begin_ns))
+            super().write("/tf_static", mounting(self._lever), begin_ns)
+        self._write_readings(recorded_ns)
+        self._latest_ns = recorded_ns
+        super().write(topic, message, recorded_ns)
+
+    def __exit__(self, *failure: Any) -> None:
+        if failure[0] is None and self._next is not None:
+            self._write_readings(self._latest_ns + _REST_NS)
+        super().__exit__(*failure)
+
+    def _write_readings(self, until_ns: int) -> None:
+        assert self._next is not None
+        end = int(np.searchsorted(self._track.times_ns, until_ns, "right"))
+        for i in range(self._next, end):
+            message = make_imu(
+                int(self._track.stamps_ns[i]),
+                self._track.angular_velocities[i],
+                self._track.specific_forces[i],
+                self._settings,
+            )
+            super().write(IMU_TOPIC, message, int(self._track.times_ns[i]))
+        self._next = max(self._next, end)
+
+
+def make_imu(
+    stamp_ns: int, rate: Array, force: Array, settings: ImuSettings, frame: str = IMU_FRAME
+) -> Any:
+    """A sensor_msgs/Imu: rate (3,) in rad/s, force (3,) in m/s^2; it knows no orientation."""
+    densities = (settings.gyroscope_noise, settings.accelerometer_noise)
+    variances = [np.eye(3).ravel() * density**2 * settings.rate for density in densities]
+    return make_message(
+        "sensor_msgs/msg/Imu",
+        header=make_header(make_message, stamp_ns, frame),
+        orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=np.array([-1.0, *[0.0] * 8]),
+        angular_velocity=_vector(rate),
+        angular_velocity_covariance=variances[0],
+        linear_acceleration=_vector(force),
+        linear_acceleration_covariance=variances[1],
+    )
+
+
+def mounting(lever: Lever) -> Any:
+    """The tf2_msgs/TFMessage that says where the IMU is on the camera."""
+    camera_from_imu = Transform(lever.rotation, lever.position)
+    transform = make_transform(make_message, 0, CAMERA_FRAME, IMU_FRAME, camera_from_imu)
+    return make_message("tf2_msgs/msg/TFMessage", transforms=[transform])
+
+
+def _vector(vector: Array) -> Any:
+    x, y, z = vector.tolist()
+    return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -1,0 +1,89 @@
+"""Simulated frames and their truth as messages of a recording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, make_message
+from rs_localizer.io.clouds import make_cloud
+from rs_localizer.io.messages import make_header
+from rs_localizer.io.recording import (
+    CAMERA_FRAME,
+    CAMERA_INFO_TOPIC,
+    KEYPOINTS_TOPIC,
+    MAP_FRAME,
+    RAW_IMAGE_TOPIC,
+    make_camera_info,
+    write_frame,
+    write_image,
+)
+from rs_localizer.simulation.frames import SimulatedFrame
+from rs_localizer.simulation.image_sequence import RenderedFrame
+from rs_localizer.simulation.true_motion import TrueState
+
+TRUE_POSE_TOPIC = "/truth/pose"
+TRUE_TWIST_TOPIC = "/truth/twist"
+
+
+def write_simulated(
+    bag: BagWriter, camera: Camera, frame: SimulatedFrame, keypoints: NDArray[Any] | None = None
+) -> None:
+    """Camera info, correspondences, and the truth at the first and at the middle row.
+
+    With rows of keypoints (n,) these in the place of correspondences.
+    """
+    if keypoints is None:
+        write_frame(bag, camera, frame.stamp_ns, frame.points, frame.pixels, frame.ids)
+    else:
+        bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
+        cloud = make_cloud(make_message, frame.stamp_ns, CAMERA_FRAME, keypoints)
+        bag.write(KEYPOINTS_TOPIC, cloud, frame.stamp_ns)
+    write_truth(bag, frame.stamp_ns, frame.first_row)
+    if frame.middle_ns != frame.stamp_ns:
+        write_truth(bag, frame.middle_ns, frame.middle_row)
+
+
+def write_rendered(bag: BagWriter, camera: Camera, frame: RenderedFrame) -> None:
+    """Camera info, image, and the truth at the first and at the middle row."""
+    bag.write(CAMERA_INFO_TOPIC, make_camera_info(camera, frame.stamp_ns), frame.stamp_ns)
+    write_image(bag, RAW_IMAGE_TOPIC, frame.stamp_ns, frame.format, frame.data)
+    write_truth(bag, frame.stamp_ns, frame.first_row)
+    if frame.middle_ns != frame.stamp_ns:
+        write_truth(bag, frame.middle_ns, frame.middle_row)
+
+
+def write_truth(bag: BagWriter, stamp_ns: int, state: TrueState) -> None:
+    """Pose of the camera in the map and its twist in camera axes, of a state of one instant."""
+    x, y, z = state.positions[0].tolist()
+    qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(state.rotations[0])).tolist()
+    pose = make_message(
+        "geometry_msgs/msg/PoseStamped",
+        header=make_header(make_message, stamp_ns, MAP_FRAME),
+        pose=make_message(
+            "geometry_msgs/msg/Pose",
+            position=make_message("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=make_message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        ),
+    )
+    twist = make_message(
+        "geometry_msgs/msg/TwistStamped",
+        header=make_header(make_message, stamp_ns, CAMERA_FRAME),
+        twist=make_message(
+            "geometry_msgs/msg/Twist",
+            linear=_vector(state.linear[0]),
+            angular=_vector(state.angular[0]),
+        ),
+    )
+    bag.write(TRUE_POSE_TOPIC, pose, stamp_ns)
+    bag.write(TRUE_TWIST_TOPIC, twist, stamp_ns)
+
+
+def _vector(vector: Array) -> Any:
+    x, y, z = vector.tolist()
+    return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

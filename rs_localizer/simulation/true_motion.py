@@ -1,0 +1,246 @@
+"""True motions of a simulated camera: constant velocity, or a spline through recorded poses.
+
+A true motion knows its pose and its velocities at every instant; nothing of it is made of the
+model that the estimators fit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.interpolate import make_interp_spline, make_lsq_spline
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.trajectories import Trajectory, split_at_gaps
+
+# Camera axes (x right, y down, z forward) in the body axes of a recorded trajectory; columns are
+# the camera's axes. Motion capture of a rig or robot mostly gives REP-103's body, x forward and
+# z up; of a camera data set, the camera itself.
+BODY_FROM_CAMERA = {
+    "forward_left_up": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    "optical": np.eye(3),
+}
+
+# Motion capture at 100 Hz and more shakes by a few tenths of a degree from sample to sample: a
+# spline through every sample turns that into accelerations that no hand has (0.24 degrees median,
+# 8 at worst, off constant velocity within 30 ms on TUM VI room5; 0.04 and 0.27 with knots of
+# 50 ms, which stay within 0.15 mm and 0.07 degrees, median, of the samples). A hand moves below
+# 10 Hz, and knots of 50 ms follow that.
+KNOT_SPACING = 0.05
+# Fewer samples to a knot than this leave nothing to average: then every sample is a knot.
+_SAMPLES_PER_KNOT = 2.0
+_DEGREE = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueState:
+    """Camera poses and velocities at n instants."""
+
+    rotations: Array  # (n,3,3) map_from_camera
+    positions: Array  # (n,3) m, camera centre in the map
+    angular: Array  # (n,3) rad/s, of the camera with respect to the map, camera axes
+    linear: Array  # (n,3) m/s, of the camera centre with respect to the map, camera axes
+
+
+class TrueMotion(Protocol):
+    """What the simulation needs to know of a motion."""
+
+    @property
+    def intervals_ns(self) -> list[tuple[int, int]]:
+        """First and last instant of each stretch without a gap, in the order of time."""
+
+    def state(self, stamp_ns: int, offsets: Array) -> TrueState:
+        """The camera at ``stamp_ns`` plus ``offsets`` (n,) seconds."""
+
+
+def sampled_way(motion: TrueMotion, spacing: float = 0.1) -> TrueState:
+    """The camera at instants ``spacing`` seconds apart, all along a motion."""
+    states = [
+        motion.state(first, np.arange(0.0, max((last - first) * 1e-9, spacing), spacing))
+        for first, last in motion.intervals_ns
+    ]
+    columns = ("rotations", "positions", "angular", "linear")
+    return TrueState(*(np.concatenate([getattr(s, name) for s in states]) for name in columns))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConstantVelocity:
+    """A camera that turns at a constant body rate while its centre moves on a straight line.
+
+    Args:
+        angular_velocity: (3,) rad/s in camera axes.
+        linear_velocity: (3,) m/s, along the camera's axes at the start.
+        duration: s.
+        rotation, position: map_from_camera at the start; default: looking along the map's x axis
+            with z up, from the origin.
+        start_ns: time of the start.
+    """
+
+    angular_velocity: Array
+    linear_velocity: Array
+    duration: float
+    rotation: Array = field(default_factory=lambda: BODY_FROM_CAMERA["forward_left_up"])
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    start_ns: int = 0
+
+    @property
+    def intervals_ns(self) -> list[tuple[int, int]]:
+        return [(self.start_ns, self.start_ns + round(self.duration * 1e9))]
+
+    def state(self, stamp_ns: int, offsets: Array) -> TrueState:
+        t = (stamp_ns - self.start_ns) * 1e-9 + np.asarray(offsets, float)
+        rotations = self.rotation @ so3.exp_many(t[:, None] * self.angular_velocity)
+        velocity = self.rotation @ self.linear_velocity
+        return TrueState(
+            rotations,
+            self.position + t[:, None] * velocity,
+            np.broadcast_to(np.asarray(self.angular_velocity, float), (len(t), 3)),
+            velocity @ rotations,
+        )
+
+
+class RecordedMotion:
+    """Cubic splines through recorded poses, one for each stretch without a gap.
+
+    The truth is the spline itself, with its exact derivatives; the samples only shape it.
+
+    Args:
+        trajectory: map_from_body.
+        axes: a key of BODY_FROM_CAMERA.
+        knot_spacing: s between the knots of a least-squares spline; 0: through every sample
+            (see KNOT_SPACING).
+
+    Raises:
+        ValueError: when no stretch is long enough for a spline.
+    """
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        axes: str = "forward_left_up",
+        knot_spacing: float = KNOT_SPACING,
+    ) -> None:
+        if axes not in BODY_FROM_CAMERA:
+            raise ValueError(f"axes must be one of {', '.join(BODY_FROM_CAMERA)}; got {axes!r}")
+        self._body_from_camera = BODY_FROM_CAMERA[axes]
+        spacings = np.diff(trajectory.stamps_ns) * 1e-9
+        if knot_spacing < _SAMPLES_PER_KNOT * (np.median(spacings) if len(spacings) else 0.0):
+            knot_spacing = 0.0
+        self._stretches = [
+            _Stretch(part, knot_spacing)
+            for part in split_at_gaps(trajectory)
+            if len(part) > _DEGREE + 1
+        ]
+        if not self._stretches:
+            raise ValueError(
+                f"a trajectory needs a stretch of more than {_DEGREE + 1} poses without a gap; "
+                f"this one has {len(trajectory)} poses"
+            )
+
+    @property
+    def intervals_ns(self) -> list[tuple[int, int]]:
+        return [(stretch.start_ns, stretch.end_ns) for stretch in self._stretches]
+
+    def state(self, stamp_ns: int, offsets: Array) -> TrueState:
+        starts = [stretch.start_ns for stretch in self._stretches]
+        index = max(int(np.searchsorted(starts, stamp_ns, side="right")) - 1, 0)
+        return self._stretches[index].state(stamp_ns, offsets, self._body_from_camera)
+
+
+class _Stretch:
+    """One spline in seven columns: position and a quaternion that is normalized afterwards."""
+
+    def __init__(self, part: Trajectory, knot_spacing: float) -> None:
+        self.start_ns = int(part.stamps_ns[0])
+        self.end_ns = int(part.stamps_ns[-1])
+        t = np.asarray((part.stamps_ns - self.start_ns) * 1e-9, np.float64)
+        values = np.hstack([part.positions, _continuous(part.quaternions)])
+        self._spline = _spline(t, values, knot_spacing)
+        self._rate = self._spline.derivative()
+
+    def state(self, stamp_ns: int, offsets: Array, body_from_camera: Array) -> TrueState:
+        t = (stamp_ns - self.start_ns) * 1e-9 + np.asarray(offsets, float)
+        values, rates = self._spline(t), self._rate(t)
+        norms = np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+        q, q_rate = values[:, 3:] / norms, rates[:, 3:] / norms
+        rotations = Rotation.from_quat(q).as_matrix() @ body_from_camera
+        # Body rate: the vector part of 2 conj(q) dq/dt; a change of the norm has none.
+        body_rate = 2.0 * (
+            q[:, 3:] * q_rate[:, :3] - q_rate[:, 3:] * q[:, :3] - np.cross(q[:, :3], q_rate[:, :3])
+        )
+        return TrueState(
+            rotations,
+            values[:, :3],
+            body_rate @ body_from_camera,
+            np.einsum("nji,nj->ni", rotations, rates[:, :3]),
+        )
+
+
+def _continuous(quaternions: Array) -> Array:
+    """The same rotations without jumps between q and -q."""
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+    signs = np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))
+    continuous: Array = quaternions * signs[:, None]
+    return continuous
+
+
+def _spline(t: Array, values: Array, knot_spacing: float) -> Any:
+    intervals = int(t[-1] / knot_spacing) if knot_spacing > 0.0 else 0
+    if intervals < 1:
+        return make_interp_spline(t, values, k=_DEGREE)
+    inner = np.linspace(0.0, t[-1], intervals + 1)
+    knots = np.concatenate([[0.0] * _DEGREE, inner, [t[-1]] * _DEGREE])
+    return make_lsq_spline(t, values, knots, k=_DEGREE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shaken:
+    """A camera that swings to and fro about an axis of its own, while it moves.
+
+    With the angle ``a(t) = A sin(2 pi f t + p)`` about the unit vector ``n`` its rotation is
+    ``R exp(a n)``; its body rate ``exp(-a n) w + a' n``, its velocity in its own axes
+    ``exp(-a n) v``. Several vibrations are one around the other.
+    """
+
+    motion: TrueMotion
+    amplitude: float  # rad
+    frequency: float  # Hz
+    axis: Array  # (3,) unit vector, camera axes
+    phase: float = 0.0  # rad, at the motion's start
+
+    @property
+    def intervals_ns(self) -> list[tuple[int, int]]:
+        return self.motion.intervals_ns
+
+    def state(self, stamp_ns: int, offsets: Array) -> TrueState:
+        base = self.motion.state(stamp_ns, offsets)
+        # The whole seconds apart, or the phase would drown in the size of today's stamps.
+        since_ns = stamp_ns - self.intervals_ns[0][0]
+        t = since_ns * 1e-9 + np.asarray(offsets, float)
+        pulse = 2.0 * math.pi * self.frequency
+        angle = self.amplitude * np.sin(pulse * t + self.phase)
+        rate = self.amplitude * pulse * np.cos(pulse * t + self.phase)
+        turn = so3.exp_many(angle[:, None] * self.axis)
+        return TrueState(
+            base.rotations @ turn,
+            base.positions,
+            np.einsum("nji,nj->ni", turn, base.angular) + rate[:, None] * self.axis,
+            np.einsum("nji,nj->ni", turn, base.linear),
+        )
+
+
+def shaken(
+    motion: TrueMotion, vibrations: list[tuple[float, float]], rng: np.random.Generator
+) -> TrueMotion:
+    """A motion with vibrations (degrees, Hz), each about any axis and from any phase."""
+    for degrees, hertz in vibrations:
+        axis = rng.normal(size=3)
+        phase = float(rng.uniform(0.0, 2.0 * math.pi))
+        unit = axis / np.linalg.norm(axis)
+        motion = Shaken(motion, math.radians(degrees), hertz, unit, phase)
+    return motion

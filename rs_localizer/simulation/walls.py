@@ -1,0 +1,257 @@
+"""Scenes of textured planes around the path of a simulated camera, built to be looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.video import Image
+from rs_localizer.markers.dictionaries import pattern
+from rs_localizer.markers.families import family
+from rs_localizer.markers.maps import MarkerMap, wall
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Marker
+from rs_localizer.simulation.planes import TexturedPlane
+from rs_localizer.simulation.true_motion import TrueState
+
+# Shapes per square of this many texels, of all sizes between a few texels and a few hundred.
+_SHAPES_PER = 9000
+_SMALLEST, _LARGEST = 6.0, 400.0
+# Fine grain (standard deviation of a grey level) and its sizes in texels.
+_GRAIN = ((1, 6.0), (4, 8.0), (32, 10.0))
+
+
+def collage(width: int, height: int, rng: np.random.Generator) -> Image:
+    """Rectangles, discs and letters of all sizes and greys over each other, with some grain.
+
+    The same generator state gives the same picture (height, width).
+    """
+    picture = np.full((height, width), 128, np.uint8)
+    count = max(20, width * height // _SHAPES_PER)
+    # Large ones first, or they would cover the rest.
+    sizes = np.sort(np.exp(rng.uniform(np.log(_SMALLEST), np.log(_LARGEST), count)))[::-1]
+    for size in sizes.tolist():
+        middle = rng.uniform((0.0, 0.0), (width, height))
+        _draw_shape(picture, middle.tolist(), size, int(rng.integers(10, 246)), rng)
+    grey = picture.astype(np.float32)
+    for step, deviation in _GRAIN:
+        grain = rng.standard_normal((height // step + 2, width // step + 2)).astype(np.float32)
+        grown = cv2.resize(grain, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+        grey += deviation * grown[:height, :width]
+    return np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8)
+
+
+def _draw_shape(
+    picture: Image, middle: list[float], size: float, grey: int, rng: np.random.Generator
+) -> None:
+    x, y = (int(value) for value in middle)
+    kind, angle = rng.integers(3), float(rng.uniform(0.0, 180.0))
+    if kind == 0:
+        extent = (size, size * float(rng.uniform(0.2, 1.0)))
+        box = cv2.boxPoints(((x, y), extent, angle))
+        cv2.fillPoly(picture, [np.rint(box).astype(np.int32)], grey, cv2.LINE_AA)
+    elif kind == 1:
+        axes = (max(1, int(0.5 * size)), max(1, int(0.5 * size * rng.uniform(0.4, 1.0))))
+        cv2.ellipse(picture, (x, y), axes, angle, 0.0, 360.0, grey, -1, cv2.LINE_AA)
+    else:
+        letter = chr(int(rng.integers(ord("A"), ord("Z") + 1)))
+        cv2.putText(
+            picture, letter, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size / 22.0, grey,
+            max(1, int(size / 9.0)), cv2.LINE_AA,
+        )  # fmt: skip
+
+
+_FAMILY = "4x4_250"  # few cells: the largest that a far or slanted marker can show
+# Texels along a cell of a marker: corners lie between texels, so that nothing is rounded.
+_CELL_TEXELS = 24
+# Sides of the markers (m) on the walls and, seen at a slant, on the floor; gaps in sides.
+_WALL_MARKER, _FLOOR_MARKER, _GAP = 0.42, 0.56, 0.5
+# From the way of the camera (m) to the two walls, to where they end, to the floor and to the top:
+# a larger room would be all markers too small to read, a smaller one would show too few.
+_NEAR, _OPEN, _BELOW, _ABOVE = 1.5, 3.1, 0.9, 1.8
+# Each plane has its own light, so that edges can be seen: grey of its paper and its ink.
+_LIGHTS = ((235, 26), (200, 22), (172, 18))
+# Of pictures that are no markers (m).
+_PICTURE_TEXEL = 0.003
+_POSTER_DISTANCE = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What a rendered camera looks at."""
+
+    planes: tuple[TexturedPlane, ...]
+    marker_map: MarkerMap | None = None  # None: a scene without markers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Box:
+    """The way of a camera in a frame whose diagonal x = y it mostly looks along; z is up."""
+
+    axes: Array  # (3,3) map_from_box
+    low: Array  # (3,)
+    high: Array  # (3,)
+
+
+def three_walls(way: TrueState) -> Scene:
+    """Two walls and a floor full of markers, at right angles, in a corner before the camera.
+
+    The corner stands where the camera looks on average.
+
+    Args:
+        way: of the camera, evenly in time, in a map whose z points up.
+    """
+    box = _box(way, turned=0.25 * np.pi)
+    corner = np.array([*(box.high[:2] + _NEAR), box.low[2] - _BELOW])
+    extent = corner - (box.low - _OPEN)
+    height = box.high[2] + _ABOVE - corner[2]
+    # Larger markers where a long way would need more than there are.
+    scale, most = 1.0, family(_FAMILY).count
+    while True:
+        pitches = scale * (1.0 + _GAP) * np.array([_WALL_MARKER, _FLOOR_MARKER])
+        x, y, z = (max(1, round(length / pitches[0])) for length in (*extent[:2], height))
+        floor = [max(1, round(length / pitches[1])) for length in extent[:2]]
+        if (x + y) * z + floor[0] * floor[1] <= most:
+            break
+        scale *= 1.1
+    ex, ey, ez = np.eye(3)
+    # Each wall: number of markers, their side, its right and up as a viewer has them, its middle.
+    spans = pitches[0] * np.array([x, y, z])
+    ground = pitches[1] * np.array(floor)
+    walls = (
+        (y, z, _WALL_MARKER, -ey, ez, corner - 0.5 * spans[1] * ey + 0.5 * spans[2] * ez),
+        (x, z, _WALL_MARKER, ex, ez, corner - 0.5 * spans[0] * ex + 0.5 * spans[2] * ez),
+        (*floor, _FLOOR_MARKER, ex, ey, corner - 0.5 * ground[0] * ex - 0.5 * ground[1] * ey),
+    )
+    markers: list[Marker] = []
+    planes = []
+    for (columns, rows, side, right, up, middle), light in zip(walls, _LIGHTS, strict=True):
+        frame = box.axes @ np.column_stack([right, up, np.cross(right, up)])
+        pose = Pose(box.axes @ middle, frame)
+        size = scale * side
+        gap = _GAP * size
+        made = wall(_FAMILY, (columns, rows), size, gap, first_id=len(markers), pose=pose)
+        planes.append(_marker_plane(pose, columns, rows, size, len(markers), light))
+        markers += made
+    return Scene(tuple(planes), MarkerMap(tuple(markers)))
+
+
+def poster(way: TrueState) -> Scene:
+    """One large picture upright before the camera."""
+    box = _box(way, turned=0.0)
+    size = np.array([box.high[1] - box.low[1], box.high[2] - box.low[2]]) + 2.0 * _POSTER_DISTANCE
+    middle = 0.5 * (box.low + box.high)
+    top = np.array([box.high[0] + _POSTER_DISTANCE, *(middle[1:] + 0.5 * size)])
+    return Scene((_picture(box.axes, top, np.array([0.0, -1.0, 0.0]), [0.0, 0.0, -1.0], size, 0),))
+
+
+def room(way: TrueState) -> Scene:
+    """A closed room around the way of the camera, every wall with a picture of its own."""
+    box = _box(way, turned=0.0)
+    low, high = box.low - _NEAR, box.high + _NEAR
+    planes = []
+    for axis in range(3):
+        across, along = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+        size = np.array([(high - low) @ across, (high - low) @ along])
+        for side in range(2):
+            start = low.copy()
+            start[axis] = (low, high)[side][axis]
+            planes.append(_picture(box.axes, start, across, along, size, 2 * axis + side))
+    return Scene(tuple(planes))
+
+
+def _box(way: TrueState, turned: float) -> _Box:
+    """The camera's way in axes that its mean horizontal gaze makes, turned about the vertical."""
+    gaze = way.rotations[:, :2, 2].mean(axis=0)
+    angle = float(np.arctan2(gaze[1], gaze[0])) - turned
+    cosine, sine = np.cos(angle), np.sin(angle)
+    axes = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    seen_from = way.positions @ axes
+    return _Box(axes, seen_from.min(axis=0), seen_from.max(axis=0))
+
+
+def _marker_plane(
+    pose: Pose, columns: int, rows: int, size: float, first_id: int, light: tuple[int, int]
+) -> TexturedPlane:
+    """The paper of a grid of markers with half a gap around it."""
+    drawn = family(_FAMILY)
+    side = drawn.cells * _CELL_TEXELS
+    pitch = round((1.0 + _GAP) * side)
+    margin = (pitch - side) // 2
+    paper, ink = light
+    texture = np.full((rows * pitch, columns * pitch), paper, np.uint8)
+    for index in range(columns * rows):
+        row, column = (margin + pitch * place for place in divmod(index, columns))
+        white = pattern(drawn, first_id + index)
+        cells = np.where(white, paper, ink).astype(np.uint8)
+        texture[row : row + side, column : column + side] = cells.repeat(
+            _CELL_TEXELS, axis=0
+        ).repeat(_CELL_TEXELS, axis=1)
+    texel = size / side
+    right, up, _ = pose.rotation.T
+    corner = pose.position + 0.5 * texel * pitch * (rows * up - columns * right)
+    return TexturedPlane(corner, right, -up, texel, texture)
+
+
+def _picture(
+    axes: Array, corner: Array, right: Array, down: Array | list[float], size: Array, seed: int
+) -> TexturedPlane:
+    width, height = (max(2, round(length / _PICTURE_TEXEL)) for length in size)
+    texture = collage(width, height, np.random.default_rng(seed))
+    return TexturedPlane(
+        axes @ corner, axes @ right, axes @ np.asarray(down), _PICTURE_TEXEL, texture
+    )
+
+
+# Texels along a cell of a marker: corners lie between texels, so that nothing is rounded.
+_POSTER_TEXELS = 14
+# Where along a wall its markers hang, in shares of its width.
+_PLACES = (0.3, 0.7)
+_PAPER, _INK = 235, 26
+
+
+def marked_room(way: TrueState) -> Scene:
+    """The room of :func:`rs_localizer.simulation.walls.room` with two markers on each wall.
+
+    Floor and ceiling have none.
+    """
+    bare = room(way)
+    middle = way.positions.mean(axis=0)
+    planes, markers = list[TexturedPlane](), list[Marker]()
+    for plane in bare.planes:
+        if abs(plane.normal[2]) > 0.5:
+            planes.append(plane)
+            continue
+        texture = plane.texture.copy()
+        for share in _PLACES:
+            markers.append(_hang(texture, plane, share, len(markers), middle))
+        planes.append(replace(plane, texture=texture))
+    return Scene(tuple(planes), MarkerMap(tuple(markers)))
+
+
+SCENES = {"three": three_walls, "poster": poster, "room": room, "marked_room": marked_room}
+"""All scenes by name, the first one unless another is wanted."""
+
+
+def _hang(texture: Image, plane: TexturedPlane, share: float, number: int, viewer: Array) -> Marker:
+    """Draw a marker into the picture of a plane; the marker."""
+    drawn = family(_FAMILY)
+    side = drawn.cells * _POSTER_TEXELS
+    sheet = side + 2 * _POSTER_TEXELS
+    white = np.pad(pattern(drawn, number), 1, constant_values=True)
+    cells = np.where(white, _PAPER, _INK).astype(np.uint8)
+    paper = cells.repeat(_POSTER_TEXELS, axis=0).repeat(_POSTER_TEXELS, axis=1)
+    # From inside the room, half of the walls are read from behind.
+    mirrored = float(plane.normal @ (viewer - plane.corner)) > 0.0
+    height, width = texture.shape
+    upright = abs(plane.down[2]) > 0.5
+    along, across = (share * width, 0.5 * height) if upright else (0.5 * width, share * height)
+    left, top = round(along - 0.5 * sheet), round(across - 0.5 * sheet)
+    texture[top : top + sheet, left : left + sheet] = paper[:, ::-1] if mirrored else paper
+    centre = plane.points(np.array([[left + 0.5 * sheet, top + 0.5 * sheet]]))[0]
+    right, up = (-plane.right if mirrored else plane.right), -plane.down
+    pose = Pose(centre, np.column_stack([right, up, np.cross(right, up)]))
+    return Marker.at(_FAMILY, number, side * plane.texel, pose)

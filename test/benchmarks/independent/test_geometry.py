@@ -1,0 +1,122 @@
+"""The second simulator against SciPy's rotations, OpenCV's lens, and finite differences."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.independent import motions, rotations
+from benchmarks.independent.cameras import Camera, Scan
+
+STEP = 1e-5
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.99e-4, 1.01e-4, 0.1, 3.0])
+def test_rotations_are_those_of_scipy(angle: float) -> None:
+    rng = np.random.default_rng(0)
+    vectors = angle * motions.directions(20, rng)
+    found = rotations.exponential(vectors)
+    np.testing.assert_allclose(found, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(rotations.logarithm(found), vectors, atol=1e-12, rtol=1e-8)
+
+
+def test_the_lens_is_that_of_opencv() -> None:
+    rng = np.random.default_rng(0)
+    camera = Camera()
+    points = np.column_stack([rng.uniform(-0.7, 0.7, (50, 2)), np.ones(50)])
+    expected = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
+    )[0][:, 0]
+    pixels = camera.project(points)
+    np.testing.assert_allclose(pixels, expected, atol=1e-9)
+    np.testing.assert_allclose(camera.bearings(pixels), points[:, :2], atol=1e-11)
+    assert np.all(np.isnan(camera.project(-points)))
+
+
+def samples() -> np.ndarray:
+    """Of a recorded trajectory (n,8) that has a gap."""
+    times = np.delete(np.arange(0.0, 6.0, 0.01), slice(250, 300))
+    turn = np.column_stack([np.sin(times), 0.5 * np.cos(2.0 * times), times])
+    quaternions = Rotation.from_rotvec(turn).as_quat()
+    return np.column_stack([times, np.cos(turn), quaternions * np.sign(quaternions[:, 3:])])
+
+
+MOTIONS = {
+    "rest": motions.rest,
+    "hand": motions.hand,
+    "vibration": partial(motions.vibration, degrees=1.0, hertz=20.0),
+    "steady": partial(motions.steady, rate=3.0, speed=1.0),
+    "stop": partial(motions.sudden_stop, earliest=-0.02, latest=0.02),
+    "coloured": partial(motions.coloured, degrees=0.3, hertz=(20.0, 60.0)),
+    "struck": partial(motions.struck, degrees=0.3, earliest=-0.1, latest=0.0),
+    "recorded": lambda count, rng: motions.Recorded(samples(), count, rng, around=0.2),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_twists_are_the_change_of_the_poses(name: str) -> None:
+    rng = np.random.default_rng(1)
+    moving = MOTIONS[name](40, rng)
+    which, time = np.arange(40), rng.uniform(-0.1, 0.1, 40)
+    states = moving.states(which, time)
+    before, after = (moving.poses(which, time + step) for step in (-STEP, STEP))
+    turn = rotations.logarithm(np.swapaxes(before[0], 1, 2) @ after[0]) / (2 * STEP)
+    way = np.einsum("nji,nj->ni", states.rotation, after[1] - before[1]) / (2 * STEP)
+    np.testing.assert_allclose(states.angular, turn, atol=1e-5)
+    np.testing.assert_allclose(states.linear, way, atol=1e-6)
+    assert np.any(turn != 0.0) == (name != "rest")
+
+
+def test_a_hand_is_as_fast_as_a_hand() -> None:
+    rng = np.random.default_rng(2)
+    moving = motions.hand(2000, rng)
+    which, time = np.arange(2000), rng.uniform(-1.0, 1.0, 2000)
+    before, after = (moving.states(which, time + step) for step in (-STEP, STEP))
+    rate = np.degrees(np.linalg.norm(before.angular, axis=1))
+    bend = np.linalg.norm((after.angular - before.angular) / (2 * STEP), axis=1)
+    assert np.median(rate) == pytest.approx(67.0, rel=0.1)
+    assert np.sqrt(np.mean(bend**2)) == pytest.approx(9.0, rel=0.1)
+    assert np.quantile(np.linalg.norm(before.linear, axis=1), 0.99) == pytest.approx(1.0, rel=0.2)
+
+
+def test_a_vibration_has_its_amplitude_and_a_stop_ends() -> None:
+    rng = np.random.default_rng(3)
+    time = np.linspace(-0.05, 0.05, 2001)
+    shaken = motions.vibration(1, rng, degrees=1.0, hertz=50.0)
+    turned = shaken.poses(np.zeros(2001, int), time)[0]
+    away = np.degrees(np.linalg.norm(rotations.logarithm(turned @ turned[1000].T), axis=1))
+    period = turned[1000 + 400]  # 1/50 s later only the slow drift is left
+    assert 1.0 < away.max() < 3.0
+    assert np.degrees(np.linalg.norm(rotations.logarithm(period @ turned[1000].T))) < 0.5
+    stopped = motions.sudden_stop(30, rng, -0.01, 0.01)
+    which = np.arange(30)
+    late, early = (stopped.states(which, np.full(30, t)) for t in (0.06, -0.02))
+    assert np.all(np.linalg.norm(late.angular, axis=1) < 1e-12)
+    assert np.linalg.norm(early.angular, axis=1) == pytest.approx(np.radians(60.0))
+
+
+@pytest.mark.parametrize("scan", list(Scan))
+def test_every_point_is_seen_when_its_row_is_exposed(scan: Scan) -> None:
+    camera = Camera(scan=scan)
+    rng = np.random.default_rng(4)
+    moving = motions.hand(1, rng)
+    local = np.column_stack([rng.uniform(-1.0, 1.0, (60, 2)), rng.uniform(2.0, 4.0, 60)])
+    places = local @ moving.rotation[0].T + moving.position[0]
+
+    def local_at(delay: np.ndarray) -> np.ndarray:
+        rotation, position = moving.poses(np.zeros(60, int), delay)
+        return np.einsum("nji,nj->ni", rotation, places - position)
+
+    pixels = camera.project_rolling(local_at, (60,))
+    edge = {Scan.DOWN: 0.0, Scan.UP: camera.height - 1.0}
+    along = pixels[:, 1] if scan in edge else pixels[:, 0]
+    size = (camera.height if scan in edge else camera.width) - 1.0
+    forward = scan in (Scan.DOWN, Scan.RIGHT)
+    delay = camera.readout_time * (along if forward else size - along) / size
+    np.testing.assert_allclose(camera.project(local_at(delay)), pixels, atol=1e-8)
+    still = camera.project(local_at(np.zeros(60)))
+    assert np.abs(still - pixels).max() > 1.0

@@ -1,0 +1,70 @@
+"""``python -m benchmarks NAME``: what it writes and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.__main__ import main
+
+
+def test_tables_figures_and_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "new" / "folder"
+    words = ["translation", "linearisation", "--trials", "20", "--seed", "3"]
+    assert main([*words, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "translation (" in printed
+    assert str(out / "summary.md") in printed
+    names = {path.name for path in out.iterdir()}
+    assert {"translation.csv", "translation.png", "linearisation.csv", "linearisation.png",
+            "summary.md", "summary.json"} <= names  # fmt: skip
+    with (out / "translation.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["method"] for row in rows} >= {"p3p", "r6p_vcwt", "r9p", "refined"}
+    assert len({row["per_frame"] for row in rows}) == 11
+    data = json.loads((out / "summary.json").read_text())
+    assert (data["trials"], data["seed"]) == (20, 3)
+    assert {claim["name"].split(".")[0] for claim in data["claims"]} == {
+        "translation",
+        "linearisation",
+    }
+    text = (out / "summary.md").read_text()
+    for name in names - {"summary.md", "summary.json"}:
+        assert f"({name})" in text
+
+
+def test_same_seed_same_tables(tmp_path: Path) -> None:
+    from benchmarks.experiments.trials import draw_trials
+
+    for folder, seed in (("a", "0"), ("b", "0"), ("c", "1")):
+        draw_trials.cache_clear()
+        words = ["translation", "--trials", "10", "--seed", seed]
+        assert main([*words, "--out", str(tmp_path / folder)]) == 0
+    a, b, c = ((tmp_path / folder / "translation.csv").read_text() for folder in "abc")
+    assert a == b
+    assert a != c
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["flight"], "no experiment 'flight'; choose from motion, translation"),
+        (["--trials", "0"], "--trials must be 1 or more"),
+        (["--seed", "-1"], "--seed 0 or more"),
+        (["--trials", "many"], "invalid int value: 'many'"),
+    ],
+)
+def test_wrong_usage(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert text in capsys.readouterr().err
+
+
+def test_an_output_that_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["translation", "--out", str(tmp_path / "file")]) == 1
+    assert "file" in capsys.readouterr().err

@@ -1,0 +1,60 @@
+"""A short campaign over all readers, and that a campaign sees what it is there to see."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from benchmarks.fuzzing.campaign import case_of, run
+from benchmarks.fuzzing.targets import Target, targets
+
+EXECUTIONS = 4000
+
+
+def test_no_reader_raises_another_error(tmp_path: Path) -> None:
+    everything = targets(tmp_path)
+    *_, report = run(everything, EXECUTIONS, seed=1)
+    assert report.failures == [], report.text()
+    assert report.executions == EXECUTIONS
+    for name, outcomes in report.outcomes.items():
+        # Some of it is read all the same, some is not: the damages are neither nothing nor all.
+        assert outcomes["read"] > 0, name
+        assert len(outcomes) > 1 or name.startswith("localize"), name
+    assert report.peak_mb < 200.0
+
+
+def test_an_execution_can_be_repeated(tmp_path: Path) -> None:
+    target = targets(tmp_path)["map .ply"]
+    assert case_of(target, "map .ply", 0, 5) == case_of(target, "map .ply", 0, 5)
+    assert case_of(target, "map .ply", 0, 5) != case_of(target, "map .ply", 0, 6)
+
+
+def test_what_fails_is_reported() -> None:
+    def read(case: Any) -> None:
+        if case == 3:
+            raise KeyError("three")
+        if case == 2:
+            raise ValueError("two")
+
+    target = Target(lambda random: random.randint(0, 3), read, (ValueError,))
+    *_, report = run({"numbers": target}, 200, seed=0)
+    outcomes = report.outcomes["numbers"]
+    assert set(outcomes) == {"read", "ValueError", "FAILED: KeyError"}
+    assert len(report.failures) == outcomes["FAILED: KeyError"] > 20
+    failure = report.failures[0]
+    assert failure.case == 3
+    assert case_of(target, "numbers", 0, failure.number) == 3
+    assert "KeyError('three') in read" in report.text()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_damage_changes_something(seed: int, tmp_path: Path) -> None:
+    random = Random(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, target in targets(tmp_path).items():
+            assert len({repr(target.make(random)) for _ in range(20)}) > 10, name

@@ -1,0 +1,67 @@
+"""Images of a quick hand into both nodes: the same poses and twists as offline, to the last bit."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import image_flight
+from rs_localizer.cli.main import main
+
+FLIGHT = "--images --trajectory tum_vi_room5 --start 21.5 --duration 0.25 --exposure 0.002".split()
+
+
+def run(*words: str) -> None:
+    command = [sys.executable, "-m", "rs_localizer", *words]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+def test_nodes_and_replay_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images, markers, poses = (str(tmp_path / name) for name in ("images", "markers", "poses"))
+    assert main(["simulate", images, *FLIGHT, "--grey-noise", "2"]) == 0
+    # In processes of their own: what other tests have compiled in this one may round differently.
+    run("detect", images, "--map", f"{images}/marker_map.yaml", "--out", markers)
+    shutter = ["--params", f"{markers}/parameters.yaml", "-p", "pose_time:=mid_frame"]
+    run("replay", markers, *shutter, "--out", poses)
+    capsys.readouterr()
+    assert image_flight.main([images, poses, "-p", "pose_time:=mid_frame"]) == 0
+    assert capsys.readouterr().out == (
+        "8 images\n"
+        "/rs_localizer/pose: 8 live, 8 replayed, 8 identical\n"
+        "/rs_localizer/twist: 8 live, 8 replayed, 8 identical\n"
+    )
+    # At a camera's pace some may be left out on a busy machine.
+    assert image_flight.main([images, "--rate", "10"]) == 0
+    told = re.fullmatch(
+        r"(\d+) poses of 8 images at 10 Hz, from image to pose: "
+        r"p50 ([\d.]+) ms, p95 ([\d.]+) ms\n",
+        capsys.readouterr().out,
+    )
+    assert told
+    assert 0 < int(told[1]) <= 8
+    assert 1.0 < float(told[2]) <= float(told[3])
+
+
+@pytest.mark.parametrize(
+    ("live", "replayed", "identical", "complete"),
+    [
+        ((3, 3), (3, 3), (3, 3), True),
+        ((3, 0), (3, 0), (3, 0), True),  # p3p has no twists
+        ((3, 3), (3, 3), (2, 3), False),
+        ((4, 3), (3, 3), (3, 3), False),
+        ((3, 2), (3, 3), (3, 2), False),
+        ((0, 0), (0, 0), (0, 0), False),
+    ],
+)
+def test_what_counts_as_agreement(
+    live: tuple[int, int], replayed: tuple[int, int], identical: tuple[int, int], complete: bool
+) -> None:
+    counts = (
+        dict(zip(("/rs_localizer/pose", "/rs_localizer/twist"), numbers, strict=True))
+        for numbers in (live, replayed, identical)
+    )
+    assert image_flight.Agreement(4, *counts).complete == complete

@@ -1,0 +1,57 @@
+"""The load benchmark counts what it sends; its figures are no matter of tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Imu, PointCloud2
+
+from benchmarks.load.frames import Frames, simulated
+from benchmarks.load.measuring import steady
+
+
+def test_frames_never_end_and_are_known_by_their_stamps(tmp_path: Path) -> None:
+    frames = simulated(points=30, outliers=0.3, rate=30.0, different=50)
+    frames.save(tmp_path / "frames.npz")
+    loaded = Frames.load(tmp_path / "frames.npz")
+    assert (loaded.rate, loaded.camera_info) == (30.0, frames.camera_info)
+    assert loaded.clouds == frames.clouds
+    for index in (0, 1, 49, 50, 123_456):
+        cloud = deserialize_message(loaded.cloud(index), PointCloud2)
+        stamp = cloud.header.stamp
+        assert abs(stamp.sec + 1e-9 * stamp.nanosec - (1000.0 + index / 30.0)) < 1e-6
+        pose = PoseStamped()
+        pose.header.stamp = stamp
+        assert loaded.index(serialize_message(pose)) == index
+        first = deserialize_message(bytes(loaded.clouds[index % 50]), PointCloud2)
+        assert cloud.data == first.data
+        assert cloud.width == 30
+
+
+def test_readings_go_with_their_frames(tmp_path: Path) -> None:
+    frames = simulated(points=30, outliers=0.3, rate=30.0, different=60, imu_rate=200.0)
+    frames.save(tmp_path / "frames.npz")
+    loaded = Frames.load(tmp_path / "frames.npz")
+    assert loaded.imus == frames.imus
+    assert (len(loaded.imus), loaded.imu_rate) == (400, 200.0)  # two seconds
+    first, again = (deserialize_message(loaded.imu(index), Imu) for index in (3, 403))
+    assert again.angular_velocity == first.angular_velocity
+    assert again.header.stamp.sec == first.header.stamp.sec + 2
+    assert first.header.frame_id == "camera_optical_frame"  # no TF is needed
+
+
+def test_every_frame_is_accounted_for() -> None:
+    frames = simulated(points=60, outliers=0.2, rate=20.0, different=40, imu_rate=200.0)
+    (result,) = steady(frames, cameras=1, count=60)
+    assert result.frames == 60
+    # On a busy machine frames are replaced, and some sensor data may be lost.
+    assert result.answered > 0
+    assert result.lost <= 5
+    assert len(result.latencies) == result.answered
+    assert np.all((result.latencies > 0.0) & (result.latencies < 5.0))
+    assert np.all(result.memory > 50.0)
+    assert 0.0 < result.cpu < 2.0
+    assert result.imu.endswith("%")

@@ -1,0 +1,61 @@
+"""From photons to poses, offline: images rendered, markers detected, frames replayed; the truth."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.marker_flight import load_flight, quality
+from rs_localizer.cli.main import main
+from rs_localizer.evaluation import marker_flight
+
+# Two walls and the floor come by while the hand shakes the camera.
+FLIGHT = "--images --trajectory tum_vi_room5 --start 21 --duration 0.8 --exposure 0.002".split()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """images, markers, ours and p3p: what the four commands write."""
+    made = tmp_path_factory.mktemp("flight")
+    images, markers = str(made / "images"), str(made / "markers")
+    assert main(["simulate", images, *FLIGHT, "--grey-noise", "2"]) == 0
+    assert main(["detect", images, "--map", f"{images}/marker_map.yaml", "--out", markers]) == 0
+    shutter = ["--params", f"{markers}/parameters.yaml", "-p", "pose_time:=mid_frame"]
+    for name, solver in (("ours", "r6p_vcwt"), ("p3p", "p3p")):
+        solved = ["-p", f"solver:={solver}", "--out", str(made / name)]
+        assert main(["replay", markers, *shutter, *solved]) == 0
+    return made
+
+
+def test_poses_of_images_are_those_of_the_truth(folder: Path) -> None:
+    flight = load_flight(folder / "images", folder / "markers")
+    assert flight.frames == 24
+    assert len(flight.middles_ns) == 24
+    assert np.median(flight.speeds) > 60.0
+    ours, p3p = (quality(flight, folder / name) for name in ("ours", "p3p"))
+    assert ours.localized == 1.0
+    assert ours.reprojection < 0.5 < p3p.reprojection
+    assert 3.0 * ours.position_fast < p3p.position_fast
+    assert ours.position_fast < 0.02
+
+
+def test_missing_poses_count_as_wrong(folder: Path, tmp_path: Path) -> None:
+    flight = load_flight(folder / "images", folder / "markers")
+    lines = (folder / "ours" / "poses.txt").read_text().splitlines(keepends=True)
+    (tmp_path / "poses.txt").write_text("".join(lines[:-20]))
+    few = quality(flight, tmp_path)
+    assert few.localized == pytest.approx(4 / 24)
+    assert few.position == np.inf
+
+
+def test_the_table_says_it(folder: Path) -> None:
+    said = io.StringIO()
+    names = ("images", "markers", "ours", "p3p")
+    marker_flight.main([str(folder / name) for name in names], said)
+    first, _, ours, p3p = said.getvalue().splitlines()
+    assert first.startswith("24 frames; 24 show 3 markers or more, ")
+    assert ours.split()[:3] == ["ours", "100.0", "%"]
+    assert p3p.split()[0] == "p3p"

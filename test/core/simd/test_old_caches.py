@@ -1,0 +1,67 @@
+"""Old caches go; what may be in use, or is somebody else's, stays."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from rs_localizer.core.simd import jit
+
+DAY = 86400.0
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    jit._mark.cache_clear()
+    jit._remove_others.cache_clear()
+    return tmp_path
+
+
+def folder(cache: Path, name: str, days: float, inside: str = "rs_localizer.core.so3") -> Path:
+    """A folder of kernels that was used some days ago."""
+    made = cache / name
+    (made / inside).mkdir(parents=True)
+    (made / inside / "hat-1.py311.nbi").write_bytes(b"")
+    os.utime(made, times=(time.time() - days * DAY,) * 2)
+    return made
+
+
+def test_what_nobody_used_for_a_month_is_removed(cache: Path) -> None:
+    used = folder(cache, "0" * 16, 100)
+    old = folder(cache, "0123456789abcdef", 31)
+    staying = [
+        folder(cache, "1" * 16, 29),  # another version, still in use
+        folder(cache, "another_package_of_numba", 100),
+        folder(cache, "2" * 16, 100, inside="somebody.elses"),
+    ]
+    (cache / "3333333333333333").write_text("a file")
+    empty = cache / ("4" * 16)  # of anybody
+    empty.mkdir()
+    os.utime(empty, times=(time.time() - 100 * DAY,) * 2)
+    staying.append(empty)
+    jit._remove_others(used)
+    assert not old.exists()
+    assert all(path.is_dir() for path in [used, *staying])
+    assert (cache / "3333333333333333").is_file()
+
+
+def test_use_keeps_a_folder(cache: Path) -> None:
+    used, old = folder(cache, "0" * 16, 0), folder(cache, "1" * 16, 31)
+    jit._mark(old)
+    jit._remove_others(used)
+    assert old.is_dir()
+
+
+def test_a_folder_is_marked_once_a_day(cache: Path) -> None:
+    today = folder(cache, "0" * 16, 0.5)
+    before = today.stat().st_mtime_ns
+    jit._mark(today)
+    assert today.stat().st_mtime_ns == before
+
+
+def test_a_folder_that_is_gone_is_no_error(cache: Path) -> None:
+    jit._mark(cache / ("0" * 16))
+    jit._remove_others(cache / "nowhere" / ("0" * 16))

@@ -1,0 +1,194 @@
+"""Answers beside the truth: what is compared, what is counted, and the table of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.quiver import Quiver
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.cli.main import main
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.evaluation import plots
+from rs_localizer.evaluation.comparison import (
+    Answer,
+    Recording,
+    Result,
+    compare,
+    counts_at,
+    load_recording,
+    predicted_pixels,
+    table,
+    true_rates,
+)
+from rs_localizer.evaluation.plots import (
+    error_picture,
+    inlier_picture,
+    residual_picture,
+    trajectory_picture,
+)
+
+MIDDLE_NS = 15_000_000
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A simulated recording of 30 frames that turns by 200 deg/s."""
+    bag = tmp_path_factory.mktemp("comparison") / "bag"
+    rate = str(np.radians(200.0))
+    assert (
+        main(["simulate", str(bag), "--duration", "1", "--angular-velocity", "0", rate, "0"]) == 0
+    )
+    return load_recording(bag)
+
+
+def answers(recording: Recording, *, moving: bool, shift: float) -> dict[int, Answer]:
+    """True answers, shifted, to all frames but the third."""
+    assert recording.truth is not None
+    truth, twists = recording.truth.poses, recording.truth.twists
+    assert twists is not None
+    found = {}
+    for stamp in recording.stamps_ns[:2] + recording.stamps_ns[3:]:
+        row = truth.stamps_ns.tolist().index(stamp + MIDDLE_NS)
+        found[stamp] = Answer(
+            stamp,
+            0.01,
+            stamp + MIDDLE_NS,
+            truth.positions[row] + np.array([0.0, shift, 0.0]),
+            truth.quaternions[row],
+            twists.angular[row] if moving else None,
+            twists.linear[row] if moving else None,
+            np.array([0.3, 0.4]),
+        )
+    return found
+
+
+@pytest.fixture
+def results(recording: Recording) -> dict[str, Result]:
+    return {
+        "good": compare(answers(recording, moving=True, shift=0.002), recording.truth),
+        "bad": compare(answers(recording, moving=False, shift=0.05), recording.truth),
+    }
+
+
+def test_recording_is_read_as_a_whole_or_in_part(tmp_path: Path) -> None:
+    assert main(["simulate", str(tmp_path / "bag"), "--duration", "0.5"]) == 0
+    whole, part = load_recording(tmp_path / "bag"), load_recording(tmp_path / "bag", 4)
+    assert (len(whole.clouds), len(part.clouds)) == (15, 4)
+    assert len(whole.camera_infos) == 15
+    assert None not in whole.camera_infos
+    assert part.stamps_ns == whole.stamps_ns[:4]
+
+
+def test_errors_and_counts(recording: Recording, results: dict[str, Result]) -> None:
+    good, bad = results["good"], results["bad"]
+    assert good.errors is not None
+    assert bad.errors is not None
+    np.testing.assert_allclose(good.errors.linear, 0.002)
+    np.testing.assert_allclose(bad.errors.linear, 0.05)
+    np.testing.assert_allclose(good.errors.angular, 0.0, atol=1e-5)
+    np.testing.assert_allclose(good.errors.true_angular_rate, 200.0)
+    assert good.twist_errors is not None
+    assert bad.twist_errors is None
+    np.testing.assert_allclose(good.residuals, np.sqrt(0.125))
+    np.testing.assert_allclose(true_rates(recording), 200.0)
+    counts = counts_at(good, recording.stamps_ns)
+    assert counts[2] == 0.0
+    assert counts.sum() == 2 * (len(recording.stamps_ns) - 1)
+
+
+def test_table(recording: Recording, results: dict[str, Result]) -> None:
+    text = table("A flight", recording, results)
+    lines = {line[:44].strip(): line[44:].split() for line in text.splitlines()}
+    assert all(len(line) <= 80 for line in text.splitlines())
+    assert lines["A flight"] == ["good", "bad"]
+    count = len(recording.stamps_ns)
+    assert lines["frames"] == [str(count)] * 2
+    assert lines["localized"][0] == str(count - 1)
+    assert lines["position error, median (mm)"] == ["2.0", "50.0"]
+    assert lines["where the camera turns > 150 deg/s"][0] == "0.0"
+    assert lines["angular velocity error, median (deg/s)"] == ["0.0", "-"]
+    assert lines["latency, 50 / 95 % (ms)"] == ["10.0", "/", "10.0"] * 2
+    # Without truth there is nothing to say about errors, and no empty lines about it.
+    blind = Recording(recording.stamps_ns, [], recording.clouds, {}, None)
+    assert "error" not in table("A flight", blind, {"good": compare({}, None)})
+
+
+def test_pictures(recording: Recording, results: dict[str, Result], tmp_path: Path) -> None:
+    """They are drawn at all, also where a method has no answer."""
+    matches = np.full(len(recording.stamps_ns), 105.0)
+    assert recording.truth is not None
+    for shown in (results, results | {"bad": compare({}, recording.truth)}):
+        for figure in (
+            trajectory_picture(recording, shown),
+            error_picture(shown),
+            inlier_picture(recording, shown, matches),
+        ):
+            figure.savefig(tmp_path / "figure.png")
+    assert residual_picture(recording, results, 0.03) is None  # there are no images
+
+
+def project(camera: Camera, points: Array, rotation: Rotation, centre: Array) -> Array:
+    return camera.project(rotation.inv().apply(points - centre))
+
+
+def test_predicted_pixels_move_with_the_rows() -> None:
+    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+    camera = Camera(640, 480, K, readout_time=0.03)
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1.0, -0.8, 3.0], [1.0, 0.8, 5.0], size=(50, 3))
+    start = Rotation.from_rotvec([0.01, -0.02, 0.03])
+    angular, linear = np.array([1.0, -2.0, 0.5]), np.array([0.5, 0.2, -0.3])
+    answer = Answer(0, 0.0, 0, np.zeros(3), start.as_quat(), angular, linear, np.zeros(0))
+    pixels = predicted_pixels(camera, answer, points)
+    for point, pixel in zip(points, pixels, strict=True):
+        late = 0.03 * (pixel[1] / 479 - 0.5)
+        turned = start * Rotation.from_rotvec(late * angular)
+        seen = project(camera, point[None], turned, late * start.apply(linear))
+        np.testing.assert_allclose(seen[0], pixel, atol=1e-6)
+    static = Answer(0, 0.0, 0, np.zeros(3), start.as_quat(), None, None, np.zeros(0))
+    expected = project(camera, points, start, np.zeros(3))
+    np.testing.assert_allclose(predicted_pixels(camera, static, points), expected, atol=1e-9)
+
+
+def test_long_names_stand_in_two_lines(recording: Recording) -> None:
+    found = compare(answers(recording, moving=True, shift=0.0), recording.truth)
+    lines = table("Title", recording, {"one": found, "P3P (one pose per image)": found})
+    first, second, third, *_ = lines.splitlines()
+    assert first.split() == ["Title", "one", "P3P", "(one", "pose"]
+    assert second.split() == ["per", "image)"]
+    assert third.split() == ["frames", "30", "30"]
+    assert max(map(len, lines.splitlines())) <= 80
+
+
+def test_picture_and_table_have_the_same_median_of_inliers(recording: Recording) -> None:
+    half = dict(list(answers(recording, moving=True, shift=0.0).items())[:10])
+    results = {"one": compare(half, recording.truth)}
+    median = np.median(results["one"].inlier_counts)
+    assert median > 0.0
+    figure = inlier_picture(recording, results, np.full(30, 105.0))
+    labels = figure.axes[0].get_legend_handles_labels()[1]
+    assert f"one: median {median:.3g}" in labels
+
+
+@pytest.mark.parametrize(("residual", "enlarged"), [(0.11, "500"), (3.0, "20"), (700.0, "0.1")])
+def test_arrows_stay_inside(residual: float, enlarged: str) -> None:
+    """All the points lie at the border of the image, and the arrows point outwards."""
+    pixels = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
+    outwards = (pixels - pixels.mean(axis=0)) / np.linalg.norm(pixels[2] / 2)
+    predicted = {"bad": pixels - residual * outwards, "good": pixels - 0.01 * outwards}
+    figure = plots.residuals(np.zeros((480, 640), np.uint8), pixels, predicted, "A frame")
+    assert figure.get_suptitle().startswith("A frame: ")
+    for axes in figure.axes:
+        assert axes.get_xlabel() == f"arrows {enlarged} times enlarged"
+        (arrows,) = (c for c in axes.collections if isinstance(c, Quiver))
+        tips = arrows.XY + np.stack([arrows.U, arrows.V], axis=1) / arrows.scale
+        left, right = axes.get_xlim()
+        bottom, top = axes.get_ylim()
+        assert left <= tips[:, 0].min() < tips[:, 0].max() <= right
+        assert top <= tips[:, 1].min() < tips[:, 1].max() <= bottom
+    longest = np.hypot(arrows.U, arrows.V).max() / arrows.scale
+    assert longest < 80.0

@@ -1,0 +1,87 @@
+"""The cube is drawn where its points are, each at its own row's pose; animations can be played."""
+
+from __future__ import annotations
+
+import io
+
+import cv2
+import numpy as np
+from PIL import Image as Pillow
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.evaluation.cube_clip import corner_pixels, cube_on, draw_cube, gif, side_by_side
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Marker
+
+CAMERA = Camera(
+    640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]),
+    D=[-0.1, 0.02, 0.0, 0.0], readout_time=0.03,
+)  # fmt: skip
+# Before the camera, facing it: x to the right, y up, z toward the viewer.
+MARKER = Marker.at("4x4_50", 0, 0.4, Pose([0.1, 0.0, 3.0], np.diag([1.0, -1.0, -1.0])))
+MOVING = Motion(np.eye(3), np.zeros(3), np.array([0.05, 0.2, -0.1]), np.array([0.05, 0.0, 0.02]))
+STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+BLUE = (255, 0, 0)
+
+
+def drawn(motion: Motion) -> np.ndarray:
+    picture = np.zeros((480, 640, 3), np.uint8)
+    draw_cube(picture, CAMERA, motion.at_rows, cube_on(MARKER), BLUE)
+    assert not picture[..., 1:].any()
+    return picture[..., 0]
+
+
+def test_cube_stands_on_the_marker_toward_the_viewer() -> None:
+    corners = cube_on(MARKER).corners
+    sides = np.linalg.norm(corners[[1, 2, 4]] - corners[0], axis=1)
+    np.testing.assert_allclose(sides, 0.6)
+    np.testing.assert_allclose(corners.mean(axis=0), [0.1, 0.0, 2.7])
+    np.testing.assert_allclose(corners[:4].mean(axis=0), MARKER.pose.position)
+
+
+def test_every_edge_is_drawn_where_the_rows_see_it() -> None:
+    picture, corners = drawn(MOVING), cube_on(MARKER).corners
+    share = np.linspace(0.0, 1.0, 15)[:, None]
+    for a in range(8):
+        for b in (a ^ 1, a ^ 2, a ^ 4):
+            edge = corners[a] + share * (corners[b] - corners[a])
+            seen, _ = project_rolling(CAMERA, MOVING.at_rows, edge)
+            for u, v in np.rint(seen).astype(int):
+                assert picture[v - 1 : v + 2, u - 1 : u + 2].max() > 100
+    # It is not where a camera at rest would see it.
+    rest, _ = project_rolling(CAMERA, STILL.at_rows, corners)
+    assert np.linalg.norm(corner_pixels(CAMERA, MOVING.at_rows, cube_on(MARKER)) - rest) > 20.0
+    # The front is filled, and nothing is drawn far away.
+    v, u = np.nonzero(picture)
+    inside, _ = project_rolling(CAMERA, MOVING.at_rows, corners[4:].mean(axis=0)[None])
+    column, row = np.rint(inside[0]).astype(int)
+    assert 60 < picture[row, column] < 110
+    all_seen = corner_pixels(CAMERA, MOVING.at_rows, cube_on(MARKER))
+    assert u.min() > all_seen[:, 0].min() - 5
+    assert u.max() < all_seen[:, 0].max() + 5
+    assert v.max() < all_seen[:, 1].max() + 5
+
+
+def test_a_cube_behind_the_camera_is_not_drawn() -> None:
+    behind = Motion(np.eye(3), np.array([0.0, 0.0, -2.7]), np.zeros(3), np.zeros(3))
+    assert not drawn(behind).any()
+
+
+def test_animation_can_be_played() -> None:
+    pictures = []
+    for k in range(6):
+        left = np.full((48, 64, 3), 200, np.uint8)
+        cv2.circle(left, (10 + 8 * k, 20), 6, (0, 0, 255), -1)
+        right = np.full((48, 64, 3), 90, np.uint8)
+        captions = (("left", "1"), ("right", "2"))
+        pictures.append(side_by_side([left, right], captions, [(0, 0, 0), (255, 0, 0)], 128))
+    assert pictures[0].shape[1] == 2 * 128 + 6
+    played = Pillow.open(io.BytesIO(gif(pictures, 12.5)))
+    assert played.n_frames == 6
+    assert played.info["duration"] == 80
+    assert played.info["loop"] == 0
+    for k in range(6):
+        played.seek(k)
+        shown = np.asarray(played.convert("RGB"))[..., ::-1].astype(int)
+        assert np.abs(shown - pictures[k]).mean() < 4.0

@@ -1,0 +1,67 @@
+"""Signals at any moment: an orderly end, and nothing that is not whole."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.signals import campaign
+
+# What is interrupted in the middle of code that Numba calls, or in a finalizer.
+PROGRAM = """
+import os, signal, sys, time
+sys.path.insert(0, {folder!r})
+from rs_localizer.process.stopping import StopSignals
+class Finalized:
+    def __del__(self):
+        os.kill(os.getpid(), {number})
+        time.sleep(0.1)
+with StopSignals():
+    try:
+        {body}
+        time.sleep(30)
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+def test_random_signals() -> None:
+    ended = list(campaign(10, seed=1, commands=("replay", "detect", "markers")))
+    assert [one for one in ended if one.fault] == []
+    assert any(one.code > 128 for one in ended)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("body", ["import numba.fake", "Finalized()"])
+def test_no_interrupt_is_lost(tmp_path: Path, number: int, body: str) -> None:
+    """Nor raised where code from C would lose it, or be left half done."""
+    folder = f"{tmp_path}"
+    package = tmp_path / "numba"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "fake.py").write_text(
+        f"import os, time\nos.kill(os.getpid(), {number:d})\ntime.sleep(0.1)\nprint('whole')\n"
+    )
+    program = PROGRAM.format(folder=folder, number=int(number), body=body)
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    expected = ["whole", "interrupted"] if "numba" in body else ["interrupted"]
+    assert ended.stdout.split() == expected
+    assert ended.returncode == 0
+
+
+def test_who_compiles_for_long_is_ended(tmp_path: Path) -> None:
+    (tmp_path / "numba.py").write_text("import time\ntime.sleep(60)\n")
+    body = (
+        "import threading; threading.Timer(0.5, os.kill, (os.getpid(), 15)).start(); import numba"
+    )
+    program = PROGRAM.format(folder=f"{tmp_path}", number=15, body=body)
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (143, "", "interrupted\n")

@@ -1,0 +1,52 @@
+"""Work by several threads comes back in order, a few at a time; images survive their encoding."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.simulation.image_sequence import Encoding, in_order
+
+
+def test_results_come_in_order_and_few_wait() -> None:
+    started: list[int] = []
+
+    def work(item: int) -> int:
+        started.append(item)
+        time.sleep(0.002 * (7 * item % 5))
+        return item**2
+
+    results = in_order(work, range(200))
+    assert [next(results) for _ in range(3)] == [0, 1, 4]
+    time.sleep(0.1)  # nobody takes more: nothing is made ahead without bound
+    assert len(started) < 100
+    assert list(results) == [item**2 for item in range(3, 200)]
+
+
+def test_an_error_ends_the_work() -> None:
+    before = threading.active_count()
+
+    def work(item: int) -> int:
+        if item == 5:
+            raise ValueError("five")
+        return item
+
+    results = in_order(work, iter(range(10**9)))
+    with pytest.raises(ValueError, match="five"):
+        list(results)
+    assert threading.active_count() == before
+
+
+def test_encodings() -> None:
+    image = cv2.GaussianBlur(
+        np.random.default_rng(0).integers(0, 256, (60, 80), np.uint8), (0, 0), 3.0
+    )
+    exact = np.frombuffer(Encoding("png")(image), np.uint8)
+    np.testing.assert_array_equal(cv2.imdecode(exact, cv2.IMREAD_UNCHANGED), image)
+    good = np.frombuffer(Encoding("jpeg", 95)(image), np.uint8)
+    assert np.abs(cv2.imdecode(good, cv2.IMREAD_UNCHANGED).astype(int) - image).max() < 6
+    assert len(Encoding("jpeg", 20)(image)) < len(good)

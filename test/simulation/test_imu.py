@@ -1,0 +1,93 @@
+"""The simulated IMU against the motion itself: what it measures, integrated, is the motion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rs_localizer import data
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
+from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, Shaken, shaken
+
+PERFECT = ImuSettings(2000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+CAMERA_FROM_IMU = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True).as_matrix()
+LEVER = Lever(CAMERA_FROM_IMU, np.array([0.1, -0.05, 0.02]))
+RNG = np.random.default_rng(0)
+
+
+def steady(duration: float) -> ConstantVelocity:
+    return ConstantVelocity(
+        np.array([0.3, -1.0, 0.7]), np.array([0.4, 0.1, -0.2]), duration, start_ns=10**18
+    )
+
+
+def test_the_motion_comes_back_when_it_is_integrated() -> None:
+    """Dead reckoning by the midpoint rule, over a second of a hand that shakes."""
+    hand = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
+    motion = Shaken(hand, math.radians(0.3), 60.0, np.array([0.6, 0.0, 0.8]), 1.0)
+    first = hand.intervals_ns[0][0]
+    track = simulate_imu(motion, PERFECT, LEVER, RNG)
+    count = 2001
+    start = motion.state(first, np.zeros(1))
+    map_from_imu = Rotation.from_matrix(start.rotations[0] @ CAMERA_FROM_IMU)
+    place = start.positions[0] + start.rotations[0] @ LEVER.position
+    speed = start.rotations[0] @ (start.linear[0] + np.cross(start.angular[0], LEVER.position))
+    gravity = np.array([0.0, 0.0, -9.80665])
+    dt = 1.0 / PERFECT.rate
+    for i in range(count - 1):
+        rate = 0.5 * (track.angular_velocities[i] + track.angular_velocities[i + 1])
+        halfway = map_from_imu * Rotation.from_rotvec(0.5 * dt * rate)
+        force = 0.5 * (track.specific_forces[i] + track.specific_forces[i + 1])
+        pull = halfway.apply(force) + gravity
+        place, speed = place + dt * speed + 0.5 * dt**2 * pull, speed + dt * pull
+        map_from_imu = map_from_imu * Rotation.from_rotvec(dt * rate)
+    end = motion.state(int(track.times_ns[count - 1]), np.zeros(1))
+    turned = Rotation.from_matrix(end.rotations[0] @ CAMERA_FROM_IMU)
+    assert (turned.inv() * map_from_imu).magnitude() < math.radians(0.01)
+    there = end.positions[0] + end.rotations[0] @ LEVER.position
+    assert np.linalg.norm(place - there) < 1e-3
+    assert np.linalg.norm(there - start.positions[0]) > 0.1  # it has been somewhere
+
+
+def test_a_steady_turn_pulls_towards_its_centre() -> None:
+    track = simulate_imu(steady(0.5), PERFECT, LEVER, RNG)
+    turn = np.array([0.3, -1.0, 0.7])
+    np.testing.assert_allclose(track.angular_velocities @ CAMERA_FROM_IMU.T - turn, 0.0, atol=1e-12)
+    state = steady(0.5).state(10**18, (track.times_ns - 10**18) * 1e-9)
+    up = state.rotations[:, 2] * 9.80665  # third row: the map's z in camera axes
+    inwards = np.cross(turn, np.cross(turn, LEVER.position))
+    np.testing.assert_allclose(track.specific_forces @ CAMERA_FROM_IMU.T, up + inwards, atol=1e-6)
+
+
+def test_noise_bias_and_clock_are_those_that_were_asked_for() -> None:
+    settings = ImuSettings(400.0, 2e-3, 0.02, 1e-3, 0.05, 0.1, time_offset=-0.007)
+    track = simulate_imu(steady(50.0), settings, LEVER, np.random.default_rng(1))
+    clean = simulate_imu(steady(50.0), ImuSettings(400.0, *[0.0] * 5), LEVER, RNG)
+    assert np.all(track.times_ns - track.stamps_ns == -7_000_000)
+    assert np.linalg.norm(track.biases[0]) == pytest.approx(0.02)
+    # Density times the root of the rate, and of the time for the walk.
+    rest = track.angular_velocities - track.biases - clean.angular_velocities
+    assert np.std(rest) == pytest.approx(2e-3 * 20.0, rel=0.02)
+    assert np.std(np.diff(track.biases, axis=0)) == pytest.approx(1e-3 / 20.0, rel=0.02)
+    force = track.specific_forces - clean.specific_forces
+    assert np.linalg.norm(force.mean(axis=0)) == pytest.approx(0.1, rel=0.2)
+    assert np.std(force - force.mean(axis=0)) == pytest.approx(0.05 * 20.0, rel=0.02)
+
+
+def test_a_shaken_camera_turns_as_its_poses_do() -> None:
+    motion = shaken(steady(2.0), [(0.3, 60.0), (0.1, 120.0)], np.random.default_rng(2))
+    at, h = np.linspace(0.1, 1.9, 50), 1e-6
+    now = motion.state(10**18, at)
+    before, after = (motion.state(10**18, at + shift) for shift in (-h, h))
+    turned = Rotation.from_matrix(np.swapaxes(before.rotations, 1, 2) @ after.rotations)
+    np.testing.assert_allclose(turned.as_rotvec() / (2.0 * h), now.angular, atol=1e-5)
+    moved = (after.positions - before.positions) / (2.0 * h)
+    np.testing.assert_allclose(np.einsum("nji,nj->ni", now.rotations, moved), now.linear, atol=1e-6)
+    still = steady(2.0).state(10**18, np.linspace(0.0, 2.0, 4000))
+    swung = motion.state(10**18, np.linspace(0.0, 2.0, 4000))
+    angles = Rotation.from_matrix(np.swapaxes(still.rotations, 1, 2) @ swung.rotations).magnitude()
+    assert math.radians(0.3) < angles.max() <= math.radians(0.4001)

@@ -1,0 +1,252 @@
+"""Rendered images against plain ray casting, OpenCV's warping and analytic projections."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.core import so3
+from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.simulation.planes import TexturedPlane
+from rs_localizer.simulation.renderer import ImageSettings, Renderer
+from rs_localizer.simulation.true_motion import ConstantVelocity
+
+K = np.array([[80.0, 0.0, 47.0], [0.0, 82.0, 36.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(96, 72, K, readout_time=0.04)
+MOTION = ConstantVelocity(
+    np.array([1.0, -2.0, 3.0]), np.array([0.5, -0.3, 1.0]), 1.0, position=np.array([0.1, 0.2, 0.0])
+)
+LENSES = {
+    "none": {},
+    "plumb_bob": {"D": [-0.2, 0.05, 0.01, -0.01, 0.002]},
+    "rational_polynomial": {"D": [0.1, 0.02, 0.001, -0.002, 0.0, 0.3, 0.05, 0.01],
+                            "distortion_model": "rational_polynomial"},
+    "equidistant": {"D": [0.02, -0.01, 0.003, 0.0], "distortion_model": "equidistant"},
+}  # fmt: skip
+
+
+def waves(width: int, height: int, period: float = 40.0) -> np.ndarray:
+    """A picture so smooth that its sampling does not matter, only where it is."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    grey = 128 + 60 * np.sin(2 * np.pi * x / period) + 60 * np.cos(2 * np.pi * y / (1.3 * period))
+    return np.rint(grey).astype(np.uint8)
+
+
+def corner_of_a_room() -> list[TexturedPlane]:
+    """Two walls and a floor, with some of the background in sight."""
+    x, y, z = np.eye(3)
+    return [
+        TexturedPlane(np.array([2.0, 0.8, 1.2]), -y, -z, 0.01, waves(250, 200)),
+        TexturedPlane(np.array([2.0, -1.7, 1.2]), -x, -z, 0.01, waves(300, 200, 30.0)),
+        TexturedPlane(np.array([2.0, 0.8, -0.8]), -y, -x, 0.01, waves(250, 300, 50.0)),
+    ]
+
+
+def cast(camera: Camera, planes: list[TexturedPlane], motion: ConstantVelocity, stamp_ns: int):
+    """Ray by ray: the grey level that each pixel's middle sees, and how deep (NaN: nothing)."""
+    width, height = camera.size
+    image, nearest = np.full((height, width), 60.0), np.full((height, width), np.nan)
+    for row in range(height):
+        for column in range(width):
+            pixel = np.array([[column, row]], float)
+            tau = camera.row_time(pixel)
+            time = stamp_ns - motion.start_ns
+            seconds = 1e-9 * time + (tau - camera.first_row_time) * camera.readout_time
+            rotation = motion.rotation @ so3.exp(seconds[0] * motion.angular_velocity)
+            centre = motion.position + seconds[0] * motion.rotation @ motion.linear_velocity
+            ray = rotation @ [*camera.rays(pixel)[0], 1.0]
+            for plane in planes:
+                normal = np.cross(plane.right, plane.down)
+                depth = normal @ (plane.corner - centre) / (normal @ ray)
+                met = centre + depth * ray - plane.corner
+                x, y = met @ plane.right / plane.texel, met @ plane.down / plane.texel
+                inside = 0 < x < plane.texture.shape[1] and 0 < y < plane.texture.shape[0]
+                if depth > 0.0 and inside and not depth > nearest[row, column]:
+                    nearest[row, column] = depth
+                    map_x, map_y = np.array([[x - 0.5]]), np.array([[y - 0.5]])
+                    image[row, column] = cv2.remap(
+                        plane.texture.astype(np.float32), map_x.astype(np.float32),
+                        map_y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
+                    )[0, 0]  # fmt: skip
+    return image, nearest
+
+
+def away_from_edges(depths: np.ndarray) -> np.ndarray:
+    """Pixels around which the depth changes little: a pixel on an edge is a mixture."""
+    filled = np.nan_to_num(depths)
+    smooth = np.abs(cv2.Laplacian(filled, cv2.CV_64F)) < 0.08
+    return cv2.erode(smooth.astype(np.uint8), np.ones((3, 3))) > 0
+
+
+@pytest.mark.parametrize(
+    ("lens", "direction"),
+    [
+        *(("plumb_bob", direction) for direction in ScanDirection),
+        ("none", "top_to_bottom"),
+        ("rational_polynomial", "bottom_to_top"),
+        ("equidistant", "left_to_right"),
+    ],
+)
+def test_every_line_is_seen_from_its_own_pose(lens: str, direction: str) -> None:
+    camera = replace(CAMERA, scan_direction=direction, **LENSES[lens])
+    planes = corner_of_a_room()
+    image = Renderer(camera, planes).image(MOTION, 300_000_000)
+    expected, depths = cast(camera, planes, MOTION, 300_000_000)
+    compared = away_from_edges(depths)
+    assert compared.mean() > 0.75
+    difference = (image - expected)[compared]
+    assert np.abs(difference).mean() < 1.0
+    assert np.percentile(np.abs(difference), 99) < 6.0
+    # A row late, or a wrong sign, would be seen.
+    still = replace(camera, readout_time=0.04 * 71 / 70)
+    late = Renderer(still, planes).image(MOTION, 301_000_000)
+    assert np.abs((late - expected)[compared]).mean() > 2.0 * np.abs(difference).mean()
+
+
+def test_global_shutter_is_a_homography() -> None:
+    rotation = MOTION.rotation @ so3.exp(np.array([0.2, -0.1, 0.3]))
+    still = replace(
+        MOTION, rotation=rotation, angular_velocity=np.zeros(3), linear_velocity=np.zeros(3)
+    )
+    _, y, z = np.eye(3)
+    plane = TexturedPlane(np.array([2.0, 2.0, 2.0]), -y, -z, 0.01, waves(400, 400))
+    image = Renderer(replace(CAMERA, readout_time=0.0), [plane]).image(still, 0)
+    # Texel centres are at whole numbers for OpenCV, half of a texel from the corner.
+    corners = np.array([[0.0, 0.0], [399.0, 0.0], [399.0, 399.0], [0.0, 399.0]], np.float32)
+    seen = (plane.points(corners + 0.5) - still.position) @ rotation
+    assert np.all(seen[:, 2] > 0.0)
+    matrix = cv2.getPerspectiveTransform(corners, CAMERA.project(seen).astype(np.float32))
+    expected = cv2.warpPerspective(plane.texture, matrix, (96, 72), borderValue=60.0)
+    covered = cv2.warpPerspective(np.ones_like(plane.texture), matrix, (96, 72))
+    inside = cv2.erode(covered, np.ones((3, 3))) > 0
+    assert inside.mean() > 0.9
+    assert np.abs(image.astype(float) - expected)[inside].max() < 4.0
+
+
+def chessboard(cell: int = 24, cells: int = 12) -> TexturedPlane:
+    squares = np.kron(np.indices((cells, cells)).sum(0) % 2, np.ones((cell, cell)))
+    texture = (30 + 200 * squares).astype(np.uint8)
+    return TexturedPlane(
+        np.array([-0.6, -0.6, 0.0]), np.eye(3)[0], np.eye(3)[1], 0.1 / cell, texture
+    )
+
+
+def test_corners_are_where_they_project_to() -> None:
+    """Near and far, upright and slanted: no offset, and what the search for a corner can do."""
+    camera = Camera(640, 480, np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]))
+    plane, rng, errors = chessboard(), np.random.default_rng(0), []
+    grid = 24.0 * np.stack(np.meshgrid(np.arange(1, 12), np.arange(1, 12)), -1).reshape(-1, 2)
+    for _ in range(12):
+        rotation = so3.exp(rng.uniform(-0.8, 0.8, 3))
+        position = -rotation[:, 2] * rng.uniform(1.2, 5.0) + 0.05 * rng.normal(size=3)
+        pose = ConstantVelocity(np.zeros(3), np.zeros(3), 1.0, rotation=rotation, position=position)
+        image = Renderer(camera, [plane], ImageSettings(noise=2.0)).image(pose, 0)
+        true = camera.project((plane.points(grid) - position) @ rotation)
+        spacing = np.linalg.norm(np.diff(true.reshape(11, 11, 2), axis=0), axis=2).min()
+        window = int(np.clip(spacing / 3.0, 2, 5))
+        true = true[np.all((true > 12) & (true < np.array([627, 467])), axis=1)]
+        found = cv2.cornerSubPix(
+            image, np.array(true[:, None], np.float32), (window, window), (-1, -1), (3, 50, 1e-4)
+        )
+        errors.append(found[:, 0] - true)
+    all_errors = np.concatenate(errors)
+    distances = np.linalg.norm(all_errors, axis=1)
+    assert len(distances) > 1000
+    assert np.median(distances) < 0.06
+    assert np.abs(all_errors[distances < 1.0].mean(axis=0)).max() < 0.01
+
+
+def test_a_far_picture_does_not_alias() -> None:
+    squares = np.indices((1024, 1024)).sum(0) % 2
+    plane = TexturedPlane(
+        np.array([5.0, 2.56, 2.56]), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]),
+        0.005, (255 * squares).astype(np.uint8),
+    )  # fmt: skip
+    still = ConstantVelocity(np.zeros(3), np.zeros(3), 1.0)
+    image = Renderer(CAMERA, [plane]).image(still, 0)[20:50, 30:60]
+    assert np.abs(image - 127.5).max() < 8.0
+
+
+def test_exposure_blurs_along_the_motion_and_shifts_nothing() -> None:
+    """An edge that passes by at v px per exposure is a ramp of that width, in the same place."""
+    edge = np.full((400, 800), 20, np.uint8)
+    edge[:, 400:] = 220
+    plane = TexturedPlane(
+        np.array([2.0, 4.0, 2.0]), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]), 0.01,
+        edge,
+    )  # fmt: skip
+    camera = replace(CAMERA, readout_time=0.0)
+    passing = ConstantVelocity(np.zeros(3), np.array([5.0, 0.0, 0.0]), 1.0)
+
+    def row(exposure: float) -> np.ndarray:
+        settings = ImageSettings(exposure=exposure)
+        return Renderer(camera, [plane], settings).image(passing, 10_000_000)[36].astype(float)
+
+    sharp, blurred = row(0.0), row(0.05)
+    travel = 80.0 * 5.0 * 0.05 / 2.0
+    ramp = np.flatnonzero((blurred > 30) & (blurred < 210))
+    assert len(ramp) == pytest.approx(0.9 * travel, abs=2)
+    np.testing.assert_allclose(np.diff(blurred[ramp]).mean(), 200.0 / travel, rtol=0.1)
+    assert (blurred - sharp).sum() == pytest.approx(0.0, abs=100.0)  # half a pixel
+
+
+def test_a_cropped_image_is_a_part_of_the_whole_one() -> None:
+    planes = corner_of_a_room()
+    cropped = replace(CAMERA, roi=Roi(20, 10, 50, 40))
+    # The stamp is that of the first delivered row.
+    row_ns = round(0.04 / 71 * 1e9)
+    whole = Renderer(CAMERA, planes).image(MOTION, 300_000_000)
+    part = Renderer(cropped, planes).image(MOTION, 300_000_000 + 10 * row_ns)
+    assert np.abs(part.astype(int) - whole[10:50, 20:70]).max() <= 1
+
+
+def test_noise_and_vignetting() -> None:
+    plane = TexturedPlane(
+        np.array([2.0, 4.0, 4.0]), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]), 0.1,
+        np.full((80, 80), 100, np.uint8),
+    )  # fmt: skip
+    still = ConstantVelocity(np.zeros(3), np.zeros(3), 1.0)
+    noisy = Renderer(CAMERA, [plane], ImageSettings(noise=5.0))
+    image = noisy.image(still, 0, (1, 2))
+    assert image.std() == pytest.approx(5.0, rel=0.05)
+    assert image.mean() == pytest.approx(100.0, abs=0.3)
+    np.testing.assert_array_equal(image, noisy.image(still, 0, (1, 2)))
+    assert np.any(image != noisy.image(still, 0, (1, 3)))
+    dark = Renderer(CAMERA, [plane], ImageSettings(vignetting=0.4)).image(still, 0)
+    np.testing.assert_array_equal(dark[[0, 0, -1, -1], [0, -1, 0, -1]], 60)
+    assert dark[36, 48] == 100
+
+
+def test_rays_that_the_lens_does_not_have_see_the_background() -> None:
+    """A barrel so strong that it folds: its corners show nothing."""
+    camera = replace(CAMERA, D=[-0.9, 0.0, 0.0, 0.0])
+    image = Renderer(camera, corner_of_a_room()).image(MOTION, 0)
+    assert image[0, 0] == image[-1, -1] == 60
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"right": np.array([0.0, -1.0, 0.1])}, "perpendicular unit vectors"),
+        ({"texel": 0.0}, "a texel must be more than 0"),
+        ({"texture": np.zeros((3, 3, 3), np.uint8)}, "grey image of bytes, got .3, 3, 3."),
+        ({"texture": np.zeros((3, 3))}, "float64"),
+    ],
+)
+def test_impossible_planes_are_refused(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(chessboard(), **change)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"exposure": -1.0}, {"noise": np.inf}, {"vignetting": 1.5}, {"exposure": np.nan}]
+)
+def test_impossible_settings_are_refused(settings: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(settings))} must .* got"):
+        ImageSettings(**settings)
+    with pytest.raises(ValueError, match="at least one plane"):
+        Renderer(CAMERA, [])

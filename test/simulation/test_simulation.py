@@ -1,0 +1,191 @@
+"""Simulated frames: every point where its own row sees it, noise and outliers as ordered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.trajectories import Trajectory
+from rs_localizer.simulation.frames import (
+    FrameSettings,
+    SimulatedFrame,
+    frame_stamps,
+    simulate_frames,
+)
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity, RecordedMotion, TrueMotion
+
+K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
+MOTION = ConstantVelocity(np.array([0.6, -2.0, 1.5]), np.array([1.0, 0.5, 0.25]), 1.0)
+MAP = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
+CLEAN = FrameSettings(points=100, noise=0.0, outliers=0.0)
+LENSES = {
+    "none": (DistortionModel.PLUMB_BOB, []),
+    "plumb_bob": (DistortionModel.PLUMB_BOB, [-0.3, 0.1, 0.002, -0.001, 0.01]),
+    "rational_polynomial": (
+        DistortionModel.RATIONAL_POLYNOMIAL,
+        [0.5, 0.1, 0.001, 0.001, 0.01, 0.8, 0.2, 0.02],
+    ),
+    "equidistant": (DistortionModel.EQUIDISTANT, [-0.02, 0.01, -0.003, 0.001]),
+}
+
+
+def camera(direction: str = "top_to_bottom", lens: str = "none", readout: float = 0.03) -> Camera:
+    model, coefficients = LENSES[lens]
+    return Camera(640, 480, K, np.array(coefficients), model, readout, direction)
+
+
+def frames(
+    settings: FrameSettings = CLEAN, motion: TrueMotion = MOTION, seed: int = 0, **lens: str
+) -> list[SimulatedFrame]:
+    return list(simulate_frames(camera(**lens), motion, MAP, settings, seed=seed))
+
+
+@pytest.mark.parametrize("direction", list(ScanDirection))
+def test_each_point_is_seen_at_the_time_of_its_row(direction: str) -> None:
+    """Independent of row_time and project_rolling: plain geometry at each pixel's exposure."""
+    for frame in frames(direction=direction)[::10]:
+        assert len(frame.points) == 100
+        u, v = frame.pixels.T
+        late = {
+            "top_to_bottom": v / 479,
+            "bottom_to_top": (479 - v) / 479,
+            "left_to_right": u / 639,
+            "right_to_left": (639 - u) / 639,
+        }[direction]
+        assert late.min() > -0.01
+        assert late.max() < 1.01
+        state = MOTION.state(frame.stamp_ns, 0.03 * late)
+        local = np.einsum("nji,nj->ni", state.rotations, frame.points - state.positions)
+        np.testing.assert_allclose(u, 400 * local[:, 0] / local[:, 2] + 319.5, atol=1e-6)
+        np.testing.assert_allclose(v, 410 * local[:, 1] / local[:, 2] + 239.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_distortion_is_that_of_opencv(lens: str) -> None:
+    model, coefficients = LENSES[lens]
+    for frame in frames(lens=lens)[::10]:
+        assert len(frame.points) == 100
+        state = MOTION.state(frame.stamp_ns, 0.03 * frame.pixels[:, 1] / 479)
+        local = np.einsum("nji,nj->ni", state.rotations, frame.points - state.positions)
+        zero, D = np.zeros((3, 1)), np.array(coefficients)
+        if model == DistortionModel.EQUIDISTANT:
+            expected = cv2.fisheye.projectPoints(local[:, None], zero, zero, K, D)[0]
+        else:
+            expected = cv2.projectPoints(local[:, None], zero, zero, K, D)[0]
+        np.testing.assert_allclose(frame.pixels, expected[:, 0], atol=1e-5)
+
+
+def test_points_that_a_lens_folds_back_are_not_seen() -> None:
+    # Strong barrel distortion: beyond 60 degrees off axis the polynomial runs backwards.
+    lens = Camera(640, 480, K * [[0.5], [0.5], [1.0]] + [[0, 0, 159.75], [0, 0, 119.75], [0, 0, 0]],
+                  np.array([-0.35, 0.0, 0.0, 0.0]), readout_time=0.0)  # fmt: skip
+    settings = FrameSettings(points=5000, noise=0.0, outliers=0.0)
+    for frame in list(simulate_frames(lens, MOTION, MAP, settings))[::10]:
+        np.testing.assert_allclose(lens.rays(frame.pixels), bearings(frame), atol=1e-3)
+
+
+def bearings(frame: SimulatedFrame) -> Array:
+    local = frame.points @ frame.motion.rotation.T + frame.motion.translation
+    return np.asarray(local[:, :2] / local[:, 2:])
+
+
+@pytest.mark.parametrize("direction", list(ScanDirection))
+def test_truth_against_finite_differences(direction: str) -> None:
+    t = np.arange(0.0, 2.0, 1 / 120)
+    quaternions = np.stack([np.sin(t), np.cos(2 * t), np.sin(1.5 * t), 2 + np.cos(t)], axis=1)
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    positions = 0.3 * np.stack([np.sin(3 * t), np.cos(2 * t), t], axis=1)
+    motion = RecordedMotion(Trajectory((t * 1e9).astype(np.int64), positions, quaternions))
+    step = 1e-5
+    for frame in frames(direction=direction, motion=motion)[5:50:15]:
+        assert frame.middle_ns == frame.stamp_ns + 15_000_000
+        around = motion.state(frame.stamp_ns, 0.015 + np.array([-step, 0.0, step]))
+        truth = frame.motion
+        np.testing.assert_allclose(truth.rotation, around.rotations[1].T, atol=1e-9)
+        centre = -truth.rotation.T @ truth.translation
+        np.testing.assert_allclose(centre, around.positions[1], atol=1e-9)
+        # Per readout: what the camera would do in 0.03 s, in its own axes.
+        travel = (around.positions[2] - around.positions[0]) / (2 * step) * 0.03
+        np.testing.assert_allclose(truth.linear_velocity, truth.rotation @ travel, atol=1e-8)
+        turn = around.rotations[0].T @ around.rotations[2]
+        skew = (turn - turn.T) / 2
+        omega = np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (2 * step)
+        np.testing.assert_allclose(truth.angular_velocity, omega * 0.03, atol=1e-8)
+        np.testing.assert_allclose(
+            frame.first_row.rotations[0], motion.state(frame.stamp_ns, np.zeros(1)).rotations[0]
+        )
+
+
+def test_noise_has_the_ordered_size_in_both_coordinates() -> None:
+    noisy = frames(FrameSettings(points=100, noise=1.5, outliers=0.0))
+    differences = []
+    for frame in noisy:
+        # The same points again without noise: their ids are now their places in the list.
+        (exact,) = simulate_frames(
+            camera(), MOTION, frame.points, CLEAN, stamps_ns=[frame.stamp_ns]
+        )
+        differences.append(frame.pixels - exact.pixels[np.argsort(exact.ids)])
+    noise = np.concatenate(differences)
+    assert len(noise) == 100 * len(noisy)
+    np.testing.assert_allclose(noise.std(axis=0), 1.5, rtol=0.05)
+    np.testing.assert_allclose(noise.mean(axis=0), 0.0, atol=0.1)
+    assert abs(np.corrcoef(noise.T)[0, 1]) < 0.06
+
+
+def test_outliers_have_the_ordered_share_and_fill_the_image() -> None:
+    mixed = frames(FrameSettings(points=100, noise=0.5, outliers=0.3))
+    assert all(np.count_nonzero(~frame.inliers) == 30 for frame in mixed)
+    wild = np.concatenate([frame.pixels[~frame.inliers] for frame in mixed])
+    assert wild.min() >= -0.5
+    assert np.all(wild <= [639.5, 479.5])
+    np.testing.assert_allclose(wild.mean(axis=0), [319.5, 239.5], rtol=0.06)
+    np.testing.assert_allclose(wild.std(axis=0), [640 / 12**0.5, 480 / 12**0.5], rtol=0.06)
+    firsts = [frame.inliers[:30].sum() for frame in mixed]
+    assert 15 < np.mean(firsts) < 27  # anywhere in the list, not at its head
+
+
+def test_seed_decides_everything() -> None:
+    one, same, other = (frames(FrameSettings(points=50), seed=seed) for seed in (4, 4, 5))
+    for a, b in zip(one, same, strict=True):
+        np.testing.assert_array_equal(a.pixels, b.pixels)
+        np.testing.assert_array_equal(a.ids, b.ids)
+    assert not np.array_equal(one[0].pixels, other[0].pixels)
+    assert not np.array_equal(one[0].pixels, one[1].pixels)
+
+
+def test_no_frame_touches_a_gap() -> None:
+    t = np.arange(0.0, 3.0, 1 / 120)
+    t = t[((t < 1.0) | (t > 1.4)) & ((t < 2.0) | (t > 2.05))]
+    stamps_ns = 1_500_000_000_000_000_000 + np.round(t * 1e9).astype(np.int64)
+    quaternions = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    motion = RecordedMotion(Trajectory(stamps_ns, np.zeros((len(t), 3)), quaternions))
+    stamps = np.array(frame_stamps(motion, camera(), 30.0))
+    for stamp in stamps:
+        inside = [first <= stamp <= last - 30_000_000 for first, last in motion.intervals_ns]
+        assert sum(inside) == 1
+    seconds = (stamps - stamps_ns[0]) * 1e-9
+    np.testing.assert_allclose(seconds * 30, np.round(seconds * 30), atol=1e-6)
+    # All that fit are there: 90 in three seconds, less those that touch 0.4 s and 0.05 s.
+    assert 70 <= len(stamps) <= 75
+
+
+def test_scarce_maps_give_fewer_points() -> None:
+    (frame,) = simulate_frames(camera(), MOTION, MAP[:40], FrameSettings(), stamps_ns=[0])
+    assert len(frame.points) == len(frame.pixels) == len(frame.inliers) < 40
+    (empty,) = simulate_frames(camera(), MOTION, MAP[:0], FrameSettings(), stamps_ns=[0])
+    assert empty.pixels.shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("points", -1), ("noise", -0.1), ("outliers", 1.1), ("rate", 0.0)]
+)
+def test_impossible_settings_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} must .* got {value}"):
+        replace(FrameSettings(), **{name: value})
