@@ -11,7 +11,7 @@ import contextlib
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
@@ -23,6 +23,10 @@ from rs_localizer.process.stopping import INTERRUPTED, StopRequest
 
 # What shells report of a program whose output nobody reads any more: 128 + SIGPIPE.
 _SIGPIPE = 141
+# Characters that steer terminals: names in recordings and files may hold them.
+_STEERING = {
+    code: f"\\x{code:02x}" for code in (*range(32), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +143,8 @@ def main(
         return _fail(name, explain(error), 1)
     StopRequest.clean_up.append(remove_unfinished)
     try:
-        module.run(arguments)
+        with _plain_output() if name != "watch" else nullcontext():
+            module.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
         return _unheard()
@@ -157,8 +162,21 @@ def main(
 
 
 def _fail(name: str, text: str, code: int) -> int:
-    print(f"rs_localizer {name}: {' '.join(text.split())}", file=sys.stderr)
+    shown = " ".join(text.split()).translate(_STEERING)
+    print(f"rs_localizer {name}: {shown}", file=sys.stderr)
     return code
+
+
+@contextlib.contextmanager
+def _plain_output() -> Iterator[None]:
+    """Within ``with``, what is printed cannot steer the terminal."""
+    write = sys.stdout.write
+    output = sys.stdout
+    output.write = lambda text: write(text.translate(_STEERING))  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        output.write = write  # type: ignore[method-assign]
 
 
 def _unheard() -> int:

@@ -22,6 +22,7 @@ from rs_localizer.core.camera import Camera, DistortionModel
 _FEWEST = 4
 _OF_MATRIX = 4  # focal lengths and centre
 _RADII = np.linspace(0.0, 1.0, 21)
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +39,17 @@ class LensError:
 
     @property
     def pixels(self) -> float:
-        """How far (px) the radial part moves the image points that it moves farthest."""
-        a, b = self.mean[:2]
-        return float(self.corner * np.abs(a * _RADII**3 + b * _RADII**5).max())
+        """How far (px) it moves the image points that it moves farthest."""
+        distorting = 2 if len(self.mean) % _OF_MATRIX == 2 else 4
+        a, b, c, d = np.r_[self.mean[:distorting], np.zeros(4 - distorting)]
+        matrix = self.mean[distorting:]
+        focal, centre = (matrix[:2], matrix[2:]) if len(matrix) else np.zeros((2, 2))
+        x, y = (np.outer(_RADII, turn) for turn in (np.cos(_ANGLES), np.sin(_ANGLES)))
+        squared = x**2 + y**2
+        radial = a * squared + b * squared**2
+        along = x * (radial + focal[0]) + 2.0 * c * x * y + d * (squared + 2.0 * x**2) + centre[0]
+        down = y * (radial + focal[1]) + 2.0 * d * x * y + c * (squared + 2.0 * y**2) + centre[1]
+        return float(self.corner * np.hypot(along, down).max())
 
 
 def corner_of(camera: Camera) -> float:

@@ -24,8 +24,8 @@ MOST = 16_384
 """How many readings are remembered."""
 # Readings that come so much behind the newest are no stragglers: the clock was set back.
 _SET_BACK_NS = 500_000_000
-# At a longer period than this, a shaking of 30 Hz turns by half a cycle between two readings.
-_LONGEST_PERIOD_NS = 16_000_000
+LONGEST_PERIOD_NS = 16_000_000
+"""At a longer period, a shaking of 30 Hz turns by half a cycle between two readings."""
 # Between readings that are closer than this the noise would make the spline swing: one counts.
 _CLOSEST_NS = 250_000
 # A gyroscope that shows its greatest value so many times in a row, and at least this (rad/s; the
@@ -184,10 +184,10 @@ class ReadingBuffer:
             kept = _apart(stamps)
             stamps, values = stamps[kept], values[kept]
             span = span_of(stamps, start_ns, end_ns)
-        if span.period > _LONGEST_PERIOD_NS:
+        if span.period > LONGEST_PERIOD_NS:
             return Lacking(
                 Lack.TOO_SLOW,
-                f"a reading comes every {_span(span.period)}; at most {_span(_LONGEST_PERIOD_NS)} "
+                f"a reading comes every {_span(span.period)}; at most {_span(LONGEST_PERIOD_NS)} "
                 "tell how a camera shakes",
             )
         if span.gap:

@@ -6,15 +6,18 @@ recording was; the readers of this package take them and rclpy's messages alike.
 
 from __future__ import annotations
 
+import bz2
 import contextlib
+import importlib
 import shutil
 import sqlite3
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from types import TracebackType
+from types import SimpleNamespace, TracebackType
 from typing import Any, Self
 
+from lz4.frame import LZ4FrameDecompressor
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Qos,
@@ -30,6 +33,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from rs_localizer.io.topics import TF_STATIC
+from rs_localizer.io.yaml_text import load_yaml
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SUFFIXES = (".mcap", ".db3", ".bag")
@@ -46,8 +50,73 @@ _LATCHED = Qos(
 _LATCHED_TOPICS = (TF_STATIC,)
 
 
+# Of a chunk or a message, unpacked: a hundred raw images of a megapixel are fewer.
+_MOST_UNPACKED = 2**28
+# A packed file may stand for so many times its size: raw images of a dark room.
+_BEST_PACKING = 1000
+
+
 class BagError(ValueError):
     """A recording that cannot be read or written; the message names the path and the fault."""
+
+
+def _unpacked(decompressor: Any, data: bytes) -> bytes:
+    raw: bytes = decompressor.decompress(data, _MOST_UNPACKED)
+    if not decompressor.eof:
+        raise BagError(f"{len(data)} packed bytes are cut off or stand for over {len(raw)}")
+    return raw
+
+
+class _BoundedZstd:
+    """What rosbags takes of its module zstd, which unpacks without a limit."""
+
+    def __init__(self, module: Any) -> None:
+        self._module = module
+        self.compress = module.compress
+
+    def decompress(self, data: bytes) -> bytes:
+        return _unpacked(self._module.ZstdDecompressor(), data)
+
+    @contextlib.contextmanager
+    def open(self, file: Any, mode: str) -> Iterator[Any]:
+        remaining = _BEST_PACKING * max(Path(file.name).stat().st_size, 1000)
+
+        def read(size: int) -> bytes:
+            nonlocal remaining
+            data: bytes = opened.read(size)
+            remaining -= len(data)
+            if remaining < 0:
+                raise BagError(f"{file.name} unpacks to over {_BEST_PACKING} times its size")
+            return data
+
+        with self._module.open(file, mode) as opened:
+            yield SimpleNamespace(read=read)
+
+
+def _bound_decompression() -> None:
+    """Have rosbags unpack no more than :data:`_MOST_UNPACKED` at once; it has no such option."""
+    ros1, ros2, mcap = (
+        vars(importlib.import_module(f"rosbags.{name}"))
+        for name in ("rosbag1.reader", "rosbag2.reader", "rosbag2.storage_mcap")
+    )
+    bounded = _BoundedZstd(ros2["zstd"])
+    ros2["zstd"] = bounded
+
+    def lz4(data: bytes) -> bytes:
+        return _unpacked(LZ4FrameDecompressor(), data)
+
+    ros1["decompressors"] |= {
+        "bz2": lambda data: _unpacked(bz2.BZ2Decompressor(), data),
+        "lz4": lz4,
+    }
+    mcap["DECOMPRESSORS"] |= {
+        "zstd": lambda data, _: bounded.decompress(data),
+        "lz4": lambda data, _: lz4(data),
+    }
+
+
+with contextlib.suppress(KeyError, AttributeError):  # of versions that are made otherwise
+    _bound_decompression()
 
 
 @lru_cache(maxsize=1)
@@ -99,11 +168,19 @@ class BagReader:
         if not wanted:
             return
         with _explained(self._path):
+            self._check_types({connection.msgtype for connection in wanted})
             for connection, stamp_ns, data in self._reader.messages(connections=wanted):
                 message = self._reader.deserialize(data, connection.msgtype)
                 if not self._reader.is2:
                     message = _as_ros2(message, connection.msgtype)
                 yield connection.topic, stamp_ns, message
+
+    def _check_types(self, names: Collection[str]) -> None:
+        """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
+        own, known = self._reader.typestore.fielddefs, typestore().fielddefs
+        for name in set(names) & set(known) if self._reader.is2 else ():
+            if _fields_of(name, own) != _fields_of(name, known):
+                raise BagError(f"{self._path} describes {name} otherwise than ROS 2 Jazzy does")
 
 
 @contextlib.contextmanager
@@ -122,6 +199,17 @@ def open_bag(path: Path | str) -> Iterator[BagReader]:
             if bag.count(bag.topics) == 0:
                 raise BagError(f"{path} is an empty recording: it holds no message")
         yield bag
+
+
+def _fields_of(name: str, defined: Mapping[str, Any]) -> Any:
+    """The fields of a message type with all that they hold, names replaced by their fields."""
+
+    def expanded(item: Any) -> Any:
+        if isinstance(item, (tuple, list)):
+            return [expanded(part) for part in item]
+        return expanded(defined[item][1]) if item in defined else item
+
+    return expanded(defined[name][1])
 
 
 def is_bag(path: Path) -> bool:
@@ -146,6 +234,7 @@ def _storage(path: Path) -> Path:
             raise BagError(f"{path} is an empty file")
         return path
     if (path / "metadata.yaml").exists():
+        load_yaml((path / "metadata.yaml").read_text(encoding="utf-8"))  # with limits
         return path
     # A recorder that was killed leaves its data without metadata.yaml.
     files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)

@@ -21,6 +21,11 @@ from rs_localizer.io.calibration.colmap import colmap_camera
 _KEYPOINTS, _MATCHES = "keypoints", "matches0"
 # Between the names of a pair: now, in a group of the first one, and in older files.
 _SEPARATORS = ("/", "_")
+# What h5py raises of a damaged file, for that of an absurd size.
+_DAMAGES = (
+    *(KeyError, TypeError, ValueError, OSError, AttributeError, RuntimeError),
+    *(MemoryError, OverflowError, IndexError),
+)
 _NONE = -1  # of a keypoint without a match
 
 
@@ -84,7 +89,7 @@ class H5File:
         """
         try:
             values = np.asarray(self._file[name][_KEYPOINTS][()], np.float64)
-        except (KeyError, TypeError, ValueError, OSError, AttributeError, RuntimeError):
+        except _DAMAGES:
             raise HlocError(f"{self._path} has no {_KEYPOINTS} of {name}") from None
         if values.ndim != 2 or values.shape[1] < 2:
             raise HlocError(
@@ -115,11 +120,11 @@ class H5File:
         for separator in _SEPARATORS:
             for turned in (False, True):
                 key = separator.join(names[::-1] if turned else names)
-                if key not in self._file:
-                    continue
                 try:
+                    if key not in self._file:
+                        continue
                     values: NDArray[Any] = np.asarray(self._file[key][_MATCHES][()])
-                except (KeyError, TypeError, ValueError, OSError, AttributeError, RuntimeError):
+                except _DAMAGES:
                     values = np.zeros(0)
                 if values.ndim != 1 or values.dtype.kind not in "iu":
                     raise HlocError(f"{self._path}: {key} has no {_MATCHES} of whole numbers (n,)")

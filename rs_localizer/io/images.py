@@ -134,19 +134,29 @@ def read_compressed_image(message: Any) -> Image:
     Raises:
         MessageError: for anything else, or an image that is truncated or damaged.
     """
-    data = np.frombuffer(message.data, np.uint8)
+    pixels = decode(bytes(message.data), str(message.format))
+    return Image(stamp_ns(message), str(message.header.frame_id), pixels)
+
+
+def decode(packed: bytes, format_: str) -> Gray:
+    """The pixels (h,w) of a JPEG or PNG; ``format_`` is what is said of it.
+
+    Raises:
+        MessageError: for anything else, or an image that is truncated or damaged.
+    """
+    data = np.frombuffer(packed, np.uint8)
     start = data[:8].tobytes()
     found = [item for item in _FORMATS if start.startswith(item[1])]
     if not found:
         raise MessageError(
-            f"the compressed image is neither JPEG nor PNG: its format is {str(message.format)!r} "
+            f"the compressed image is neither JPEG nor PNG: its format is {format_!r} "
             f"and its {len(data)} bytes start with {start.hex(' ') or 'nothing'}"
         )
     name, _, end = found[0]
     # OpenCV fills what is missing with gray and says nothing.
     if not _ends_with(data, end):
         raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
-    size = _claimed_size(data.tobytes(), name)
+    size = _claimed_size(packed, name)
     if size is None:
         raise MessageError(
             f"the {name} image of {len(data)} bytes cannot be decoded: no header tells its size"
@@ -157,14 +167,14 @@ def read_compressed_image(message: Any) -> Image:
             f"cannot tell, or which is more than {_MOST_PIXELS // 1_000_000} megapixels"
         )
     if name == "PNG":
-        data = np.frombuffer(_still_png(data.tobytes()), np.uint8)
+        data = np.frombuffer(_still_png(packed), np.uint8)
     try:
         decoded = cv2.imdecode(data, _AS_IT_IS)
     except cv2.error as error:
         raise MessageError(f"the {name} image cannot be decoded: {error}") from error
     if decoded is None:
         raise MessageError(f"the {name} image of {len(data)} bytes cannot be decoded")
-    return Image(stamp_ns(message), str(message.header.frame_id), _eight_bits(np.asarray(decoded)))
+    return _eight_bits(np.asarray(decoded))
 
 
 def _claimed_size(data: bytes, name: str) -> tuple[int, int] | None:

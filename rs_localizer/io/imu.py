@@ -40,12 +40,14 @@ def read_imu(message: Any) -> ImuReading:
     """
     frame = frame_id(message, "the frame of the IMU's axes")
     rates = message.angular_velocity_covariance
+    forces = message.linear_acceleration_covariance
+    if (len(rates), len(forces)) != (9, 9):
+        raise MessageError(f"the covariances must be of 9 numbers, found {len(rates), len(forces)}")
     if float(rates[0]) == _ABSENT:
         raise MessageError(
             "angular_velocity_covariance[0] is -1: the message has no angular velocity (a topic of "
             "the accelerometer alone?)"
         )
-    forces = message.linear_acceleration_covariance
     turn = _vector(message.angular_velocity, "angular_velocity", "rad/s", _FASTEST)
     force = None
     if float(forces[0]) != _ABSENT and _is_finite(message.linear_acceleration):

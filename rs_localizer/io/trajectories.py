@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -22,6 +23,9 @@ from rs_localizer.core.arrays import Array
 
 # Files round quaternions to four digits or more; what is further from 1 is no rotation.
 _QUATERNION_TOLERANCE = 0.01
+# No line of eight numbers is as long, no recording of days has as many: of packed text that few
+# bytes stand for.
+_LONGEST_LINE, _MOST_LINES = 10_000, 20_000_000
 # Seconds whose nanoseconds fit 64 bits.
 _LATEST = 9_223_372_036
 
@@ -169,13 +173,19 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.int64]
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         with _open(path, "r") as file:
-            for number, line in enumerate(file, start=1):
+            lines = iter(lambda: file.readline(_LONGEST_LINE + 1), "")
+            for number, line in enumerate(lines, start=1):
+                if len(line) > _LONGEST_LINE or number > _MOST_LINES:
+                    raise TrajectoryError(
+                        f"{path}, line {number}: lines have at most {_LONGEST_LINE} characters, "
+                        f"and there are at most {_MOST_LINES}"
+                    )
                 stripped = line.strip()
                 if stripped and not stripped.startswith("#"):
                     yield number, stripped
     except FileNotFoundError:
         raise TrajectoryError(f"{path} does not exist") from None
-    except (OSError, EOFError, UnicodeDecodeError) as error:
+    except (OSError, EOFError, UnicodeDecodeError, zlib.error) as error:
         raise TrajectoryError(f"{path} cannot be read as text: {error}") from error
 
 

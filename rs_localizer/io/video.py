@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import mmap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -11,16 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.io.images import decode
+from rs_localizer.io.messages import MessageError
+
 Image = NDArray[np.uint8]
 
 _JPEG_START = b"\xff\xd8"
 # Markers that stand alone; all others are followed by their length.
 _START, _END, _SCAN = 0xD8, 0xD9, 0xDA
-_LONELY = {0x01, _START, *range(0xD0, 0xD8)}
+_LONELY = {0x01, *range(0xD0, 0xD8)}
 # For videos that are not JPEG already; artefacts stay below the noise of a corner.
 _QUALITY = 95
-# Raw rows: a camera's note that the picture should be shown upright turns the shutter, too.
-_AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 class VideoError(ValueError):
@@ -58,10 +61,10 @@ def read_video(path: Path | str) -> Iterator[VideoImage]:
 
 
 def _from_stream(path: Path) -> Iterator[VideoImage]:
-    for jpeg in split_jpegs(path.read_bytes()):
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_IT_IS)
-        if image is not None:
-            yield VideoImage(jpeg, np.asarray(image, np.uint8), None)
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for jpeg in split_jpegs(data):
+            with contextlib.suppress(MessageError):
+                yield VideoImage(jpeg, decode(jpeg, "jpeg"), None)
 
 
 def has_times(path: Path | str) -> bool:
@@ -77,7 +80,8 @@ def has_times(path: Path | str) -> bool:
 def _from_container(path: Path) -> Iterator[VideoImage]:
     last = -1.0
     video = cv2.VideoCapture(str(path))
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as with _AS_IT_IS
+    # Raw rows: a note that the picture should be shown upright turns the shutter, too.
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     try:
         while True:
             read, color = video.read()
@@ -95,42 +99,43 @@ def _from_container(path: Path) -> Iterator[VideoImage]:
         video.release()
 
 
-def split_jpegs(data: bytes) -> Iterator[bytes]:
+def split_jpegs(data: bytes | mmap.mmap) -> Iterator[bytes]:
     """The whole images of a stream of JPEGs; one that breaks off is left out.
 
     Segments are walked by their lengths: an embedded thumbnail has a start and an end of its own.
     """
     start = data.find(_JPEG_START)
     while start >= 0:
-        end = _jpeg_end(data, start)
-        if end is not None:
+        is_whole, end = _walk_jpeg(data, start)
+        if is_whole:
             yield data[start:end]
-        start = data.find(_JPEG_START, start + 2 if end is None else end)
+        start = data.find(_JPEG_START, max(start + 2, end))
 
 
-def _jpeg_end(data: bytes, start: int) -> int | None:
-    """Where the image that starts here ends; None: it breaks off or is none."""
-    at = start
-    while at + 1 < len(data):
-        if data[at] != 0xFF:
-            return None
+def _walk_jpeg(data: bytes | mmap.mmap, start: int) -> tuple[bool, int]:
+    """Whether the image that starts here has an end, and where that is, or where it breaks off."""
+    at = start + 2
+    while at + 1 < len(data) and data[at] == 0xFF:
         marker = data[at + 1]
         if marker == _END:
-            return at + 2
+            return True, at + 2
+        if marker == _START:  # the next one
+            break
         if marker == 0xFF:  # padding
             at += 1
         elif marker in _LONELY:
             at += 2
         elif at + 4 > len(data):
-            return None
+            break
         else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-            if marker == _SCAN:
-                at = _scan_end(data, at)
-    return None
+            end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+            if end > len(data):
+                break
+            at = _scan_end(data, end) if marker == _SCAN else end
+    return False, at
 
 
-def _scan_end(data: bytes, at: int) -> int:
+def _scan_end(data: bytes | mmap.mmap, at: int) -> int:
     """The next marker after compressed data, in which 0xFF is followed by 0 or a restart."""
     while True:
         at = data.find(b"\xff", at)

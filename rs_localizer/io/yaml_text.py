@@ -10,10 +10,34 @@ import yaml
 # for a thousand million values, or for endlessly many.
 _MOST_VALUES = 100_000
 _DEEPEST = 50
+# Of numbers; those of base 60 ("1:0:0 ...", YAML 1.1) take time that grows with its square.
+_LONGEST_NUMBER = 100
+# PyYAML reads half a megabyte a second.
+_MOST_CHARACTERS = 4_000_000
 
 
 class YamlError(ValueError):
     """Text that is no YAML, or more than anybody writes."""
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's, with limits on what takes much more time or memory than its text does."""
+
+    merged = 0
+
+    def flatten_mapping(self, node: Any) -> None:
+        """Put what ``<<`` names into a mapping: copies, of copies where these merge, too."""
+        super().flatten_mapping(node)
+        if node.tag == "tag:yaml.org,2002:map":
+            self.merged += len(node.value)
+            if self.merged > _MOST_VALUES:
+                raise YamlError(f"it holds more than {_MOST_VALUES} values")
+
+    def construct_scalar(self, node: Any) -> Any:
+        is_number = node.tag.rpartition(":")[2] in ("int", "float", "timestamp")
+        if is_number and len(str(node.value)) > _LONGEST_NUMBER:
+            raise YamlError(f"it holds a number of {len(node.value)} characters")
+        return super().construct_scalar(node)
 
 
 def load_yaml(text: str) -> Any:
@@ -22,10 +46,14 @@ def load_yaml(text: str) -> Any:
     Raises:
         YamlError: for anything else, saying what was found.
     """
+    if len(text) > _MOST_CHARACTERS:
+        raise YamlError(f"it has {len(text)} characters, more than {_MOST_CHARACTERS}")
     try:
-        tree = yaml.safe_load(text)
+        tree = yaml.load(text, _Loader)
     except RecursionError:
         raise YamlError(f"it nests deeper than {_DEEPEST}") from None
+    except YamlError:
+        raise
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # dates and numbers that are none
         raise YamlError(" ".join(str(error).split())) from error
     check_tree(tree)

@@ -7,6 +7,7 @@ recording gives the same poses live and offline.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.inertial.buffer import Lack, Lacking, ReadingBuffer
+from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, Lack, Lacking, ReadingBuffer
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
@@ -37,6 +38,13 @@ _BUNDLE = 0.05
 # Frames over which the share is told, and in a row before the log is told: at the beginning some
 # are without, and now and then a message is lost.
 _MANY, _LONG = 100, 5
+# Frames whose accelerometer readings average a hand's accelerations out of gravity.
+_SOME = 30
+# Of the last readings, changes of the frame_id that are no restart of a driver.
+_ALTERNATES = 4
+
+# Hz: at less, a shaking of 30 Hz turns by half a cycle between two readings.
+_LEAST_RATE = 1e9 / LONGEST_PERIOD_NS
 
 _OF_LACK = {
     Lack.NEVER: ImuReason.NEVER,
@@ -79,10 +87,14 @@ class ImuState:
     used: int  # of them
     share: float  # of the last of them
     unused: Unused | None  # of the last frame; None: it was used
+    mostly: Unused | None  # most frequent of the last frames; None: it was used in all
     reasons: dict[str, int]  # of the others, how many for which
     rate: float  # Hz; NaN: unknown
     time_offset: float  # s to be added to its stamps, in all; NaN: unknown
     status: InertialStatus | None  # what the frames say of the gyroscope
+    # rad, between gravity as the accelerometer shows it and gravity_in_map; NaN: not known yet;
+    # None: imu.gravity is off
+    gravity: float | None = None
 
 
 class ImuInput:
@@ -96,7 +108,11 @@ class ImuInput:
     def __init__(self, notice: Notify) -> None:
         self._notice = notice
         self._buffer = ReadingBuffer()
-        self._recently: deque[bool] = deque(maxlen=_MANY)
+        self._recently: deque[Unused | None] = deque(maxlen=_MANY)
+        self._frames_of: deque[str] = deque(maxlen=_MANY)  # the last readings' axes
+        self._force_in_map = np.zeros(3)  # mean of the last frames
+        self._with_force = 0  # how many
+        self._gravity: float | None = None
         self._frames = self._used = 0
         self._unused: Unused | None = None
         self._reasons: Counter[str] = Counter()
@@ -107,6 +123,7 @@ class ImuInput:
 
     def add(self, reading: ImuReading) -> None:
         """Take a reading."""
+        self._frames_of.append(reading.frame)
         self._buffer.add(
             reading.stamp_ns, reading.frame, reading.angular_velocity, reading.linear_acceleration
         )
@@ -123,15 +140,19 @@ class ImuInput:
         if not recently:
             return None
         left = math.nan if self._status is None else self._status.time_offset
+        reasons = [unused.reason for unused in recently if unused is not None]
+        usual = max(reasons, key=reasons.count, default=None)
         return ImuState(
             self._frames,
             self._used,
-            sum(recently) / len(recently),
+            recently.count(None) / len(recently),
             self._unused,
+            next((u for u in reversed(recently) if u is not None and u.reason == usual), None),
             dict(self._reasons),
             self._buffer.rate(),
             self._given_offset + left,
             self._status,
+            self._gravity,
         )
 
     def awaits(self, tracker: Follower, config: NodeConfig, time_ns: int, patience: float) -> bool:
@@ -170,7 +191,25 @@ class ImuInput:
         else:
             result = tracker.localize(time_ns, *given, imu=found)
             self._count(config, tracker, _why(tracker.inertial))
+            self._compare_gravity(config, found, result)
         return result
+
+    def _compare_gravity(
+        self, config: NodeConfig, samples: ImuSamples, result: Estimate | Failure
+    ) -> None:
+        """How far the accelerometer's gravity is from gravity_in_map, if that is used."""
+        if not config.imu.gravity:
+            self._gravity, self._with_force = None, 0
+            return
+        if result and samples.specific_force is not None:
+            force = result.rotation.T @ samples.specific_force.mean(axis=0)
+            self._with_force = min(self._with_force + 1, _MANY)
+            self._force_in_map += (force - self._force_in_map) / self._with_force
+        self._gravity = math.nan
+        if self._with_force >= _SOME:
+            up, down = self._force_in_map, np.asarray(config.gravity_in_map, float)
+            cosine = -(up @ down) / max(float(np.linalg.norm(up) * np.linalg.norm(down)), 1e-12)
+            self._gravity = math.acos(min(max(cosine, -1.0), 1.0))
 
     def without_tracker(self, config: NodeConfig) -> None:
         """Count a frame that no gyroscope could help."""
@@ -190,9 +229,14 @@ class ImuInput:
         camera_frame: str,
         transforms: Transforms,
     ) -> ImuSamples | Unused:
+        if (two := self._two_frames()) is not None:
+            return two
         start_ns, end_ns = _exposure(config, time_ns, tracker)
         found = self._buffer.between(start_ns, end_ns, start_ns - _BEFORE_NS, end_ns + _AROUND_NS)
         if isinstance(found, Lacking):
+            slow = found.lack is Lack.NOT_YET and self._buffer.rate() < _LEAST_RATE
+            if slow:  # which is why they are late, and what is to be said of them
+                return Unused(ImuReason.TOO_SLOW, f"{self._buffer.rate():.0f} Hz")
             return Unused(_OF_LACK[found.lack], found.detail)
         half_ns = round(0.5e9 * config.readout_time)
         times_ns = found.stamps_ns + round(1e9 * config.imu.time_offset)
@@ -203,10 +247,17 @@ class ImuInput:
             text = f"from the IMU {self.frame!r} to the camera {camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
 
+    def _two_frames(self) -> Unused | None:
+        """Whether the readings have two frames of axes in turns, each of which ends the other."""
+        of = list(self._frames_of)
+        if sum(a != b for a, b in itertools.pairwise(of)) < _ALTERNATES:
+            return None
+        return Unused(ImuReason.TWO_FRAMES, " and ".join(repr(name) for name in sorted(set(of))))
+
     def _count(self, config: NodeConfig, tracker: Follower | None, unused: Unused | None) -> None:
         self._frames += 1
         self._used += unused is None
-        self._recently.append(unused is None)
+        self._recently.append(unused)
         self._unused = unused
         self._status = None if tracker is None else tracker.inertial
         self._given_offset = config.imu.time_offset

@@ -69,7 +69,6 @@ def _pixels(cloud: Correspondences, camera: Camera) -> str:
 def lens_is_off(lens: LensError) -> str:
     """What to say of a calibration that lacks distortion."""
     return (
-        f"the calibration looks off: residuals form a smooth field over the image, as of a lens "
-        f"that moves points by up to {lens.pixels:.1f} px; poses are found with the distortion "
-        "that it lacks; calibrate again"
+        f"residuals vary smoothly over the image (up to {lens.pixels:.1f} px): recalibrate the "
+        "lens; until then poses allow for it"
     )

@@ -135,6 +135,10 @@ IMU_REASONS: dict[str, Meaning] = {
     ImuReason.SATURATED: Meaning(
         "the camera turns faster than the gyroscope can tell", "a larger range of the gyroscope"
     ),
+    ImuReason.TWO_FRAMES: Meaning(
+        "messages on imu come with two frame_ids in turns",
+        "two IMUs, or two drivers, publish on one topic: remap one of them",
+    ),
     ImuReason.NO_TRANSFORM: Meaning(
         "TF does not say how the IMU is turned against the camera",
         "publish, or record, their transform on /tf_static; ROS needs tf2_ros for it",

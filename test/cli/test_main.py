@@ -108,6 +108,21 @@ def test_faults_are_one_line_and_an_exit_code(
     assert capsys.readouterr().err.endswith(text)
 
 
+def test_names_cannot_steer_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(arguments: argparse.Namespace) -> None:
+        sys.stdout.write("frame \x1b]0;title\x07 \x9b2J\n\tä\n")
+        raise ValueError("no topic \x1b[2J")
+
+    command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
+    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
+    assert main(["replay"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "frame \\x1b]0;title\\x07 \\x9b2J\n\tä\n"
+    assert captured.err == "rs_localizer replay: no topic \\x1b[2J\n"
+
+
 def test_a_fault_in_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(arguments: argparse.Namespace) -> None:
         raise TypeError("a bug")

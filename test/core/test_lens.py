@@ -89,3 +89,19 @@ def test_of_a_region_aside_of_the_axis_the_farthest_corner_counts():
     moved = np.hypot(*(lacks.mended(aside).distort(rays)[0] - corners).T)
     assert lacks.pixels == pytest.approx(moved.max())
     assert corner_of(whole) == pytest.approx(400.0 / 420.0)
+
+
+def test_what_a_wrong_focal_length_moves_is_said() -> None:
+    # It was 0.0 px: only the radial part counted. At the corner 3 % are 0.03 times its distance.
+    given = Camera(640, 480, np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]]))
+    corner = given.focal_length * corner_of(given)
+    for mean in (
+        [0.0, 0.0, 0.0, 0.0, 0.03, 0.03, 0.0, 0.0],
+        [0.01, -0.02, 0.003, -0.002, 0.01, 0.02, 0.004, 0.003],
+    ):
+        lens = LensError(np.array(mean), np.eye(8), corner)
+        turn = np.linspace(0.0, 2.0 * np.pi, 200)
+        rim = corner_of(given) * np.column_stack([np.cos(turn), np.sin(turn)])
+        rays = np.concatenate([share * rim for share in np.linspace(0.0, 1.0, 50)])
+        moved = lens.mended(given).distort(rays)[0] - given.distort(rays)[0]
+        assert lens.pixels == pytest.approx(np.linalg.norm(moved, axis=1).max(), rel=0.02)

@@ -11,6 +11,11 @@ from rs_localizer.io.yaml_text import YamlError, load_yaml
 # Nine lines for 9^9 values.
 LAUGHS = "\n".join(f"k{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(9))
 
+# Each merges the one before it twice.
+MERGES = "k0: &a0 {x: 1}\n" + "".join(
+    f"k{n}: &a{n} {{<<: [*a{n - 1}, *a{n - 1}]}}\n" for n in range(1, 40)
+)
+
 
 def test_what_people_write() -> None:
     assert load_yaml("a: &x {b: 1}\nc: *x\nd: [1, 2.5, yes, text]\n") == {
@@ -28,7 +33,10 @@ def test_what_people_write() -> None:
         ("[" * 5000, "nests deeper than 50|expected"),
         (LAUGHS, "more than 100000 values"),
         ("2026-99-99", "month must be in 1..12"),
-        ("9" * 5000, "limit"),
+        ("9" * 5000, "a number of 5000 characters"),
+        (":".join(["1"] * 200_000), "a number of 399999 characters"),
+        (MERGES, "more than 100000 values"),
+        ("a" * 5_000_000, "5000000 characters"),
         ("!!python/object/apply:os.system [ls]", "could not determine a constructor"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import re
 from collections import Counter
@@ -253,6 +254,37 @@ def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight: Flight) -> 
     angle = re.search(r"by (\d+) degrees", str(flown.state.unused))
     assert angle is not None
     assert 175 <= int(angle[1]) <= 180
+
+
+def alternating() -> Change:
+    names = itertools.cycle(("imu_a", "imu_b"))
+
+    def change(message: Any, time: float) -> Iterable[Any]:
+        result = copy.deepcopy(message)
+        result.header.frame_id = next(names)
+        return (result,)
+
+    return change
+
+
+def test_two_frame_ids_in_turns_are_named(flight: Flight) -> None:
+    flown = fly(flight, alternating())
+    flown.assert_none_is_lost_or_wrong(count(flight))
+    assert flown.state is not None
+    assert flown.state.mostly is not None
+    assert flown.state.mostly.reason == ImuReason.TWO_FRAMES
+    assert "'imu_a' and 'imu_b'" in str(flown.state.mostly)
+
+
+@pytest.mark.parametrize(("down", "degrees"), [((0.0, 0.0, -1.0), 0.0), ((0.0, 1.0, 0.0), 90.0)])
+def test_gravity_is_compared_with_the_map(
+    flight: Flight, down: tuple[float, ...], degrees: float
+) -> None:
+    imu = Imu(gravity=True)
+    flown = fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down))
+    assert flown.state is not None
+    assert flown.state.gravity is not None
+    assert math.degrees(flown.state.gravity) == pytest.approx(degrees, abs=5.0)
 
 
 def test_no_covariance_is_no_fault(flight: Flight) -> None:

@@ -65,5 +65,5 @@ def test_pixels_of_another_resolution() -> None:
 
 def test_a_lens_that_is_off_is_said_in_pixels() -> None:
     text = lens_is_off(LensError(np.array([-0.02, 0.0]), np.eye(2), 400.0))
-    assert "calibration looks off" in text
+    assert "recalibrate the lens" in text
     assert "up to 8.0 px" in text

@@ -48,6 +48,8 @@ def choose(cameras: Mapping[str, T], name: str | None) -> T:
     """
     if name is None and len(cameras) == 1:
         return next(iter(cameras.values()))
+    if not cameras:
+        raise ValueError("it has no camera")
     if name is None or name not in cameras:
         known = ", ".join(cameras)
         raise ValueError(
@@ -61,9 +63,11 @@ def _load_xml(text: str) -> Any:
         raise YamlError("the XML defines entities")
     try:
         root = ElementTree.fromstring(text)
+        return {item.tag: _value(item) for item in root}
+    except RecursionError:
+        raise YamlError("the XML nests too deep") from None
     except (ElementTree.ParseError, ValueError) as error:
         raise YamlError(f"the XML cannot be read: {error}") from error
-    return {item.tag: _value(item) for item in root}
 
 
 def _value(item: ElementTree.Element) -> Any:

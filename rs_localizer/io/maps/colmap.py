@@ -7,6 +7,7 @@ others.
 from __future__ import annotations
 
 import sqlite3
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -21,6 +22,10 @@ DATABASE = "database.db"
 _MOST_OBSERVATIONS = 32
 _SIFT_WIDTH = 128
 _WIDEST = 4096
+# Of an image: 8192 features of COLMAP take 1 MB, 65,536 of the widest 256 MB.
+_MOST_BYTES = 2**28
+_PATIENCE = 60.0  # s, for a database of ten thousand images
+_IS_TABLE = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name='descriptors'"
 # Extractors of COLMAP 3.12 and later; before, there was no such column.
 _UNDEFINED, _SIFT = -1, 0
 
@@ -69,8 +74,7 @@ def _find_database(places: tuple[Path, ...]) -> Path | None:
 def _has_descriptors(path: Path) -> bool:
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as tables:
-            query = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name='descriptors'"
-            return bool(tables.execute(query).fetchone()[0])
+            return bool(tables.execute(_IS_TABLE).fetchone()[0])
     except sqlite3.Error:
         return False
 
@@ -120,6 +124,12 @@ def _observed(
     try:
         with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as tables:
             tables.text_factory = bytes  # of a damaged one, text may be none
+            tables.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
+            deadline = time.monotonic() + _PATIENCE
+            # A view, or a computed column, may stand for any amount of work.
+            tables.set_progress_handler(lambda: int(time.monotonic() > deadline), 10_000)
+            if not tables.execute(_IS_TABLE).fetchone()[0]:
+                raise MapError("it has no table of descriptors")
             columns = [row[1] for row in tables.execute("PRAGMA table_info(descriptors)")]
             kind = "type" if b"type" in columns else str(_SIFT)
             for image, rows in zip(images.tolist(), groups, strict=True):

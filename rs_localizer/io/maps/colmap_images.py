@@ -54,7 +54,7 @@ def _read_binary(data: bytes) -> dict[str, ModelImage]:
             (features,) = _COUNT.unpack_from(data, end + 1)
             found[data[start:end].decode("utf-8")] = ModelImage(number, features)
             position = end + 1 + _COUNT.size + features * _FEATURE_BYTES
-    except (struct.error, ValueError):  # the latter also where a name is not text
+    except (struct.error, ValueError, OverflowError):  # ValueError also where a name is no text
         position = len(data) + 1
     if position > len(data):
         raise MapError("images.bin is truncated or damaged")

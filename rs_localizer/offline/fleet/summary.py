@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 from collections.abc import Sequence
@@ -65,7 +66,7 @@ def _as_csv(rows: Sequence[Row], columns: Sequence[str]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*_FIRST, *columns, *_LAST])
-    writer.writerows(row.cells(columns) for row in rows)
+    writer.writerows(map(_plain, row.cells(columns)) for row in rows)
     return text.getvalue().encode()
 
 
@@ -79,6 +80,14 @@ def _as_markdown(command: str, rows: Sequence[Row], columns: Sequence[str]) -> b
         *(f"| {' | '.join(map(_escaped, row.cells(columns)))} |" for row in rows),
     ]
     return ("\n".join(lines) + "\n").encode()
+
+
+def _plain(cell: str) -> str:
+    """Text that a spreadsheet does not take for a formula."""
+    with contextlib.suppress(ValueError):
+        float(cell)
+        return cell
+    return f"'{cell}" if cell.startswith(("=", "+", "-", "@", "\t", "\r")) else cell
 
 
 def _escaped(cell: str) -> str:

@@ -27,7 +27,9 @@ from rs_localizer.ros.node.statistics import WINDOW
 from rs_localizer.settings import NODE_NAME
 
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
-_ODD = ("map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "lens")
+_ODD = (
+    "map_is_camera", "coarse_coordinates", "pixels_outside", "camera_changed", "lens", "bad_imu",
+)  # fmt: skip
 
 
 class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):

@@ -19,6 +19,7 @@ from benchmarks.frames.conditions import (
     Condition,
     Points,
     conditions,
+    named,
     turning,
 )
 from benchmarks.frames.generated import generate
@@ -150,13 +151,19 @@ def test_the_gyroscope_says_how_the_camera_turns() -> None:
 
 
 def test_calibrations_are_off_as_described() -> None:
-    (centre,) = (one for one in conditions() if one.name == "centre 1px/rich/1px")
+    centre = named("camera/centre 1px/rich/1px")
     for variant in range(4):
         off = camera_of(centre, variant).K - centre.camera.matrix
         assert np.linalg.norm(off[:2, 2]) == pytest.approx(1.0)
-    (focal,) = (one for one in conditions() if one.name == "focal 0.3%/wall/1px")
+    focal = named("camera/focal 0.3%/wall/1px")
     ratios = {round(float(camera_of(focal, k).K[0, 0] / focal.camera.focal), 6) for k in range(4)}
     assert ratios == {0.997, 1.003}
+    boards = named("camera/ten boards/rich/1px")
+    for variant in range(2):
+        found = camera_of(boards, variant)
+        off = found.K - boards.camera.matrix
+        assert 1e-3 < np.abs(off).max() < 3.0  # px
+        np.testing.assert_allclose(found.D, boards.camera.distortion, atol=0.03)
 
 
 def test_settings_have_dotted_names() -> None:

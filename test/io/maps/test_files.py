@@ -193,7 +193,7 @@ FIRST_FEATURE_OF_IMAGE_2 = (
         ("UPDATE descriptors SET data = NULL", "the descriptors of image 1 are none"),
         ("UPDATE descriptors SET cols = 64, rows = 2 * rows WHERE image_id = 2", "64 x uint8"),
         ("DELETE FROM descriptors", "no descriptors of the images"),
-        ("DROP TABLE descriptors", "no such table"),
+        ("DROP TABLE descriptors", "no table of descriptors"),
         (FIRST_FEATURE_OF_IMAGE_2, "no point of the model"),
     ],
 )

@@ -284,5 +284,6 @@ def test_messages_that_no_imu_sends_are_counted(
     wrong.angular_velocity.x = 250.0
     robot.send(("/imu", 0, wrong))
     node.wait_for_log("bad_imu: angular_velocity is (250.0, 0.0, 0.0) rad/s, more than any IMU")
+    assert robot.peer.spin_until(lambda: "Odd: bad_imu" in robot.values)
     robot.play(items)
     assert robot.peer.spin_until(lambda: robot.values.get("Refused: bad_imu") == "1")

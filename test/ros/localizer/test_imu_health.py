@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,9 +15,9 @@ from rs_localizer.ros.localizer.imu_health import imu_oddity, imu_values
 STATUS = InertialStatus(
     Alone.NONE, np.radians([0.5, -0.25, 1.0]), math.radians(0.01), 0.0049, 0.0002
 )
-USED = ImuState(200, 190, 0.97, None, {"imu_gap": 10}, 400.04, -0.0051, STATUS)
+USED = ImuState(200, 190, 0.97, None, None, {"imu_gap": 10}, 400.04, -0.0051, STATUS)
 LATE = Unused(ImuReason.LATE, "the last reading is 97.5 ms older than the last row")
-UNUSED = ImuState(200, 0, 0.0, LATE, {"imu_late": 200}, math.nan, math.nan, None)
+UNUSED = ImuState(200, 0, 0.0, LATE, LATE, {"imu_late": 200}, math.nan, math.nan, None)
 
 
 def test_an_imu_in_use() -> None:
@@ -45,3 +46,18 @@ def test_an_imu_that_is_not_used() -> None:
 
 def test_without_one_nothing_is_said() -> None:
     assert imu_oddity(None) == {}
+
+
+def test_the_most_frequent_reason_is_said_and_not_the_last_one() -> None:
+    slow = Unused(ImuReason.TOO_SLOW, "a reading comes every 20.0 ms")
+    state = replace(UNUSED, mostly=slow)
+    assert imu_values(state)["IMU"] == f"not used: {slow}"
+    assert "every 20.0 ms" in imu_oddity(state)["imu"]
+
+
+def test_gravity_that_contradicts_the_map_is_a_warning() -> None:
+    assert "imu.gravity" not in imu_oddity(USED)
+    assert imu_oddity(replace(USED, gravity=math.radians(2.0))) == {}
+    state = replace(USED, gravity=math.radians(88.0))
+    assert "88 degrees off gravity_in_map" in imu_oddity(state)["imu.gravity"]
+    assert imu_values(state)["IMU gravity off gravity_in_map (deg)"] == "88.0"

@@ -1,0 +1,178 @@
+"""Small files that stand for much work or memory, or lie about it: one sentence, at once."""
+
+from __future__ import annotations
+
+import gzip
+import shutil
+import sqlite3
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from rs_localizer.io import bags
+from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
+from rs_localizer.io.calibration.files import CalibrationError, read_calibration
+from rs_localizer.io.hloc import HlocError, open_h5, read_queries
+from rs_localizer.io.maps.colmap_images import read_images
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.maps.landmarks import MapError
+from rs_localizer.io.trajectories import TrajectoryError, read_tum
+from rs_localizer.io.video import VideoError, read_video, split_jpegs
+
+COLMAP = Path(__file__).parent / "maps" / "colmap"
+IMU = "sensor_msgs/msg/Imu"
+POSE = b"1 0 0 0 0 0 0 1\n"
+
+
+@pytest.fixture(autouse=True)
+def in_time() -> Iterator[None]:
+    started = time.process_time()
+    yield
+    assert time.process_time() - started < 20.0
+
+
+def test_a_stream_of_starts_is_walked_once() -> None:
+    scan = b"\xff\xd8\xff\xda\x00\x02" + bytes(10)
+    assert list(split_jpegs(scan * 40_000)) == []
+    assert list(split_jpegs(b"\xff\xd8\xff\xe1\xff\xff" * 100_000)) == []
+
+
+def test_a_stream_of_images_that_claim_too_much(tmp_path: Path) -> None:
+    size = b"\x00\x11\x08" + struct.pack(">HH", 65000, 65000) + b"\x03" + bytes(9)
+    image = b"\xff\xd8\xff\xc0" + size + b"\xff\xda\x00\x02" + bytes(20) + b"\xff\xd9"
+    (tmp_path / "a.mjpeg").write_bytes(image * 3)
+    with pytest.raises(VideoError, match="holds no image"):
+        list(read_video(tmp_path / "a.mjpeg"))
+
+
+@pytest.mark.parametrize("text", [bytes(50_000_000), b"1" * 50_000_000, POSE + b"# " * 10**7])
+def test_packed_text(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "a.gz").write_bytes(gzip.compress(text, 1))
+    with pytest.raises(TrajectoryError, match="at most 10000 characters"):
+        read_tum(tmp_path / "a.gz")
+
+
+def test_damaged_packed_text(tmp_path: Path) -> None:
+    data = bytearray(gzip.compress(POSE * 1000))
+    data[20:40] = bytes(20)
+    (tmp_path / "a.gz").write_bytes(data)
+    with pytest.raises(TrajectoryError, match="cannot be read as text"):
+        read_tum(tmp_path / "a.gz")
+
+
+def test_deep_xml(tmp_path: Path) -> None:
+    (tmp_path / "a.xml").write_text("<a>" * 50_000 + "</a>" * 50_000)
+    with pytest.raises(CalibrationError, match="nests too deep"):
+        read_calibration(tmp_path / "a.xml")
+
+
+def test_a_view_in_the_place_of_descriptors(tmp_path: Path) -> None:
+    shutil.copytree(COLMAP / "binary", tmp_path / "model")
+    endless = (
+        "CREATE VIEW descriptors AS WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)"
+        " SELECT x AS image_id, 0 AS type, 1 AS rows, 128 AS cols, x AS data FROM n WHERE x < 0"
+    )
+    with sqlite3.connect(tmp_path / "model" / "database.db") as tables:
+        tables.execute(endless)
+    tables.close()
+    with pytest.raises(MapError, match="no table of descriptors"):
+        read_map_file(tmp_path / "model", "map")
+
+
+@pytest.mark.parametrize("features", [2**40, 2**62, 2**64 - 1])
+def test_counts_of_a_model_that_lie(tmp_path: Path, features: int) -> None:
+    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.jpg\0"
+    data = struct.pack("<Q", 2**64 - 1) + image + struct.pack("<Q", features) + image
+    (tmp_path / "images.bin").write_bytes(data)
+    with pytest.raises(MapError, match="truncated or damaged"):
+        read_images(tmp_path)
+
+
+def test_a_query_that_is_no_camera(tmp_path: Path) -> None:
+    (tmp_path / "queries.txt").write_text("image.jpg what is this\n")
+    with pytest.raises(HlocError, match="line 1: expected NAME MODEL"):
+        read_queries(tmp_path / "queries.txt")
+
+
+def test_damaged_hdf5(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for number in range(50):
+            file[f"a{number}.jpg/b.jpg/matches0"] = np.arange(9)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        data = bytearray(whole)
+        start = int(rng.integers(100, len(data) - 64))
+        data[start : start + 64] = rng.integers(0, 256, 64, np.uint8).tobytes()
+        path.write_bytes(data)
+        try:
+            with open_h5(path) as matches:
+                matches.matches(f"a{start % 50}.jpg", "b.jpg")
+        except HlocError:
+            pass
+
+
+def test_recordings_with_types_of_their_own(tmp_path: Path) -> None:
+    own = get_typestore(Stores.EMPTY)
+    own.register(get_types_from_msg("float64[] angular_velocity_covariance\n", IMU))
+    with Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/imu", IMU, typestore=own)
+        message = own.types[IMU](angular_velocity_covariance=np.zeros(2))
+        writer.write(connection, 1, own.serialize_cdr(message, IMU))
+    with (
+        open_bag(tmp_path / "bag") as bag,
+        pytest.raises(BagError, match="describes sensor_msgs/msg/Imu otherwise than ROS 2"),
+    ):
+        list(bag.messages(["/imu"]))
+
+
+@pytest.mark.parametrize(
+    ("mode", "storage"),
+    [
+        (CompressionMode.FILE, StoragePlugin.SQLITE3),
+        (CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
+        (CompressionMode.STORAGE, StoragePlugin.MCAP),
+        (CompressionMode.MESSAGE, StoragePlugin.MCAP),
+    ],
+)
+def test_packed_recordings(
+    tmp_path: Path, mode: CompressionMode, storage: StoragePlugin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bags, "_MOST_UNPACKED", 1_000_000)
+    monkeypatch.setattr(bags, "_BEST_PACKING", 50)
+    text = "std_msgs/msg/String"
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for length in (1000, 3_000_000):
+        writer = Writer(tmp_path / f"bag{length}", version=9, storage_plugin=storage)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            connection = writer.add_connection("/a", text, typestore=store)
+            message = make_message(text, data="a" * length)
+            writer.write(connection, 1, store.serialize_cdr(message, text))
+    with open_bag(tmp_path / "bag1000") as bag:
+        assert [len(message.data) for _, _, message in bag.messages(["/a"])] == [1000]
+
+    def read() -> None:
+        with open_bag(tmp_path / "bag3000000") as bag:
+            list(bag.messages(["/a"]))
+
+    with pytest.raises(BagError, match=r"stand for over|times its size"):
+        read()
+
+
+def test_metadata_that_merges_for_ever(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write("/a", make_message("std_msgs/msg/String", data="a"), 1)
+    file = tmp_path / "bag" / "metadata.yaml"
+    merges = "".join(f"k{n}: &a{n} {{<<: [*a{n - 1}, *a{n - 1}]}}\n" for n in range(1, 40))
+    file.write_text(f"{file.read_text()}\nk0: &a0 {{x: 1}}\n{merges}")
+    with pytest.raises(BagError, match="more than 100000 values"), open_bag(tmp_path / "bag"):
+        pass
