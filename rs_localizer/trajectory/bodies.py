@@ -13,9 +13,9 @@ PLACE, BODY = 3, 6
 _FLAT = 1e-6  # thickness of a plane by its size: rounding of single precision
 # Standard deviations by half the size of a print. Paper curls by one part in a hundred (2 mm of an
 # A4 sheet), in waves that are smaller the shorter they are; printers and screens stretch one
-# direction by up to half a percent more than the other.
+# direction by up to three parts in a thousand more than the other.
 _BENDS = {2: 1e-2, 3: 5e-3, 4: 2.5e-3}  # by the degree of the polynomial
-_STRETCH = 5e-3
+_STRETCH = 3e-3
 
 
 def is_flat(points: Array) -> bool:

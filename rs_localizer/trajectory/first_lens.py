@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,18 +20,31 @@ _MOST_IMAGES, _LEAST_IMAGES = 30, 4
 _LEAST_SHARE = 0.6
 # Focal lengths by image width to begin with, before scenes that are no plane.
 _FOCAL_LENGTHS = (0.35, 0.7, 1.0, 1.4)
-# Models in the order in which they are preferred, and their numbers. A later one is taken where it
-# predicts images that it has not seen better by this factor: less is what the choice of the
-# images makes.
-_MODELS = (
-    DistortionModel.PLUMB_BOB, DistortionModel.EQUIDISTANT, DistortionModel.RATIONAL_POLYNOMIAL,
-)  # fmt: skip
-_NUMBERS = {
-    DistortionModel.PLUMB_BOB: 5, DistortionModel.EQUIDISTANT: 4,
-    DistortionModel.RATIONAL_POLYNOMIAL: 8,
-}  # fmt: skip
+
+
+class _Candidate(NamedTuple):
+    model: DistortionModel
+    numbers: int  # of the distortion
+    flags: int  # of OpenCV's calibration
+
+
+# Kinds of lenses in the order in which they are preferred: a later one is taken where it predicts
+# images that it has not seen better by a tenth; less is what the choice of the images makes. Few
+# images that look alike have lenses far off that fit them, unless the centre is held.
+_CANDIDATES = (
+    _Candidate(
+        DistortionModel.PLUMB_BOB,
+        5,
+        cv2.CALIB_FIX_PRINCIPAL_POINT
+        | cv2.CALIB_FIX_ASPECT_RATIO
+        | cv2.CALIB_ZERO_TANGENT_DIST
+        | cv2.CALIB_FIX_K3,
+    ),
+    _Candidate(DistortionModel.PLUMB_BOB, 5, cv2.CALIB_FIX_K3),
+    _Candidate(DistortionModel.EQUIDISTANT, 4, 0),
+    _Candidate(DistortionModel.RATIONAL_POLYNOMIAL, 8, cv2.CALIB_RATIONAL_MODEL),
+)
 _RICHER = 0.9
-_RATIONAL = cv2.CALIB_RATIONAL_MODEL
 # OpenCV 5 has one set of flags, earlier ones had another for fisheyes.
 _FLAGS: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2
 _FISHEYE = (
@@ -58,28 +71,25 @@ def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
             f"{len(chosen)} images show enough of the map for a first calibration, at least "
             f"{_LEAST_IMAGES} are needed; give --calibration"
         )
-    lenses = {model: _calibrated(size, chosen, model) for model in _MODELS}
-    best = lenses[DistortionModel.PLUMB_BOB]
-    least = np.inf if best is None else _RICHER * _unseen_error(best, chosen)
-    for model in _MODELS[1:]:
-        other = lenses[model]
-        error = np.inf if other is None else _unseen_error(other, chosen)
+    best, least = None, np.inf
+    for candidate in _CANDIDATES:
+        lens = _calibrated(size, chosen, candidate)
+        error = np.inf if lens is None else _unseen_error(lens, chosen, candidate)
         if error < least:
-            best, least = other, _RICHER * error
+            best, least = lens, _RICHER * error
     if best is None:
         raise ValueError("no lens fits the images; show the board from several sides")
     return best
 
 
-def _unseen_error(lens: Camera, images: list[Observed]) -> float:
+def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -> float:
     """Error (px rms) of each half of the images under a lens that the other half finds near this
     one.
     """
-    model = DistortionModel(lens.distortion_model)
     halves = images[::2], images[1::2]
     squared, count = 0.0, 0
     for known, unseen in (halves, halves[::-1]):
-        camera = _calibrated(lens.size, known, model, lens.K)
+        camera = _calibrated(lens.size, known, candidate, lens.K)
         if camera is None:
             return np.inf
         for image in unseen:
@@ -127,15 +137,16 @@ def reprojection_error(camera: Camera, image: Observed) -> float:
 def _calibrated(
     size: tuple[int, int],
     images: list[Observed],
-    model: DistortionModel,
+    candidate: _Candidate,
     start: Array | None = None,
 ) -> Camera | None:
-    """The lens of this model that fits the images best, from ``start`` (3,3) or from anywhere;
+    """The lens of this kind that fits the images best, from ``start`` (3,3) or from anywhere;
     None: none does.
     """
     points = [np.asarray(image.points, np.float32)[:, None] for image in images]
     pixels = [np.asarray(image.pixels, np.float32)[:, None] for image in images]
     best: tuple[float, Any, Any] | None = None
+    model = candidate.model
     everything = np.concatenate([image.points for image in images])
     near = [] if start is None else [(start.copy(), cv2.CALIB_USE_INTRINSIC_GUESS)]
     for K, flags in near or _starts(size, everything):
@@ -147,14 +158,14 @@ def _calibrated(
                     given, seen, size, K, np.zeros(4), flags=_FISHEYE
                 )
             else:
-                flags |= cv2.CALIB_FIX_K3 if model == DistortionModel.PLUMB_BOB else _RATIONAL
+                flags |= candidate.flags
                 error, found, D, _, _ = cv2.calibrateCamera(
-                    points, pixels, size, K, np.zeros(_NUMBERS[model]), flags=flags
+                    points, pixels, size, K, np.zeros(candidate.numbers), flags=flags
                 )
         except cv2.error:
             continue
         if np.isfinite(error) and (best is None or error < best[0]):
-            best = (error, found, D.ravel()[: _NUMBERS[model]])
+            best = (error, found, D.ravel()[: candidate.numbers])
     if best is None:
         return None
     try:

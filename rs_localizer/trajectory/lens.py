@@ -18,10 +18,11 @@ _FISHEYE = (slice(0, 4), 4, slice(11, 13))
 _COEFFICIENTS = {DistortionModel.PLUMB_BOB: 5, DistortionModel.RATIONAL_POLYNOMIAL: 8}
 # What is known of a lens that nobody has calibrated, as standard deviations: focal length by the
 # first guess of it; centre by the image's width (a lens is decentred by less, a crop of the sensor
-# may be by more); focal lengths by each other (pixels are square, but for video modes by 1 %); what
-# a coefficient does at the farthest corner by half the diagonal. Distortion is a series that
+# may be by more); focal lengths by each other (pixels are square but for the rounding of scaled
+# videos; before a camera that never rolls, a board that is stretched looks the same); what a
+# coefficient does at the farthest corner by half the diagonal. Distortion is a series that
 # converges: each order does about a third of the one before, a tangential one 0.3 %.
-_FOCAL_LENGTH, _CENTRE, _ASPECT = 0.3, 0.05, 0.01
+_FOCAL_LENGTH, _CENTRE, _ASPECT = 0.3, 0.05, 0.002
 _ORDERS, _TANGENTIAL = (0.1, 0.03, 0.01, 0.003), 0.003
 _RADIAL = {
     DistortionModel.PLUMB_BOB: {0: 0, 1: 1, 4: 2},

@@ -62,7 +62,8 @@ def test_the_webcam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "beside their stamps" in said.err
     assert "times less likely" not in said.out
     assert not out.exists()
-    assert {file.name for file in plots.iterdir()} == {"readout_time.png", "residuals.png"}
+    pictures = {"readout_time.png", "residuals.png", "coverage.png"}
+    assert {file.name for file in plots.iterdir()} == pictures
     assert main([*words[:-2], "--force"]) == 1
     values = load_params_file(out)
     # A third of the interval, by single poses (see ATTRIBUTION.md).
