@@ -121,7 +121,9 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     own = dict(condition.settings) | dict(settings)
     # As users are told: the final inliers may miss by twice the threshold, 3.5 deviations have to.
     own.setdefault("inlier_threshold", max(2.0, 2.0 * condition.noise))
-    config = configured(rsl.LocalizerConfig(), own, condition.calibration == EXACT)
+    # All keypoints off together are like a principal point that is off.
+    exact = condition.calibration == EXACT and not condition.points.shift
+    config = configured(rsl.LocalizerConfig(), own, exact)
     variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
     localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]
     trackers = [rsl.Tracker(one) for one in localizers] if condition.sequence.length > 1 else None

@@ -142,14 +142,12 @@ OPEN = {
         for what in ("localized", "orientation")
     ),
     "inertial.offset",
-    "inertial.planes-error",
     *(
         f"inertial.vibration-{noise}-{what}"
         for noise in ("0.3px", "1px")
         for what in ("rate", "coverage")
     ),
     *(f"inertial.few-{few}" for few in (7, 8, 12)),
-    "inertial.planes-coverage",
     "inertial.cost",
     *(
         f"inertial.minimal-{motion}-{few}-{known}"

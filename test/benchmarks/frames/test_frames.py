@@ -11,7 +11,7 @@ import pytest
 
 import rs_localizer as rsl
 from benchmarks.frames import __main__ as command
-from benchmarks.frames.compared import changes_of, read, totals
+from benchmarks.frames.compared import changes_of, changes_together, read, totals
 from benchmarks.frames.conditions import (
     BENCHES,
     HAND,
@@ -89,6 +89,17 @@ def test_refusals_count_and_frames_of_a_recording_are_one() -> None:
     one[:, 0] = 0.0
     assert changes_of(Judged(one, every.reasons), Judged(one, fewer.reasons))["localized"].sign == 0
     assert totals({"a/x": every, "b/y": fewer})["all"]["localized"] == 90.0
+
+
+def test_small_changes_are_certain_of_many_conditions_together() -> None:
+    before = {f"a/{k}": judged(40, seed=k) for k in range(30)}
+    after = {f"a/{k}": judged(40, wider=0.8, farther=1.05, seed=k) for k in range(30)}
+    changes = {name: changes_of(before[name], after[name]) for name in before}
+    together = changes_together(before, after, changes)
+    assert together["pose@m"].sign == -1
+    assert together["localized"].sign == 0
+    assert together["deg"].after == pytest.approx(1.05)
+    assert together["deg"].sign == -1
 
 
 def test_conditions_have_names_of_their_own_and_every_bench_some() -> None:
