@@ -23,7 +23,7 @@ from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.sight import Sight
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
-from rs_localizer.inertial.watch import MOST_SURPRISE, Believed, GyroscopeWatch, surprise
+from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
 
 # Of a step: what a gyroscope contradicts.
 _SEEN = np.r_[TURN, ANGULAR]
@@ -33,9 +33,6 @@ _FIRST = np.arange(3)
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
 # Deviations of an offset that was found at once, as the filter takes them.
 _WIDER = 3.0
-# What frames change in their predictions is 1 in the mean, by variances and numbers. Of the last
-# frames, about so many, it is more than this once in a million when the covariances hold.
-_REMEMBERED, _MOST_MEAN = 5, 3.0
 
 Found = tuple[Estimate | Failure, Prior | None]
 
@@ -84,7 +81,6 @@ class GyroscopeAid:
         self._status: InertialStatus | None = None  # until it is asked for
         self._search = OffsetSearch() if settings.estimate_time_offset else None
         self._shaken = False  # in this frame, by the gyroscope
-        self._mean = 1.0  # of the surprises of the last frames
 
     def warm_up(self) -> None:
         """Compile every kernel that frames may need, or load it from the cache."""
@@ -98,7 +94,7 @@ class GyroscopeAid:
         span_of(times, 0, 1)
         warm_up()
         within.known.at(0.0)
-        surprise(np.zeros(3), np.eye(3), _FIRST)
+        contradicts(np.zeros(3), np.eye(3), _FIRST)
         still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
         identity = np.eye(PARAMETERS)
         predicted = filter_.predict(still, identity, between, within, 1.0, 1.0)
@@ -117,7 +113,7 @@ class GyroscopeAid:
         self._status = None
         self.filter.reset()
         self._watch.reset()
-        self._last_ns, self._mean = None, 1.0
+        self._last_ns = None
         self._search = OffsetSearch() if self._settings.estimate_time_offset else None
 
     @property
@@ -168,12 +164,8 @@ class GyroscopeAid:
             return alone
         found = localized(foreseen)
         step = _step(foreseen, found[0])
-        squared, numbers = (np.inf, 1) if step is None else _surprise(foreseen, step)
-        if step is not None and squared <= MOST_SURPRISE and not self.filter.strange:
+        if step is not None and not (_contradicts(foreseen, step) or self.filter.strange):
             self._learn(foreseen, found[0], step)
-            self._mean += (squared / numbers - self._mean) / _REMEMBERED
-            if self._mean > _MOST_MEAN:
-                self._doubt()
             return found
         alone = localized(None)
         better = _better(found[0], alone[0])
@@ -234,19 +226,19 @@ class GyroscopeAid:
         self._state = Alone.NONE
         self._watch.judge(False, None)
         posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
+        possible = True
         if foreseen.predicted is not None:
-            self.filter.update(foreseen.predicted, step, posterior)
+            possible = self.filter.update(foreseen.predicted, step, posterior)
         else:
             self.filter.begin(foreseen.within, step[RATE], posterior)
         (delay, variance), unit = found.delay, self._readout_time
-        if not self.filter.hear_delay(unit * delay, unit**2 * variance):
+        if not (self.filter.hear_delay(unit * delay, unit**2 * variance) and possible):
             self._doubt()
 
     def _doubt(self) -> None:
         """Take the time offset for less well known, and look for it again: of all that a gyroscope
         is off by, only its stamps change at once, with the clock of one of the two.
         """
-        self._mean = 1.0
         if self._settings.estimate_time_offset:
             self.filter.doubt_offset()
             self._search = self._search or OffsetSearch(self.filter.errors.time_offset)
@@ -299,8 +291,7 @@ def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
     return step_between(state_in(foreseen.predicted.motion, origin), state_in(motion, origin))
 
 
-def _surprise(foreseen: Foreseen, step: Array) -> tuple[float, int]:
-    """Squared length of a step in deviations of what was foreseen, and of how many numbers."""
+def _contradicts(foreseen: Foreseen, step: Array) -> bool:
     if foreseen.predicted is None:
-        return surprise(step[ANGULAR], foreseen.turn.error, _FIRST), len(_FIRST)
-    return surprise(step, foreseen.predicted.covariance, _SEEN), len(_SEEN)
+        return contradicts(step[ANGULAR], foreseen.turn.error, _FIRST)
+    return contradicts(step, foreseen.predicted.covariance, _SEEN)

@@ -48,6 +48,9 @@ RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 _FAR = 4.0
 # What the rows say of the time offset is not believed beyond chance (squared, in variances).
 _MOST_DELAY = 16.0
+# Nor is the offset that the motion says, when it moves by so much (squared) more than the frame's
+# information lets it.
+_MOST_MOVED, _ROUNDING = 16.0, 1e-12  # s^2
 # A doubt makes the variance of the time offset so many times as large: one by chance costs little,
 # four in a row make of a tenth of a millisecond all that is assumed of an IMU nobody knows.
 _DOUBT = 16.0
@@ -136,15 +139,18 @@ class GyroscopeFilter:
         )  # fmt: skip
         return Predicted(motion_of(later), predicted, with_parameters)
 
-    def update(self, predicted: Predicted, step: Array, posterior: Array) -> None:
+    def update(self, predicted: Predicted, step: Array, posterior: Array) -> bool:
         """Take in a frame that was found near its prediction.
 
         Args:
             step: (18,) from the prediction to the estimate.
             posterior: (18,18) covariance of the estimate.
+
+        Returns:
+            Whether the time offset that it says can be, by the one that is known.
         """
-        everything = np.arange(PARAMETERS)
-        self._update(everything, predicted.covariance, predicted.with_parameters, step, posterior)
+        before, tied = predicted.covariance, predicted.with_parameters
+        return self._update(np.arange(PARAMETERS), before, tied, step, posterior)
 
     def begin(self, within: TurnWithin, left: Array, posterior: Array) -> None:
         """Take in a frame of which nothing was known but its turn.
@@ -187,7 +193,7 @@ class GyroscopeFilter:
 
     def _update(
         self, known: IntArray, before: Array, with_parameters: Array, step: Array, posterior: Array
-    ) -> None:
+    ) -> bool:
         """``known``: places of a step that the prediction ``before`` was of."""
         whole = len(known) == PARAMETERS
         after = np.ascontiguousarray(posterior if whole else posterior[np.ix_(known, known)])
@@ -201,6 +207,8 @@ class GyroscopeFilter:
         self._with_motion = np.ascontiguousarray(tied)
         bias, time_offset = errors.bias + change[BIAS], errors.time_offset + float(change[OFFSET])
         self.errors = GyroscopeErrors(bias, time_offset, covariance, errors.noise)
+        gained = errors.covariance[OFFSET, OFFSET] - covariance[OFFSET, OFFSET]
+        return bool(change[OFFSET] ** 2 <= _MOST_MOVED * max(gained, 0.0) + _ROUNDING)
 
 
 @kernel

@@ -22,7 +22,7 @@ from rs_localizer.inertial.turning import turn_between
 
 # Squared Mahalanobis length of what a frame changes in the predicted rotation and turn rate; a
 # chi-squared variable of six degrees of freedom exceeds this once in a million.
-MOST_SURPRISE = 38.0
+_MOST_SURPRISE = 38.0
 # So many of the last frames that contradict the gyroscope are no chance.
 _WATCHED, _CONTRADICTIONS = 12, 6
 # Turns of the camera that are kept to find out why, and how often that is tried (frames).
@@ -157,16 +157,16 @@ class GyroscopeWatch:
 
 
 @kernel
-def surprise(step: Array, covariance: Array, places: IntArray) -> float:
-    """Squared Mahalanobis length of what a frame moved at these places."""
+def contradicts(step: Array, covariance: Array, places: IntArray) -> bool:
+    """Whether a frame moved what stands at these places by more than its covariance allows."""
     count = len(places)
     block = np.empty((count, count))
     for i in range(count):
         for j in range(count):
             block[i, j] = covariance[places[i], places[j]]
     information = inverted(block)
-    squared = 0.0
+    distance = 0.0
     for i in range(count):
         for j in range(count):
-            squared += step[places[i]] * information[i, j] * step[places[j]]
-    return squared
+            distance += step[places[i]] * information[i, j] * step[places[j]]
+    return not distance <= _MOST_SURPRISE

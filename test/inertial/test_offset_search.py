@@ -97,17 +97,19 @@ def test_a_step_of_the_stamps_is_found(shaking):
     _, before = followed(tracker, stepped, 25)
     deviations, inside = [], []
     for frame in range(25, 70):
-        points, pixels = stepped.frames.seen(frame, 1.0)
-        found = tracker.localize(
-            stepped.frames.middle_ns(frame), points, pixels, None, stepped.around(frame)
+        middle_ns = stepped.frames.middle_ns(frame)
+        later = times_ns < middle_ns + 60_000_000  # samples come in time, with wrong stamps
+        imu = replace(
+            samples, times_ns=times_ns[later], angular_velocity=samples.angular_velocity[later]
         )
+        found = tracker.localize(middle_ns, *stepped.frames.seen(frame, 1.0), None, imu)
         deviations.append(tracker.inertial.time_offset_deviation)
         if found:
             inside.append(rate_error(stepped, frame, found) < 7.81)
     after = tracker.inertial
-    assert max(deviations[:10]) > 10.0 * before.time_offset_deviation
+    assert max(deviations[:10]) > 5.0 * before.time_offset_deviation
     assert abs(after.time_offset - before.time_offset + 0.02) < 1e-3
-    assert np.mean(inside) > 0.75
+    assert np.mean(inside[10:]) > 0.85
 
 
 def rate_error(recorded, frame, found):
