@@ -26,14 +26,12 @@ from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms.rigid import Transforms
 from rs_localizer.io.transforms.tree import TransformTree
 from rs_localizer.pipeline.imu import ImuInput
-from rs_localizer.pipeline.landmarks import Landmarks
-from rs_localizer.pipeline.maps import read_landmarks
+from rs_localizer.pipeline.input_checks import StreamResets, lens_is_off, oddities
+from rs_localizer.pipeline.landmarks import Landmarks, read_landmarks
 from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
-from rs_localizer.pipeline.oddities import lens_is_off, oddities
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
-from rs_localizer.pipeline.succession import Succession
 
 
 class FrameLocalizer:
@@ -64,7 +62,7 @@ class FrameLocalizer:
         self.imu = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
-        self._succession = Succession()
+        self._resets = StreamResets()
         self._calibration: Calibration | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
         self._given = config  # the readout time may be found on the way
@@ -107,7 +105,7 @@ class FrameLocalizer:
 
     def reset(self) -> None:
         """Forget the previous frames."""
-        self._succession.forget()
+        self._resets.forget()
         self._forget_motion()
 
     def _forget_motion(self) -> None:
@@ -264,6 +262,6 @@ class FrameLocalizer:
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""
-        for name, text in self._succession.breaks(stamp_ns, frame).items():
+        for name, text in self._resets.breaks(stamp_ns, frame).items():
             self._forget_motion()
             self._notice(name, text)

@@ -14,10 +14,9 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.clock import middle_row_ns
 from rs_localizer.pipeline.experienced import ExperiencedFrames
 from rs_localizer.pipeline.imu import inertial_settings
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.single_frames import SingleFrames
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker

@@ -19,7 +19,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
-from rs_localizer.ros.graph.watched import Status, Values, Watched, euler, line, table
+from rs_localizer.ros.graph.watch import Status, Values, Watched, euler, line, table
 
 WATCH = [sys.executable, "-m", "rs_localizer", "watch"]
 
