@@ -110,7 +110,7 @@ class FrameLocalizer:
 
     def _forget_motion(self) -> None:
         self.readout_watch.reset()
-        self._method.forget()
+        self._method.frames.reset()
 
     def warm_up(self) -> None:
         """Compile all that the present settings need, from points to messages."""
@@ -139,11 +139,8 @@ class FrameLocalizer:
         """Whether readings of the frame with this stamp are missing that may come within so many
         seconds.
         """
-        follower = self._method.follower
-        if follower is None:
-            return False
         time_ns = self._method.middle_row_ns(stamp_ns)
-        return self.imu.awaits(follower, self.config, time_ns, patience)
+        return self.imu.awaits(self._method.frames, self.config, time_ns, patience)
 
     def load_map(self) -> None:
         """Use the map of the setting ``map_file``, if there is one.
@@ -211,28 +208,17 @@ class FrameLocalizer:
             self._notice(name, text)
         cloud = self._thinned(cloud)
         given = (cloud.points, cloud.pixels, cloud.scores)
-        deviation = max(method.config.readout_time_deviation, self.readout_watch.error)
-        if method.follower is None:
-            self.imu.without_tracker(method.config)
-            still = Prior(of_rest=self.readout_watch.of_rest)
-            result = (
-                method.localizer.localize(*given, still)
-                if method.experienced is None
-                else method.experienced.localize(*given)
-            )
-        else:
-            time_ns = method.middle_row_ns(cloud.stamp_ns)
-            if method.tracker is not None:
-                method.tracker.trusts_readout_time = self.readout_watch.trusted
-                method.tracker.readout_time_deviation = deviation
-            method.follower.of_rest = self.readout_watch.of_rest
-            result = self.imu.track(
-                method.follower, method.config, time_ns, frame, self.transforms, given
-            )
         watch = self.readout_watch
-        config = watch.add(
-            method.config, method.camera, method.middle_row_ns(cloud.stamp_ns), result, cloud
+        deviation = max(method.config.readout_time_deviation, watch.error)
+        time_ns = method.middle_row_ns(cloud.stamp_ns)
+        method.frames.of_rest = watch.of_rest
+        if method.tracker is not None:
+            method.tracker.trusts_readout_time = watch.trusted
+            method.tracker.readout_time_deviation = deviation
+        result = self.imu.track(
+            method.frames, method.config, time_ns, frame, self.transforms, given
         )
+        config = watch.add(method.config, method.camera, time_ns, result, cloud)
         wrong_axis = watch.wrong_axis
         if config is not method.config:
             self._use(method.calibration, config)

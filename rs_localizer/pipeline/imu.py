@@ -158,7 +158,7 @@ class ImuInput:
 
     def awaits(self, tracker: Follower, config: NodeConfig, time_ns: int, patience: float) -> bool:
         """Whether readings of this exposure are missing that may come within so many seconds."""
-        if not self._wanted(config):
+        if not self._wanted(config) or tracker.inertial is None:
             return False
         _, end_ns = _exposure(config, time_ns, tracker)
         missing_ns = self._buffer.lag(end_ns + _AROUND_NS)
@@ -184,6 +184,11 @@ class ImuInput:
             given: points, pixels and scores, as :meth:`Tracker.localize` takes them.
         """
         if not self._wanted(config):
+            return tracker.localize(time_ns, *given)
+        if tracker.inertial is None:
+            unknown = config.readout_time == 0.0
+            reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
+            self._count(config, None, Unused(reason))
             return tracker.localize(time_ns, *given)
         found = self._samples(tracker, config, time_ns, camera_frame, transforms)
         if isinstance(found, Unused):
@@ -211,13 +216,6 @@ class ImuInput:
             up, down = self._force_in_map, np.asarray(config.gravity_in_map, float)
             cosine = -(up @ down) / max(float(np.linalg.norm(up) * np.linalg.norm(down)), 1e-12)
             self._gravity = math.acos(min(max(cosine, -1.0), 1.0))
-
-    def without_tracker(self, config: NodeConfig) -> None:
-        """Count a frame that no gyroscope could help."""
-        if self._wanted(config):
-            unknown = config.readout_time == 0.0
-            reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
-            self._count(config, None, Unused(reason))
 
     def _wanted(self, config: NodeConfig) -> bool:
         return config.imu.use != ImuUse.NONE and self.frame != ""
