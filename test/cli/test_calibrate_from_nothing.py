@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
-from rs_localizer.io.calibration.files import read_calibration
+from rs_localizer.io.calibration import read_calibration
 from rs_localizer.settings import load_params_file
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 320, 240, 290.0, (161.5, 117.0)
