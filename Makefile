@@ -1,5 +1,7 @@
 # make demo   the whole thing on the bundled recording: a table on the screen, pictures in out/
 # make test   lint, types and tests
+# make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
+# make coverage  the tests once more, and which lines they run (compiled kernels are not seen)
 # make clean  removes everything that make has made
 #
 # Both prepare a virtual environment first (once). PYTHON chooses the interpreter, VENV the place.
@@ -28,7 +30,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
 python := $(VENV)/bin/python
 
-.PHONY: demo test collect warm lint clean
+.PHONY: demo test bench coverage collect warm lint clean
 .DELETE_ON_ERROR:
 
 demo: $(ready)
@@ -40,6 +42,13 @@ demo: $(ready)
 test: $(ready)
 	@$(MAKE) --no-print-directory --jobs 2 lint warm collect
 	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 4 --dist loadfile
+
+bench: $(ready) warm
+	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile -m bench --timeout 1800
+
+coverage: $(ready) warm
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input pytest-cov
+	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile --cov rs_localizer --cov-report term:skip-covered
 
 # Leaves the tests with their assertions rewritten, which each of the processes would do.
 collect: $(ready)

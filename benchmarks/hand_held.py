@@ -14,7 +14,7 @@ from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
 from rs_localizer.simulation.imu import ImuSettings, Lever, make_imu, simulate_imu
 from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 
 _K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, _K, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), readout_time=0.02)
@@ -34,7 +34,7 @@ class HandHeld:
     def simulate(self, seed: int = 0) -> Iterator[SimulatedFrame]:
         """The frames; the camera is :data:`CAMERA`."""
         motion = _motion()
-        world = room(sampled_way(motion).positions, np.random.default_rng(0), count=_LANDMARKS)
+        world = room(sampled_states(motion).positions, np.random.default_rng(0), count=_LANDMARKS)
         settings = FrameSettings(self.points, _NOISE, self.outliers, self.rate)
         start = motion.intervals_ns[0][0]
         stamps = [start + round(k * 1e9 / self.rate) for k in range(self.frames)]

@@ -29,6 +29,6 @@ def _nodes(context: LaunchContext) -> list:
     return [
         *camera_driver(chosen),
         *views(chosen),
-        detector(FEATURES_NAME, "features_params_file", given(chosen, FeatureConfig)),
+        detector(chosen, FEATURES_NAME, "features_params_file", given(chosen, FeatureConfig)),
         localizer(chosen, [("camera_info", LaunchConfiguration("camera_info"))]),
     ]

@@ -4,11 +4,10 @@ ros2 launch rs_localizer localizer.launch.py namespace:=front params_file:=front
 ros2 launch rs_localizer localizer.launch.py readout_time:=0.02 base_frame:=base_link
 """
 
-from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchContext, LaunchDescription
-from rs_localizer.ros.launching import argument, common_arguments, localizer, views
+from rs_localizer.ros.launching import argument, common_arguments, localizer, starting, views
 
 # Input topics, which the drivers of cameras and the trackers of features name as they like.
 TOPICS = {
@@ -22,13 +21,8 @@ TOPICS = {
 
 def generate_launch_description() -> LaunchDescription:
     """A node with its settings, its namespace and the topics of its camera as arguments."""
-    return LaunchDescription(
-        [
-            *common_arguments(),
-            *(argument(name, name, f"topic: {text}") for name, text in TOPICS.items()),
-            OpaqueFunction(function=_nodes),
-        ]
-    )
+    topics = [argument(name, name, f"topic: {text}") for name, text in TOPICS.items()]
+    return LaunchDescription(starting([*common_arguments(), *topics], _nodes))
 
 
 def _nodes(context: LaunchContext) -> list:

@@ -4,8 +4,6 @@ ros2 launch rs_localizer markers.launch.py camera:=v4l2_camera marker_map:=$PWD/
     readout_time:=0.02 calibration:=file://$PWD/camera.yaml
 """
 
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from launch.substitutions import LaunchConfiguration
@@ -18,9 +16,10 @@ from rs_localizer.ros.launching import (
     from_camera,
     given,
     localizer,
+    read_params,
     views,
 )
-from rs_localizer.settings import DETECTOR_NAME, Kind, SettingsError, load_params_file, settings
+from rs_localizer.settings import DETECTOR_NAME, settings
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -32,25 +31,24 @@ def _nodes(context: LaunchContext) -> list:
     chosen = context.launch_configurations
     if not (
         chosen["marker_map"]
-        or _read(chosen["detector_params_file"], DetectorConfig).get("marker_map")
+        or read_params(chosen["detector_params_file"], DetectorConfig).get("marker_map")
     ):
         raise RuntimeError("marker_map must name a file: rs_localizer markers make writes one")
     shutter = _shutter(chosen["params_file"])
     return [
         *camera_driver(chosen),
         *views(chosen),
-        detector(DETECTOR_NAME, "detector_params_file", shutter | given(chosen, DetectorConfig)),
+        detector(
+            chosen,
+            DETECTOR_NAME,
+            "detector_params_file",
+            shutter | given(chosen, DetectorConfig),
+        ),
         localizer(chosen, [("camera_info", LaunchConfiguration("camera_info"))]),
     ]
 
 
 def _shutter(params_file: str) -> dict[str, Any]:
     """What the localizer's params file says of the shutter, for the detector's debug image."""
-    values = _read(params_file, NodeConfig)
+    values = read_params(params_file, NodeConfig)
     return {name: values[name] for name in settings(DetectorConfig) if name in values}
-
-
-def _read(params_file: str, kind: Kind) -> dict[str, Any]:
-    with suppress(SettingsError):  # of which the node will tell
-        return load_params_file(Path(params_file), kind)
-    return {}

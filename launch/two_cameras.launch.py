@@ -3,12 +3,12 @@
 ros2 launch rs_localizer two_cameras.launch.py left:=front right:=rear left_params_file:=front.yaml
 """
 
-from launch.actions import IncludeLaunchDescription
+from launch.actions import IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
-from rs_localizer.ros.launching import argument, share
+from rs_localizer.ros.launching import argument, need_files, share
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -26,6 +26,10 @@ def generate_launch_description() -> LaunchDescription:
                 f"parameters of the {camera} camera's node",
             ),
         ]
+    # Before the first node starts, the files of the second are checked, too.
+    actions.append(
+        OpaqueFunction(function=lambda context: need_files(context.launch_configurations))
+    )
     actions += [
         IncludeLaunchDescription(
             # Each its own: what has been launched is not launched again.

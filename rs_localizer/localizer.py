@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import LocalizerConfig, localizer_config
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lens import LensError, with_lens
@@ -73,8 +73,9 @@ class Localizer:
     def __init__(
         self, camera: Camera, config: LocalizerConfig | None = None, **settings: object
     ) -> None:
-        if not isinstance(camera, Camera):
-            raise ValueError(f"camera must be an rs_localizer.Camera, got {type(camera).__name__}")
+        instance("camera", camera, Camera)
+        if config is not None:
+            instance("config", config, LocalizerConfig)
         if config is not None and settings:
             raise ValueError(f"give either config or settings, got both: {', '.join(settings)}")
         self.config = config or localizer_config(settings)
@@ -161,8 +162,8 @@ class Localizer:
         turn: KnownTurn | None = None,
     ) -> Estimate | Failure:
         """As :meth:`localize`, however uncertain it is: the next frames may know better."""
-        if prior is not None and not isinstance(prior, Prior):
-            raise ValueError(f"prior must be an rs_localizer.Prior, got {type(prior).__name__}")
+        if prior is not None:
+            instance("prior", prior, Prior)
         points, pixels, scores = checked(points, pixels, scores)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import Acceleration
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
@@ -46,6 +46,8 @@ from rs_localizer.solvers.table import find_solver
 _LONGEST_GAP = 0.5
 # Frames in a row without a pose after which the track is given up.
 _MOST_FAILURES = 5
+# Frames in a row that are closer than a microsecond come in seconds or milliseconds.
+_LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
 # How fast surprises change the accelerations that are expected (exponent), and how much at most.
@@ -84,10 +86,12 @@ class Tracker:
         inertial: of the gyroscope whose samples come with the frames; None: there is none.
 
     Raises:
-        ValueError: without a readout time, or with a global-shutter solver.
+        ValueError: without a readout time, with a global-shutter solver, or with something else
+            than a localizer.
     """
 
     def __init__(self, localizer: Localizer, inertial: InertialSettings | None = None) -> None:
+        instance("localizer", localizer, Localizer)
         if not localizer.camera.readout_time > 0.0:
             raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
         if not find_solver(localizer.config.solver).rolling_shutter:
@@ -103,6 +107,7 @@ class Tracker:
         # Then, logarithm of the odds for a global shutter, beside those of any.
         self.of_rest = 0.0
         self._track: _Track | None = None
+        self._last_ns, self._too_close = 0, 0
         readout_time = localizer.camera.readout_time
         self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
         self._beside_turn = Acceleration(_NO_TURN, localizer.config.acceleration.linear)
@@ -124,6 +129,21 @@ class Tracker:
         """Whether a time follows that of the last frame with a pose."""
         track = self._track
         return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
+
+    def _check_time(self, time_ns: int) -> None:
+        """Raise ``ValueError`` for a time that cannot be in nanoseconds."""
+        if isinstance(time_ns, bool) or not isinstance(time_ns, (int, np.integer)):
+            raise ValueError(
+                f"time_ns must be a whole number of nanoseconds, got {time_ns!r} "
+                f"({type(time_ns).__name__}): round(1e9 * seconds)"
+            )
+        step, self._last_ns = time_ns - self._last_ns, time_ns
+        self._too_close = self._too_close + 1 if 0 < step < _LEAST_STEP_NS else 0
+        if self._too_close >= _MOST_TOO_CLOSE:
+            raise ValueError(
+                f"frames are {step} ns apart: time_ns is in nanoseconds, 1e9 of a second and 1e6 "
+                "of a millisecond"
+            )
 
     def prediction(self, time_ns: int) -> Prior | None:
         """What the last frames say of the motion at a time; None when there is no track."""
@@ -171,6 +191,7 @@ class Tracker:
             imu: samples from before the last frame with a pose, if there are any, until after the
                 exposure of this one; None: the camera goes alone.
         """
+        self._check_time(time_ns)
         if not self._follows(time_ns):
             self._track = None
         share = 0.0 if self._track is None else self._track.share

@@ -6,7 +6,7 @@ import pytest
 import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import three_walls
 from rs_localizer.tracking import Tracker
 
@@ -30,7 +30,7 @@ def seen(hand, stamp_ns, points):
 def frames():
     """(middle_ns, points, pixels, true rotation) along four seconds of a recorded hand."""
     hand = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
-    corners = three_walls(sampled_way(hand)).marker_map.points
+    corners = three_walls(sampled_states(hand)).marker_map.points
     first = hand.intervals_ns[0][0] + 500_000_000
     found = []
     for stamp_ns in first + np.arange(0, 4_000_000_000, 33_333_333):

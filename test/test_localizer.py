@@ -130,13 +130,6 @@ def test_p3p_is_a_global_shutter_and_knows_no_motion():
     assert rsl.Localizer(cam).localize(points, pixels).inliers.sum() > 0.95 * inliers.sum()
 
 
-def test_an_estimate_prints_in_a_line():
-    cam = camera()
-    text = repr(rsl.Localizer(cam).localize(*frame(cam, Path(2), 60, 0.5, 0.3)[:2]))
-    assert len(text) < 200
-    assert "of 60 inliers" in text
-
-
 def test_same_seed_same_bits_and_no_memory_of_earlier_frames():
     cam = camera()
     data = [frame(cam, Path(seed), 60, 0.5, 0.3, seed)[:2] for seed in (1, 2)]
@@ -184,6 +177,7 @@ def test_scores_help_when_right_and_do_not_harm_when_wrong(right):
     assert (result.inliers == inliers).mean() > 0.97
 
 
+@pytest.mark.bench
 def test_covariance_covers_the_error():
     """Mahalanobis distances against the chi-squared distribution with 12 degrees of freedom."""
     cam = camera()
@@ -316,6 +310,7 @@ def test_warming_up_compiles_all_that_a_frame_needs():
     assert [len(kernel.signatures) for kernel in kernels] == before
 
 
+@pytest.mark.bench
 def test_the_larger_of_two_moving_groups_wins():
     """Half of the points are the scene, three tenths another object, the rest is strewn."""
     cam = camera()

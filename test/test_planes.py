@@ -84,6 +84,7 @@ def test_the_best_motion_is_the_minimum_of_the_exact_problem(tilt, turn, travel)
     assert compared >= 3
 
 
+@pytest.mark.bench
 @pytest.mark.parametrize(
     ("tilt", "turn", "travel", "limit"),
     [(0, 0.0, 0.0, 0.35), (0, 6.0, 0.06, 1.2), (30, 1.5, 0.015, 1.1)],
@@ -98,6 +99,7 @@ def test_planes_are_localized_as_well_as_the_prior_allows(tilt, turn, travel, li
     assert np.median(errors) < limit
 
 
+@pytest.mark.bench
 def test_no_motion_that_keeps_pace_with_the_rows_is_published():
     """Before a small plane a camera that turns along with its rows would fit anything."""
     localizer = rsl.Localizer(CAMERA)

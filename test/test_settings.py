@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from rs_localizer.config import (
     DetectorConfig,
@@ -191,3 +192,10 @@ def test_a_misspelled_keyword_names_the_one_that_was_meant() -> None:
         localizer_config({"colour": 1})
     with pytest.raises(ValueError, match="solver must be one of p3p"):
         localizer_config({"solver": "p4p"})
+
+
+@pytest.mark.parametrize("kind", [NodeConfig, DetectorConfig, FeatureConfig])
+def test_no_default_is_dumped_with_an_exponent(kind: Any) -> None:
+    # `ros2 param dump` writes 2e-05, which `ros2 param load` takes for text.
+    for name, item in settings(kind).items():
+        assert "e-" not in yaml.safe_dump(item.default), name

@@ -290,3 +290,32 @@ def test_turn_rates_of_a_shaken_camera_are_covered():
         off = twist.angular - drone.motion(t).angular_velocity / READOUT
         lengths.append(off @ np.linalg.solve(twist.covariance[3:, 3:], off))
     assert np.mean(np.array(lengths[3:]) < 7.8) > 0.85  # 95 % of three degrees of freedom
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_times_in_other_units_are_refused(unit: float) -> None:
+    tracker = Tracker(rsl.Localizer(CAMERA))
+    points, pixels = Hand().frame(0.0, 40)
+    with pytest.raises(ValueError, match=r"a whole number of nanoseconds, got 12\.5"):
+        tracker.localize(12.5, points, pixels)
+    # Whole seconds, or milliseconds at 30 Hz.
+    first, step = round(1.7e9 * unit), max(1, round(unit / 30))
+    for frame in range(3):
+        assert tracker.localize(first + frame * step, points, pixels)
+    with pytest.raises(ValueError, match=r"frames are \d+ ns apart: time_ns is in nanoseconds"):
+        tracker.localize(first + 3 * step, points, pixels)
+
+
+def test_what_was_passed_instead_is_said() -> None:
+    localizer = rsl.Localizer(CAMERA)
+    failure = localizer.localize(np.zeros((3, 3)), np.zeros((3, 2)))
+    estimate = localizer.localize(*Hand().frame(0.0, 80))
+    for call, text in (
+        (lambda: Tracker(CAMERA), "localizer must be an rs_localizer.Localizer, got Camera"),
+        (lambda: rsl.camera_state(failure, CAMERA), r"got Failure \(too_few_points: "),
+        (lambda: rsl.camera_state(estimate, localizer), "rs_localizer.Camera, got Localizer"),
+        (lambda: rsl.rectify(CAMERA, failure, [[0.0, 0.0]]), r"Motion, got Failure \(too_few"),
+        (lambda: rsl.Localizer(CAMERA, {"seed": 1}), "rs_localizer.LocalizerConfig, got dict"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            call()

@@ -27,7 +27,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.simulation.frames import frame_stamps
 from rs_localizer.simulation.planes import TexturedPlane
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.true_motion import RecordedMotion, TrueMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, TrueMotion, sampled_states
 from rs_localizer.simulation.walls import room
 
 _READOUT_TIME, _RATE = 0.03, 30.0
@@ -72,7 +72,7 @@ def run(context: Context) -> Result:
     """The experiment."""
     count = int(np.clip(_FRAMES_PER_TRIAL * context.trials, _FEWEST, _MOST))
     motion = RecordedMotion(read_tum(context.hand_motion))
-    planes = room(sampled_way(motion)).planes
+    planes = room(sampled_states(motion)).planes
     camera = Camera(640, 480, _K, readout_time=_READOUT_TIME)
     stamps = frame_stamps(motion, camera, _RATE)[:count]
     extractors = {

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from benchmarks.frames.compared import compare
+from benchmarks.frames.compared import compare, totals, totals_line
 from benchmarks.frames.conditions import BENCHES, Condition, conditions
 from benchmarks.frames.judged import Judged, judge
 from benchmarks.frames.timed import times
@@ -105,9 +105,13 @@ def _run(options: argparse.Namespace) -> int:
             sys.stdout.flush()
         if pool:
             pool.shutdown()
+    names = [f"{one.bench}/{one.name}" for one in wanted]
+    sys.stdout.write(f"\n{totals_line('', None)}\n")
+    for bench, total in totals(dict(zip(names, judged, strict=True))).items():
+        sys.stdout.write(f"{totals_line(bench, total)}\n")
     np.savez_compressed(
         options.out.with_suffix(".npz"),
-        names=[f"{one.bench}/{one.name}" for one in wanted],
+        names=names,
         counts=[len(one.reasons) for one in judged],
         figures=np.concatenate([one.figures for one in judged]),
         reasons=np.concatenate([one.reasons for one in judged]),

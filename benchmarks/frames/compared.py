@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
+from scipy.stats import t as student
 
-from benchmarks.frames.judged import REGION, Judged, far_off, quantile, sharpness
+from benchmarks.frames.judged import FIGURES, REGION, Judged, far_off, quantile, sharpness
 from benchmarks.independent.rotations import Array
 
 BoolArray = NDArray[np.bool_]
@@ -23,6 +24,7 @@ _RESAMPLES = 1000
 # Certain and smaller than this is certain, and of no interest: share of an error.
 _WORTH_A_LINE = 0.02
 _ERRORS = {"deg@s": "deg_s", "deg": "deg", "mm": "mm", "deg/s": "deg/s", "m/s": "m/s"}
+_SHARP = ("turn_s", "turn", "way", "angular", "linear")
 _SHARES = ("localized", "pose@s", "pose@m", "twist@m", "in/ref", "not>5s")
 
 
@@ -58,7 +60,7 @@ def compare(options: argparse.Namespace) -> int:
         notable = any(change.sign for change in figures.values())
         if notable or options.all:
             sys.stdout.write(f"{name:{width}}  {_line(figures, options.all)}\n")
-    _totals(before, after, names)
+    _write_totals(before, after, changes)
     if options.plot is not None:
         _draw(changes, options.plot)
     return int(any(change.sign < 0 for each in changes.values() for change in each.values()))
@@ -175,11 +177,8 @@ def _line(figures: Mapping[str, Change], every: bool) -> str:
 def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
     """Of each bench and of all: shares of all frames (%), medians, sharpness, ms."""
     found = {}
-    benches = dict.fromkeys(name.split("/")[0] for name in judged)
-    for bench in (*benches, "all"):
-        those = [one for name, one in judged.items() if bench in ("all", name.split("/")[0])]
-        joined = Judged(np.concatenate([one.figures for one in those]),
-                        [reason for one in those for reason in one.reasons])  # fmt: skip
+    for bench, those in _by_bench(judged).items():
+        joined = _joined([judged[name] for name in those])
         row = {
             name: 100.0 * float(np.mean(hits[some])) if some.any() else np.nan
             for name, (hits, some) in _hits(joined).items()
@@ -189,21 +188,77 @@ def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
         some = joined.localized
         for name, figure in _ERRORS.items():
             row[name] = quantile(joined.of(figure)[some], 0.5)
-        for name in ("turn_s", "turn", "way", "angular", "linear"):
+        for name in _SHARP:
             row[f"s_{name}"] = sharpness(joined.of(name)[some])
         row["ms"] = float(np.mean(joined.of("ms")))
         found[bench] = row
     return found
 
 
-def _totals(before: Mapping[str, Judged], after: Mapping[str, Judged], names: list[str]) -> None:
-    both = [totals({name: table[name] for name in names}) for table in (before, after)]
-    columns = list(next(iter(both[0].values())))
-    sys.stdout.write("\n" + f"{'':15}" + "".join(f"{name:>10}" for name in columns) + "\n")
-    for bench in both[0]:
+def totals_line(label: str, row: Mapping[str, float] | None) -> str:
+    """One line of the table; without a row: the names of the columns."""
+    names = ("localized", *_SHARES[1:-1], ">5s", *_ERRORS, *(f"s_{name}" for name in _SHARP), "ms")
+    cells = (f"{name if row is None else f'{row[name]:.3g}':>10}" for name in names)
+    return f"{label:12}{''.join(cells)}"
+
+
+def changes_together(
+    before: Mapping[str, Judged],
+    after: Mapping[str, Judged],
+    changes: Mapping[str, Mapping[str, Change]],
+) -> dict[str, Change]:
+    """Of conditions together: shares of all frames, and the mean ratio of the errors."""
+    joined = [_joined([table[name] for name in changes]) for table in (before, after)]
+    hits = [_hits(one) for one in joined]
+    found = {}
+    for name in _SHARES:
+        change = _share(hits[0][name], hits[1][name], joined[0].of("recording"))
+        if change is not None:
+            found[name] = change
+    for name in _ERRORS:
+        those = [each[name] for each in changes.values() if name in each]
+        pairs = [(one.before, one.after) for one in those if one.before > 0.0 and one.after > 0.0]
+        if len(pairs) > 1:
+            logs = np.log([after / before for before, after in pairs])
+            error = float(np.std(logs, ddof=1)) / np.sqrt(len(logs))
+            wide = error * float(student.isf(0.5 * _CHANCE, len(logs) - 1))
+            low, mean, high = np.exp(np.mean(logs) + wide * np.array([-1.0, 0.0, 1.0]))
+            found[name] = Change(1.0, mean, low, high, int(high < 1.0) - int(low > 1.0))
+    return found
+
+
+def _by_bench(names: Iterable[str]) -> dict[str, list[str]]:
+    """Conditions of each bench, and all of them."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(name.split("/")[0], []).append(name)
+    return found | {"all": list(names)}
+
+
+def _joined(those: Sequence[Judged]) -> Judged:
+    """Conditions as one; a recording is one of its condition."""
+    parts, first = [], 0
+    for one in those:
+        figures = one.figures.copy()
+        figures[:, FIGURES.index("recording")] += first
+        first += int(one.of("recording").max()) + 1
+        parts.append(figures)
+    return Judged(np.concatenate(parts), [reason for one in those for reason in one.reasons])
+
+
+def _write_totals(
+    before: Mapping[str, Judged],
+    after: Mapping[str, Judged],
+    changes: Mapping[str, Mapping[str, Change]],
+) -> None:
+    """Two rows for each bench, and what is certain of all its conditions together."""
+    both = [totals({name: table[name] for name in changes}) for table in (before, after)]
+    sys.stdout.write(f"\n{totals_line('', None)}\n")
+    for bench, names in _by_bench(changes).items():
         for label, table in zip((bench, "  after"), both, strict=True):
-            cells = "".join(f"{table[bench][name]:10.3g}" for name in columns)
-            sys.stdout.write(f"{label:15}{cells}\n")
+            sys.stdout.write(f"{totals_line(label, table[bench])}\n")
+        together = changes_together(before, after, {name: changes[name] for name in names})
+        sys.stdout.write(f"{'':15}  {_line(together, False) or 'nothing certain'}\n")
 
 
 def _draw(changes: Mapping[str, Mapping[str, Change]], file: Path) -> None:

@@ -60,6 +60,7 @@ class Calibration:
     centre: float = 0.0  # px
     focal: float = 0.0  # share
     distortion: float = 0.0  # share that is missing
+    boards: int = 0  # views of a chessboard that it was found from; 0: it was not
     readout_time: float | None = None  # s; None: right
     scan: Scan | None = None
 
@@ -286,6 +287,7 @@ def _camera() -> Iterator[tuple[Any, ...]]:
         "focal 0.3%": Calibration(focal=0.003),
         "lens 10%": Calibration(distortion=0.1),
         "lens 30%": Calibration(distortion=0.3),
+        "ten boards": Calibration(boards=10),
     }
     for (error, calibration), scene, noise, tracked in product(
         errors.items(), ("rich", "wall"), (0.3, 1.0), (False, True)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
 from benchmarks.frames.conditions import Condition, Motion, Points
@@ -20,7 +21,7 @@ from benchmarks.independent.frames import (
 )
 from benchmarks.independent.motions import IntArray, Moving, States, directions
 from benchmarks.independent.rotations import Array, exponential
-from benchmarks.independent.scenes import Scene
+from benchmarks.independent.scenes import Scene, visible
 
 _MARGIN = 12.0  # px, of wrong points to the edge
 _SHIFTED = 0.6  # of the matches of a bad frame
@@ -29,6 +30,8 @@ _BODY_SHARE, _BODY_PLACE, _BODY_SPEED, _BODY_RATE = 1 / 3, 0.3, 0.5, math.radian
 _BENT_METRES = (3.0, 8.0)  # lengths of the waves of a bent map
 # A gyroscope of a phone, whose bias and time offset are known by now.
 _GYRO_HERTZ, _GYRO_NOISE, _GYRO_BIAS = 400.0, math.radians(0.01), math.radians(0.05)
+# Views of a chessboard that is shown to a camera, by whose corners it is calibrated.
+_BOARD_TILT, _CORNER_NOISE = math.radians(35.0), 0.1  # rad, px
 # Fewer recordings than this say little, however long they are.
 _FEWEST = 8
 
@@ -190,6 +193,29 @@ class _BentMap:
         waves = np.sin(places @ self._waves[recording].T + self._phase[recording])
         error: Array = waves @ self._way[recording]
         return error
+
+
+def calibrated(camera: Camera, boards: int, seed: int) -> tuple[Array, Array]:
+    """Matrix and distortion that OpenCV finds of views of a chessboard at rest."""
+    rng = np.random.default_rng(seed)
+    columns, rows = np.meshgrid(np.linspace(-0.25, 0.25, 9), np.linspace(-0.156, 0.156, 6))
+    flat = np.column_stack([columns.ravel(), rows.ravel(), np.zeros(columns.size)])
+    views: list[Array] = []
+    while len(views) < boards:
+        turned = exponential(_BOARD_TILT * rng.uniform(-1.0, 1.0, 3))
+        place = rng.uniform([-0.4, -0.3, 0.4], [0.4, 0.3, 0.9])
+        pixels = camera.project(flat @ turned.T + place)
+        if visible(camera, pixels).all():
+            views.append(pixels + _CORNER_NOISE * rng.normal(size=pixels.shape))
+    _, matrix, distortion, _, _ = cv2.calibrateCamera(
+        [flat.astype(np.float32)] * boards,
+        [one.astype(np.float32) for one in views],
+        (camera.width, camera.height),
+        camera.matrix,
+        np.zeros(5),
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3,
+    )
+    return np.array(matrix, np.float64), np.array(distortion, np.float64).ravel()
 
 
 def _state(states: States, frame: int) -> tuple[Array, ...]:

@@ -15,7 +15,7 @@ from scipy.stats import chi2, norm
 
 import rs_localizer as rsl
 from benchmarks.frames.conditions import EXACT, Condition
-from benchmarks.frames.generated import Frame, Gyroscope, generate
+from benchmarks.frames.generated import Frame, Gyroscope, calibrated, generate
 from benchmarks.independent.rotations import Array, logarithm
 from rs_localizer.pipeline.moments import pose_at, twist_at
 
@@ -121,7 +121,9 @@ def judge(condition: Condition, frames: int, seed: int, settings: Mapping[str, A
     own = dict(condition.settings) | dict(settings)
     # As users are told: the final inliers may miss by twice the threshold, 3.5 deviations have to.
     own.setdefault("inlier_threshold", max(2.0, 2.0 * condition.noise))
-    config = configured(rsl.LocalizerConfig(), own, condition.calibration == EXACT)
+    # All keypoints off together are like a principal point that is off.
+    exact = condition.calibration == EXACT and not condition.points.shift
+    config = configured(rsl.LocalizerConfig(), own, exact)
     variants = 1 if condition.calibration == EXACT else len(_DIRECTIONS)
     localizers = [rsl.Localizer(camera_of(condition, k), config) for k in range(variants)]
     trackers = [rsl.Tracker(one) for one in localizers] if condition.sequence.length > 1 else None
@@ -159,14 +161,17 @@ def camera_of(condition: Condition, variant: int) -> rsl.Camera:
     """What the user believes of the camera."""
     true, off = condition.camera, condition.calibration
     direction = _DIRECTIONS[variant]
-    matrix = true.matrix.copy()
+    if off.boards:
+        matrix, distortion = calibrated(true, off.boards, variant)
+    else:
+        matrix, distortion = true.matrix, (1.0 - off.distortion) * np.array(true.distortion)
     matrix[:2, 2] += off.centre * direction
     matrix[[0, 1], [0, 1]] *= 1.0 + off.focal * math.copysign(1.0, direction[0])
     return rsl.Camera(
         width=true.width,
         height=true.height,
         K=matrix,
-        D=(1.0 - off.distortion) * np.array(true.distortion),
+        D=distortion,
         distortion_model="plumb_bob",
         readout_time=true.readout_time if off.readout_time is None else off.readout_time,
         scan_direction=str(off.scan or true.scan),

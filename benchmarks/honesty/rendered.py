@@ -30,7 +30,7 @@ from rs_localizer.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.simulation.image_sequence import in_order
 from rs_localizer.simulation.recording import TRUE_POSE_TOPIC, TRUE_TWIST_TOPIC, write_truth
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import three_walls
 
 MOTIONS = {"tum_vi_room5": "forward_left_up", "tum_rgbd_fr1_xyz": "optical"}
@@ -87,7 +87,7 @@ def _render(trajectory: Path, axes: str, recording: Path, seconds: float) -> Non
         for stamp in frame_stamps(motion, camera, _RATE)
         if stamp < first + round(seconds * 1e9)
     ]
-    scene = three_walls(sampled_way(motion))
+    scene = three_walls(sampled_states(motion))
     assert scene.marker_map is not None
     renderer = Renderer(camera, scene.planes, _SENSOR)
     detector = MarkerDetector(scene.marker_map)

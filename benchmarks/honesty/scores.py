@@ -9,17 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
 
+from benchmarks.frames.judged import FIVE_SIGMA, REGION, normalised
 from benchmarks.independent.rotations import logarithm
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.outputs import Pose, Twist
 from rs_localizer.pipeline.moments import pose_at, twist_at
-
-REGION = float(chi2.ppf(0.95, 6))
-# As unlikely as five standard deviations are of one variable (6 in 10 million).
-FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), 6))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,21 +89,6 @@ def score_at(
 def motion_evidence(twist: Twist) -> float:
     """Squared normalised distance of the velocities from zero; 0 of a camera held to be at rest."""
     return normalised(np.concatenate([twist.linear, twist.angular]), twist.covariance)
-
-
-def normalised(error: Array, covariance: Array) -> float:
-    """Squared Mahalanobis length; infinite where a covariance denies that there is an error."""
-    if not np.any(error):
-        return 0.0
-    deviations = np.sqrt(np.diag(covariance))
-    if not np.all(deviations > 0.0):
-        return np.inf
-    try:
-        # Metres and radians differ by far: scaled, rounding does not decide.
-        factor = np.linalg.cholesky(covariance / np.outer(deviations, deviations))
-    except np.linalg.LinAlgError:
-        return np.inf
-    return float(np.sum(np.linalg.solve(factor, error / deviations) ** 2))
 
 
 def percent(hits: BoolArray) -> float:

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.experiments.uncertainty import IntArray, Interval, bootstrap
-from benchmarks.honesty.scores import REGION, motion_evidence, percent
+from benchmarks.frames.judged import REGION
+from benchmarks.honesty.scores import motion_evidence, percent
 from benchmarks.independent.rotations import logarithm
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array, BoolArray

@@ -1,1 +1,1 @@
-"""What a gyroscope beside the camera is worth: vibration, planes, few points, stamps, cost."""
+"""What a gyroscope beside the camera is worth: vibration, few points, stamps, cost."""

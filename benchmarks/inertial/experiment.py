@@ -15,21 +15,20 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, shaken_hand
 from benchmarks.independent.scenes import Rich
 from benchmarks.inertial.minimal import minimal
-from benchmarks.inertial.planes import (
+from benchmarks.inertial.recordings import (
+    follow,
+    follow_both,
+    record,
+)
+from benchmarks.inertial.single import (
     COLUMNS,
     FEW,
     US,
     Step,
     figures,
-    planes,
     right,
     single,
     who,
-)
-from benchmarks.inertial.recordings import (
-    follow,
-    follow_both,
-    record,
 )
 
 _SHAKING = ((0.3, 60.0), (0.1, 120.0))  # degrees, hertz
@@ -43,7 +42,7 @@ def run(context: Context) -> Result:
     """The experiment."""
     claims: list[Claim] = []
     tables: dict[str, Table] = {}
-    steps = [_vibration, _offsets, planes, _few_points, minimal, _cost]
+    steps = [_vibration, _offsets, _few_points, minimal, _cost]
     for step in context.track(steps, len(steps)):
         name, table, judged = step(context)
         tables[f"inertial_{name}"] = table
@@ -53,7 +52,7 @@ def run(context: Context) -> Result:
         "Frames of the simulator that shares no code with the estimator (30 Hz, 640x480, 30 ms "
         "readout) with a gyroscope of 400 Hz, 0.01 deg/s/sqrt(Hz) and a bias of 0.5 deg/s, whose "
         "bias and time offset the tracker has to find. Vibration: 0.3 deg at 60 Hz and 0.1 deg at "
-        "120 Hz on top of a hand's motion, after the first three seconds. Planes and few points: "
+        "120 Hz on top of a hand's motion, after the first three seconds. Few points: "
         "single frames, with the gyroscope less its bias, which is known to 0.05 deg/s and 50 us. "
         "Shares in %, medians of the errors.",
         claims,

@@ -22,8 +22,8 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, shaken_hand
 from benchmarks.independent.scenes import Rich
 from benchmarks.inertial.linear_solvers import linear_solver
-from benchmarks.inertial.planes import US, Step
 from benchmarks.inertial.recordings import Recorded, record, turn_of_frame
+from benchmarks.inertial.single import US, Step
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray

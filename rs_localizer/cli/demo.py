@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--solver",
-        choices=[name for name in SOLVERS if name != "p3p"],
+        choices=[name for name, row in SOLVERS.items() if row.rolling_shutter],
         default=NodeConfig().solver,
         help="solver that is compared with p3p (default: %(default)s)",
     )

@@ -33,7 +33,7 @@ from rs_localizer.simulation.landmarks import described, keypoint_rows
 from rs_localizer.simulation.recording import write_rendered, write_simulated
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
 from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.true_motion import TrueMotion, sampled_way
+from rs_localizer.simulation.true_motion import TrueMotion, sampled_states
 from rs_localizer.simulation.walls import SCENES
 
 # Options of the one kind of recording that mean nothing to the other.
@@ -149,7 +149,7 @@ def _write_points(args: argparse.Namespace) -> None:
 def _write_images(args: argparse.Namespace) -> None:
     camera, motion = camera_of(args), motion_of(args)
     stamps = stamps_of(args, camera, motion)
-    scene = SCENES[args.walls](sampled_way(motion))
+    scene = SCENES[args.walls](sampled_states(motion))
     settings = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
     renderer = Renderer(camera, scene.planes, settings)
     encoding = Encoding(args.format, round(args.quality))

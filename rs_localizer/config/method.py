@@ -135,10 +135,10 @@ def localizer_config(settings: Mapping[str, Any]) -> LocalizerConfig:
         ValueError: for a value out of range, or a name that is no setting; then with the one that
             may have been meant.
     """
-    known = [item.name for item in fields(LocalizerConfig)]
+    names = [item.name for item in fields(LocalizerConfig)]
     for name in settings:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(names)}"
             raise ValueError(f"{name!r} is not a setting of the localizer; {hint}")
     return LocalizerConfig(**settings)

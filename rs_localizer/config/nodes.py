@@ -120,7 +120,7 @@ class Imu:
         maximum=1.0,
     )
     gyroscope_bias_walk: float = setting(
-        2e-5,
+        1e-4,
         "Random walk of the gyroscope's bias, in rad/s^2/sqrt(Hz)",
         minimum=0.0,
         maximum=1.0,
@@ -188,6 +188,13 @@ class NodeConfig(LocalizerConfig):
         True,
         "Use the previous pose and twist as first guess and prior, with a rolling-shutter solver; "
         "without a readout_time only what frames say of map and lens is remembered",
+    )
+    max_points: int = setting(
+        20_000,
+        "Most points of a frame that are used: those with the best scores, or without scores "
+        "some of all parts of the image",
+        minimum=7,
+        maximum=1_000_000,
     )
     base_frame: str = setting(
         "",

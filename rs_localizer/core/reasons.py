@@ -67,6 +67,7 @@ class Notice(StrEnum):
     MAP_IS_CAMERA = "map_is_camera"
     COARSE_COORDINATES = "coarse_coordinates"
     PIXELS_OUTSIDE = "pixels_outside"
+    TOO_MANY_POINTS = "too_many_points"
     READOUT_TIME = "readout_time"
     LENS = "lens"
     # Of maps and keypoints.

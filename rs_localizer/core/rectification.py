@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
 
@@ -45,6 +45,8 @@ def rectify(
     Raises:
         ValueError: wrong shapes, depths that are not positive, or a row time that is not finite.
     """
+    instance("camera", camera, Camera)
+    instance("motion", motion, Motion)
     pixels = np.ascontiguousarray(pixels, np.float64)
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise ValueError(f"pixels must be (n,2), got {pixels.shape}")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
 
@@ -49,8 +49,10 @@ def camera_state(motion: Motion, camera: Camera, tau: float = 0.0) -> CameraStat
         tau: row time: 0 for the middle row, -0.5 for the first, 0.5 for the last.
 
     Raises:
-        ValueError: for a row time that is not finite.
+        ValueError: for a row time that is not finite, or a Failure instead of a motion.
     """
+    instance("motion", motion, Motion)
+    instance("camera", camera, Camera)
     if not np.isfinite(tau):
         raise ValueError(f"tau must be finite, got {tau!r}")
     rotation, translation = motion.at(tau)

@@ -18,44 +18,44 @@ _BINS = 16
 _DPI = 130
 
 
-def save_plots(camera: Camera, found: Calibration, directory: Path) -> None:
+def save_plots(camera: Camera, calibration: Calibration, directory: Path) -> None:
     """Write ``readout_time.png`` and ``residuals.png`` into a directory."""
     directory.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(10.0, 4.0), dpi=_DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
-    _likelihood(left, camera, found)
-    _blocks(right, found)
+    _likelihood(left, camera, calibration)
+    _blocks(right, calibration)
     figure.savefig(directory / "readout_time.png")
     figure = Figure(figsize=(10.0, 4.0), dpi=_DPI, layout="constrained")
-    _residuals(list(figure.subplots(1, 2)), camera, found)
+    _residuals(list(figure.subplots(1, 2)), camera, calibration)
     figure.savefig(directory / "residuals.png")
 
 
-def _likelihood(axes: Axes, camera: Camera, found: Calibration) -> None:
-    values, costs = likelihood(camera, found)
-    middle = found.readout_time
+def _likelihood(axes: Axes, camera: Camera, calibration: Calibration) -> None:
+    values, costs = likelihood(camera, calibration)
+    middle = calibration.readout_time
     axes.plot(1e3 * values, np.exp(-0.5 * costs), "o-", color=_BLUE, label="measured")
     fine = np.linspace(values[0], values[-1], 200)
-    bound = np.exp(-0.5 * ((fine - middle) / found.formal_deviation) ** 2)
+    bound = np.exp(-0.5 * ((fine - middle) / calibration.formal_deviation) ** 2)
     axes.plot(1e3 * fine, bound, color=_ORANGE, label="Cramér-Rao bound")
     axes.set(xlabel="readout time (ms)", ylabel="likelihood", title="All of the recording")
     axes.legend(frameon=False)
 
 
-def _blocks(axes: Axes, found: Calibration) -> None:
-    for block in found.blocks:
+def _blocks(axes: Axes, calibration: Calibration) -> None:
+    for block in calibration.blocks:
         axes.errorbar(
             0.5 * (block.start + block.end), 1e3 * block.readout_time,
             2e3 * block.deviation, 0.5 * (block.end - block.start), color=_BLUE,
         )  # fmt: skip
-    value, band = 1e3 * found.readout_time, 2e3 * found.deviation
+    value, band = 1e3 * calibration.readout_time, 2e3 * calibration.deviation
     axes.axhspan(value - band, value + band, color=_GREY, alpha=0.6)
     axes.axhline(value, color=_ORANGE)
     axes.set(xlabel="time (s)", ylabel="readout time (ms)", title="Its parts (two deviations)")
 
 
-def _residuals(pair: list[Axes], camera: Camera, found: Calibration) -> None:
-    before, after = without_readout(camera, found)
+def _residuals(pair: list[Axes], camera: Camera, calibration: Calibration) -> None:
+    before, after = without_readout(camera, calibration)
     for axes, place, label in (
         (pair[0], after.row_times, "row time"),
         (pair[1], after.speeds, "speed in the image (px/s)"),

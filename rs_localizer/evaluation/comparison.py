@@ -146,8 +146,8 @@ def compare(answers: dict[int, Answer], truth: Motions | None) -> Result:
 
 def counts_at(result: Result, stamps_ns: Sequence[int]) -> Array:
     """Inliers (n,) of the frames with these stamps; 0 where a frame was not localized."""
-    found = result.answers
-    return np.array([float(len(found[s].residuals)) if s in found else 0.0 for s in stamps_ns])
+    answers = result.answers
+    return np.array([float(len(answers[s].residuals)) if s in answers else 0.0 for s in stamps_ns])
 
 
 def true_rates(recording: Recording) -> Array:

@@ -124,16 +124,16 @@ def draw_cube(
         return  # partly behind the camera
     near = [_faces_viewer(cube.corners[face], centre) for face in _FACES]
     fixed = [np.rint(outline * 2**_SHIFT).astype(np.int32) for outline in outlines]
-    for outline, seen in zip(fixed, near, strict=True):
-        if not seen:
+    for outline, near_side in zip(fixed, near, strict=True):
+        if not near_side:
             cv2.polylines(picture, [outline], True, color, 1, cv2.LINE_AA, _SHIFT)
     filled = picture.copy()
-    for outline, seen in zip(fixed, near, strict=True):
-        if seen:
+    for outline, near_side in zip(fixed, near, strict=True):
+        if near_side:
             cv2.fillPoly(filled, [outline], color, cv2.LINE_AA, _SHIFT)
     cv2.addWeighted(filled, _OPACITY, picture, 1.0 - _OPACITY, 0.0, dst=picture)
-    for outline, seen in zip(fixed, near, strict=True):
-        if seen:
+    for outline, near_side in zip(fixed, near, strict=True):
+        if near_side:
             cv2.polylines(picture, [outline], True, color, _LINE_WIDTH, cv2.LINE_AA, _SHIFT)
 
 
@@ -203,9 +203,9 @@ def draw_clip(
     cube = clip_cube(walls)
     pictures: list[Image] = []
     errors: dict[str, list[float]] = {P3P: [], OURS: []}
-    for middle_ns, image, found in zip(middles_ns, images, motions, strict=True):
-        off = cube_errors(walls.motion, middle_ns, cube, found)
-        pictures.append(_picture(image, cube, found, off))
+    for middle_ns, image, estimates in zip(middles_ns, images, motions, strict=True):
+        off = cube_errors(walls.motion, middle_ns, cube, estimates)
+        pictures.append(_picture(image, cube, estimates, off))
         for name, value in off.items():
             errors[name].append(value)
     return Clip(gif(pictures[::_EVERY], _SHOWN_RATE), {k: np.array(v) for k, v in errors.items()})
@@ -222,11 +222,11 @@ def cube_errors(
     if not np.all(CAMERA.inside(true)):
         return {}
     errors = {}
-    for name, found in motions.items():
-        if found is None:
+    for name, estimate in motions.items():
+        if estimate is None:
             errors[name] = np.inf
         else:
-            off = np.linalg.norm(corner_pixels(CAMERA, found.at_rows, cube) - true, axis=1).max()
+            off = np.linalg.norm(corner_pixels(CAMERA, estimate.at_rows, cube) - true, axis=1).max()
             errors[name] = float(np.nan_to_num(off, nan=np.inf))
     return errors
 

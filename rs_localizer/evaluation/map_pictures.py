@@ -100,7 +100,7 @@ def _global_errors(built: Built, views: Sequence[View]) -> Array:
 def localized_picture(
     landmarks: Array, truth: Trajectory, estimates: Mapping[str, Trajectory]
 ) -> Figure:
-    """From above: landmarks (n,3), the way of the camera and what several methods say of it.
+    """From above: landmarks (n,3), the path of the camera and what several methods say of it.
 
     The first method is drawn above the others.
     """
@@ -111,12 +111,12 @@ def localized_picture(
             label="truth",
         )  # fmt: skip
         styles = (("x", ORANGE), (".", BLUE))[-len(estimates) :]
-        for (name, found), (marker, color) in zip(
+        for (name, estimate), (marker, color) in zip(
             reversed(list(estimates.items())), styles, strict=True
         ):
             axes.plot(
-                found.positions[:, 0], found.positions[:, 1], marker, markersize=4.0, color=color,
-                label=name,
+                estimate.positions[:, 0], estimate.positions[:, 1], marker, markersize=4.0,
+                color=color, label=name,
             )  # fmt: skip
         shown = truth.positions if near else np.vstack([landmarks, truth.positions])
         low, high = np.percentile(
@@ -131,7 +131,7 @@ def localized_picture(
             xlabel="x (m)", ylabel="y (m)", aspect="equal",
             xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half),
         )  # fmt: skip
-        axes.set_title("its way" if near else "the room from above")
+        axes.set_title("its path" if near else "the room from above")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
     return figure

@@ -83,11 +83,11 @@ def associate(
 def pose_errors(estimated: Trajectory, true: Trajectory, tolerance_ns: int = 0) -> Errors:
     """Distance of the positions (m) and angle between the orientations (deg)."""
     rows, true_rows = associate(estimated.stamps_ns, true.stamps_ns, tolerance_ns)
-    found, truth = estimated.part(rows), true.part(true_rows)
+    estimate, truth = estimated.part(rows), true.part(true_rows)
     return Errors(
-        found.stamps_ns,
-        np.linalg.norm(found.positions - truth.positions, axis=1),
-        angles_between(found.quaternions, truth.quaternions),
+        estimate.stamps_ns,
+        np.linalg.norm(estimate.positions - truth.positions, axis=1),
+        angles_between(estimate.quaternions, truth.quaternions),
         np.full(len(rows), np.nan),
     )
 
@@ -95,11 +95,11 @@ def pose_errors(estimated: Trajectory, true: Trajectory, tolerance_ns: int = 0) 
 def twist_errors(estimated: Twists, true: Twists, tolerance_ns: int = 0) -> Errors:
     """Length of the differences of the linear (m/s) and the angular (deg/s) velocities."""
     rows, true_rows = associate(estimated.stamps_ns, true.stamps_ns, tolerance_ns)
-    found, truth = estimated.part(rows), true.part(true_rows)
+    estimate, truth = estimated.part(rows), true.part(true_rows)
     return Errors(
-        found.stamps_ns,
-        np.linalg.norm(found.linear - truth.linear, axis=1),
-        np.degrees(np.linalg.norm(found.angular - truth.angular, axis=1)),
+        estimate.stamps_ns,
+        np.linalg.norm(estimate.linear - truth.linear, axis=1),
+        np.degrees(np.linalg.norm(estimate.angular - truth.angular, axis=1)),
         np.degrees(np.linalg.norm(truth.angular, axis=1)),
     )
 
@@ -119,7 +119,7 @@ _LEAST_SPREAD = 1e-3
 def aligned(estimate: Trajectory, truth: Trajectory) -> Trajectory:
     """The estimate in the frame of the truth: rigidly moved to fit row by row.
 
-    Positions alone (Umeyama, 1991) leave the rotation undetermined along a straight way, and
+    Positions alone (Umeyama, 1991) leave the rotation undetermined along a straight path, and
     orientations are wrong by what it takes then. Here both count, each by how well it fits:
     ``sum |R q_i p_i^-1|^2 / s_q^2 + sum |R (x_i - m_x) - (y_i - m_y)|^2 / s_x^2``, two steps.
     """
@@ -175,10 +175,10 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> TimeOffset | Non
     first, second = _signature(estimate), _signature(truth)
     if first is None or second is None:
         return None
-    found = _best_lag(first, second)
-    if found is None:
+    best = _best_lag(first, second)
+    if best is None:
         return None
-    lag, correlation = found
+    lag, correlation = best
     origin = (int(truth.stamps_ns[0]) - int(estimate.stamps_ns[0])) * 1e-9
     seconds = origin + lag * _STEP
     for _ in range(2):  # what is laid over each other at a wrong time is a bit off
@@ -304,12 +304,12 @@ def _refined(estimate: Trajectory, truth: Trajectory, seconds: float) -> float:
     scales = [max(float(np.median(part)), 1e-9) for part in middle]
 
     def cost(shift: float) -> float:
-        found = _errors(estimate, truth, seconds + shift)
-        if found is None:
+        parts = _errors(estimate, truth, seconds + shift)
+        if parts is None:
             return np.inf
         return sum(
             float(np.mean(np.minimum(part / scale, _LARGEST)))
-            for part, scale in zip(found, scales, strict=True)
+            for part, scale in zip(parts, scales, strict=True)
         )
 
     costs = [cost(shift) for shift in shifts]
@@ -317,9 +317,9 @@ def _refined(estimate: Trajectory, truth: Trajectory, seconds: float) -> float:
     if not 0 < best < _SHIFTS - 1:
         return seconds
     bounds = (float(shifts[best - 1]), float(shifts[best + 1]))
-    found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-5})
+    minimum = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 1e-5})
     # Of exact poses, the cost has a narrow dip that a search may miss.
-    return seconds + float(found.x if found.fun < costs[best] else shifts[best])
+    return seconds + float(minimum.x if minimum.fun < costs[best] else shifts[best])
 
 
 def _errors(estimate: Trajectory, truth: Trajectory, shift: float) -> tuple[Array, Array] | None:

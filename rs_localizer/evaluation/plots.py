@@ -287,9 +287,14 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
         predicted: (n,2) where each method's pose puts them.
         title: what image it is.
     """
-    longest = max(float(np.linalg.norm(pixels - seen, axis=1).max()) for seen in predicted.values())
+    longest = max(
+        float(np.linalg.norm(pixels - projections, axis=1).max())
+        for projections in predicted.values()
+    )
     magnification = _round_down(_RIM / longest) if longest > 0.0 else 1.0
-    tips = np.vstack([seen + magnification * (pixels - seen) for seen in predicted.values()])
+    tips = np.vstack(
+        [projections + magnification * (pixels - projections) for projections in predicted.values()]
+    )
     # Beyond the image only as far as arrows reach.
     corner = np.array(image.shape[::-1]) - 0.5
     low = np.minimum(np.maximum(pixels.min(axis=0) - _RIM, -0.5), tips.min(axis=0))
@@ -299,14 +304,14 @@ def residuals(image: Image, pixels: Array, predicted: Mapping[str, Array], title
     height = float(np.clip(_WIDTH / len(predicted) * tall / wide, 1.0, _WIDTH)) + _TITLES
     figure = _new_figure(f"{title}: from where the pose puts points to where they are seen", height)
     panels = figure.subplots(1, len(predicted), squeeze=False)[0]
-    for axes, (name, style), seen in zip(
+    for axes, (name, style), projections in zip(
         panels, _methods(predicted), predicted.values(), strict=True
     ):
-        offset = pixels - seen
+        offset = pixels - projections
         rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
         axes.imshow(0.55 * image + 0.45 * 255, cmap="gray", vmin=0, vmax=255)
         axes.quiver(
-            seen[:, 0], seen[:, 1], offset[:, 0], offset[:, 1], angles="xy",
+            projections[:, 0], projections[:, 1], offset[:, 0], offset[:, 1], angles="xy",
             scale_units="xy", scale=1.0 / magnification, color=style.color, width=0.005,
         )  # fmt: skip
         axes.set_title(f"{name}: residual {rms:.3f} px rms")
@@ -364,19 +369,23 @@ def residual_picture(
         if stamp not in recording.images or any(stamp not in r.answers for r in results.values()):
             continue
         camera = _camera(info, readout_time)
-        seen = read_correspondences(cloud)
+        correspondences = read_correspondences(cloud)
         predicted = {
-            name: predicted_pixels(camera, result.answers[stamp], seen.points)
+            name: predicted_pixels(camera, result.answers[stamp], correspondences.points)
             for name, result in results.items()
         }
-        worst, *others = sorted((_rms(p - seen.pixels) for p in predicted.values()), reverse=True)
+        worst, *others = sorted(
+            (_rms(p - correspondences.pixels) for p in predicted.values()), reverse=True
+        )
         difference = worst - min(others, default=0.0)
         if best is None or difference > best[0]:
             data = np.frombuffer(recording.images[stamp].data, np.uint8)
             image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
             best = (
                 difference,
-                residuals(np.asarray(image, np.uint8), seen.pixels, predicted, _RESIDUAL_TITLE),
+                residuals(
+                    np.asarray(image, np.uint8), correspondences.pixels, predicted, _RESIDUAL_TITLE
+                ),
             )
     return None if best is None else best[1]
 

@@ -31,7 +31,7 @@ from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import frame_stamps, middle_stamp
 from rs_localizer.simulation.image_sequence import in_order
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import marked_room
 
 
@@ -65,7 +65,7 @@ class Room:
     ) -> None:
         self.motion = RecordedMotion(trajectory)
         self.camera, self._most = camera, keypoints
-        scene = marked_room(sampled_way(self.motion))
+        scene = marked_room(sampled_states(self.motion))
         assert scene.marker_map is not None
         self.marker_map = scene.marker_map
         self.planes = scene.planes
@@ -106,17 +106,17 @@ class Room:
         effort: Effort | None = None,
     ) -> Built:
         """The map, with its metres from the markers."""
-        given = Given(views, self.camera, Anchors(self.marker_map))
-        return build_map(given, Workshop(folder, effort or Effort(), stage or _silent))
+        observations = Given(views, self.camera, Anchors(self.marker_map))
+        return build_map(observations, Workshop(folder, effort or Effort(), stage or _silent))
 
     def clouds(self, piece: Piece, done: Callable[[], object] = lambda: None) -> list[Any]:
         """The keypoints of a piece, as the node ``feature_detector`` sends them."""
         extractor = FrameExtractor(FeatureConfig(max_keypoints=self._most))
-        found = []
+        clouds = []
         for image in self.images(piece):
-            found.append(keypoints(extractor.extract(image), make_message))
+            clouds.append(keypoints(extractor.extract(image), make_message))
             done()
-        return found
+        return clouds
 
     def localized(
         self, clouds: Iterable[Any], landmarks: Map, solver: str
@@ -129,12 +129,12 @@ class Room:
         )
         localizer = FrameLocalizer(config)
         localizer.use_map(landmarks)
-        found = {}
+        answers = {}
         for cloud in clouds:
             stamp = cloud.header.stamp.sec * 10**9 + cloud.header.stamp.nanosec
             localizer.calibrate(read_camera_info(make_camera_info(self.camera, stamp)))
-            found[stamp] = localizer.localize_keypoints(cloud)
-        return found
+            answers[stamp] = localizer.localize_keypoints(cloud)
+        return answers
 
     def errors(self, answers: dict[int, Localized | Refusal]) -> Errors:
         """Of poses for the middle rows."""

@@ -85,40 +85,40 @@ class FeatureExtractor:
         ratio = _LONGEST_SIDE / max(height, width)
         size = max(1, round(width * ratio)), max(1, round(height * ratio))
         reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        found = self._extract(reduced)
+        features = self._extract(reduced)
         scale = np.array([width / size[0], height / size[1]])
         return replace(
-            found,
-            pixels=_single((found.pixels + 0.5) * scale - 0.5),
-            sizes=_single(found.sizes / ratio),
+            features,
+            pixels=_single((features.pixels + 0.5) * scale - 0.5),
+            sizes=_single(features.sizes / ratio),
         )
 
     def _extract(self, image: Gray) -> Features:
-        found: Sequence[Any] = ()
+        detected: Sequence[Any] = ()
         descriptors = None
         if min(image.shape) >= _LEAST_SIDE:
             if self._method.at_once:
-                found, descriptors = self._detector.detectAndCompute(image, None)
-                rows = self._choose(found, image)
-                found = [found[row] for row in rows]
+                detected, descriptors = self._detector.detectAndCompute(image, None)
+                rows = self._choose(detected, image)
+                detected = [detected[row] for row in rows]
                 descriptors = None if descriptors is None else descriptors[rows]
             else:
-                found = self._detector.detect(image)
-                chosen = [found[row] for row in self._choose(found, image)]
+                detected = self._detector.detect(image)
+                chosen = [detected[row] for row in self._choose(detected, image)]
                 # Some are too near the rim, and others change their places.
-                found, descriptors = self._detector.compute(image, chosen)
+                detected, descriptors = self._detector.compute(image, chosen)
         if descriptors is None:
-            found, descriptors = (), np.zeros((0, self._detector.descriptorSize()))
+            detected, descriptors = (), np.zeros((0, self._detector.descriptorSize()))
         return Features(
-            _single(self._method.place(image, found)),
-            _single(np.array([keypoint.response for keypoint in found])),
-            _single(np.array([keypoint.size for keypoint in found])),
+            _single(self._method.place(image, detected)),
+            _single(np.array([keypoint.response for keypoint in detected])),
+            _single(np.array([keypoint.size for keypoint in detected])),
             self._method.pack(descriptors),
         )
 
-    def _choose(self, found: Sequence[Any], image: Gray) -> list[int]:
-        pixels = np.array([keypoint.pt for keypoint in found]).reshape(-1, 2)
-        scores = np.array([keypoint.response for keypoint in found])
+    def _choose(self, detected: Sequence[Any], image: Gray) -> list[int]:
+        pixels = np.array([keypoint.pt for keypoint in detected]).reshape(-1, 2)
+        scores = np.array([keypoint.response for keypoint in detected])
         height, width = image.shape
         rows: list[int] = balanced(pixels, scores, (width, height), self._most).tolist()
         return rows

@@ -41,16 +41,16 @@ def refined(image: NDArray[np.uint8], corners: IntArray, levels: IntArray, step:
     reduced = image
     for level in range(int(levels.max(initial=-1)) + 1):
         if level:
-            # As ORB does, so that corners are where it saw them.
+            # As ORB does, so that corners are where it places them.
             size = tuple(max(1, round(length / step**level)) for length in (width, height))
             reduced = np.asarray(
                 cv2.resize(reduced, size, interpolation=cv2.INTER_LINEAR_EXACT), np.uint8
             )
         rows = np.flatnonzero(levels == level)
         scale = np.array([width / reduced.shape[1], height / reduced.shape[0]])
-        found = corners[rows] + _offsets(reduced, corners[rows])
+        precise = corners[rows] + _offsets(reduced, corners[rows])
         # Pixels are squares: the centre of the first one of a level is not that of the image's.
-        result[rows] = (found + 0.5) * scale - 0.5
+        result[rows] = (precise + 0.5) * scale - 0.5
     return result
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -32,6 +32,8 @@ _TYPES = dict.fromkeys(("x", "y", "z", "u", "v", "score"), (7, 8)) | {
 _ARRAYS = ("descriptor",)  # several values per point
 # NumPy has no larger rows.
 _LONGEST_ROW = 2**31 - 1
+# Parts of an image, across and down, of which each keeps as many points as the others.
+_PARTS = (16, 12)
 # Added to the rows that were kept.
 _RESIDUAL = ("residual", "<f4")
 
@@ -74,6 +76,36 @@ def read_correspondences(message: Any) -> Correspondences:
         scores=rows.columns("score")[:, 0] if rows.has("score") else None,
         dropped=rows.dropped,
         table=rows.table,
+    )
+
+
+def thinned(cloud: Correspondences, most: int, size: tuple[int, int]) -> Correspondences:
+    """The cloud with no more than ``most`` rows, in their order.
+
+    Those with the best scores; without scores, as many of each part of the image as there are.
+
+    Args:
+        size: width and height of the image, px.
+    """
+    if len(cloud.points) <= most:
+        return cloud
+    if cloud.scores is not None:
+        rank = -cloud.scores
+    else:
+        share = np.clip(cloud.pixels / size, 0.0, 1.0 - 1e-9)
+        column, row = (share * _PARTS).astype(np.int64).T
+        part = row * _PARTS[0] + column
+        order = np.argsort(part, kind="stable")
+        sorted_ = part[order]
+        rank = np.empty(len(part))
+        rank[order] = np.arange(len(part)) - np.searchsorted(sorted_, sorted_)
+    chosen = np.sort(np.argsort(rank, kind="stable")[:most])
+    return replace(
+        cloud,
+        points=cloud.points[chosen],
+        pixels=cloud.pixels[chosen],
+        scores=None if cloud.scores is None else cloud.scores[chosen],
+        table=cloud.table[chosen],
     )
 
 

@@ -12,7 +12,12 @@ from rs_localizer.config import MatchBy, NodeConfig
 from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration
-from rs_localizer.io.clouds import Correspondences, EmptyCloudError, read_correspondences
+from rs_localizer.io.clouds import (
+    Correspondences,
+    EmptyCloudError,
+    read_correspondences,
+    thinned,
+)
 from rs_localizer.io.keypoints import Keypoints, read_keypoints
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
@@ -60,6 +65,7 @@ class FrameLocalizer:
         self._landmarks = Landmarks(notice)
         self._succession = Succession()
         self._calibration: Calibration | None = None
+        self._too_many = False  # whether clouds above max_points have been noticed
         self._given = config  # the readout time may be found on the way
         self._method = Method.of(ANY_CALIBRATION, config)
 
@@ -204,6 +210,7 @@ class FrameLocalizer:
         method, frame = self._method, self._calibration.frame
         for name, text in oddities(cloud, method.camera, frame).items():
             self._notice(name, text)
+        cloud = self._thinned(cloud)
         given = (cloud.points, cloud.pixels, cloud.scores)
         deviation = max(method.config.readout_time_deviation, self.readout_watch.error)
         if method.follower is None:
@@ -238,6 +245,17 @@ class FrameLocalizer:
             self._notice(Notice.LENS, lens_is_off(result.lens))
         known = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
         return self.mounted(of_camera(cloud, result, method.config, method.camera, frame, known))
+
+    def _thinned(self, cloud: Correspondences) -> Correspondences:
+        """The cloud with no more points than ``max_points``, which is said once."""
+        most = self.config.max_points
+        if len(cloud.points) > most and not self._too_many:
+            self._too_many = True
+            self._notice(
+                Notice.TOO_MANY_POINTS,
+                f"{len(cloud.points)} points have come; max_points of them, {most}, are used",
+            )
+        return thinned(cloud, most, self._method.camera.size)
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""

@@ -22,8 +22,10 @@ def read_landmarks(file: str, frame: str) -> Map:
     path = Path(file).expanduser()
     try:
         landmarks = read_map_file(path, frame)
-    except (MapError, OSError) as error:
+    except MapError as error:
         raise MapError(f"map_file: {error}") from error
+    except OSError as error:
+        raise MapError(f"map_file: {path} cannot be read: {error.strerror or error}") from error
     if landmarks.ids is None and landmarks.descriptors is None:
         raise MapError(
             f"map_file: {path}: keypoints cannot be matched with a map that has neither ids "

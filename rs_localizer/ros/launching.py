@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import difflib
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from rs_localizer.config import NodeConfig
-from rs_localizer.settings import NODES, Kind, settings
+from rs_localizer.config import DetectorConfig, NodeConfig
+from rs_localizer.settings import NODES, Kind, SettingsError, load_params_file, settings
 
 PACKAGE = "rs_localizer"
 # Drivers by their package, and their executables; both publish image_raw and camera_info.
 DRIVERS = {"v4l2_camera": "v4l2_camera_node", "usb_cam": "usb_cam_node_exe"}
+
+
+# Settings that name files, by the argument that names the params file of their node.
+_FILES: dict[str, tuple[Kind, str]] = {
+    "params_file": (NodeConfig, "map_file"),
+    "detector_params_file": (DetectorConfig, "marker_map"),
+}
+# An unknown argument that is so much like a known one (difflib) is a slip of the pen; others may
+# belong to the launch file that includes these.
+_ALIKE = 0.85
+_RESPAWN_DELAY = 2.0  # s: a node that cannot start shall not take the whole CPU
 
 
 def share(*path: str) -> PathJoinSubstitution:
@@ -63,6 +78,66 @@ def _typed(text: str, default: Any) -> Any:
     return ParameterValue(text, value_type=str)  # or "1" would become a number
 
 
+def read_params(params_file: str, kind: Kind) -> dict[str, Any]:
+    """The settings of a node in a params file; none where the node will refuse it."""
+    with suppress(SettingsError):
+        return load_params_file(Path(params_file), kind)
+    return {}
+
+
+def starting(
+    arguments: Sequence[DeclareLaunchArgument], nodes: Callable[[Any], list[Any]]
+) -> list[Any]:
+    """Arguments, and what to start once they are known, if they can be right.
+
+    Args:
+        nodes: makes it of the launch context.
+    """
+    names = [item.name for item in arguments]
+
+    def function(context: Any) -> list[Any]:
+        need_known(getattr(context, "argv", None) or (), names)
+        need_files(context.launch_configurations)
+        return nodes(context)
+
+    return [*arguments, OpaqueFunction(function=function)]
+
+
+def need_known(words: Iterable[str], names: Sequence[str]) -> None:
+    """Name arguments of the command line, ``NAME:=VALUE``, that no launch file takes.
+
+    Raises:
+        RuntimeError: for one that is nearly the name of another.
+    """
+    for name in (word.split(":=")[0] for word in words if ":=" in word):
+        if name in names:
+            continue
+        if alike := difflib.get_close_matches(name, names, 1, _ALIKE):
+            raise RuntimeError(f"unknown launch argument {name!r}: did you mean {alike[0]!r}?")
+        logging.getLogger(PACKAGE).warning(
+            f"unknown launch argument {name!r} (ros2 launch --show-args)"
+        )
+
+
+def need_files(configurations: Mapping[str, str]) -> None:
+    """Raise ``RuntimeError`` if a file that is named does not exist."""
+    files = {name: text for name, text in configurations.items() if name.endswith("params_file")}
+    for params_file, (kind, name) in _FILES.items():
+        if params_file in configurations:
+            known = read_params(configurations[params_file], kind)
+            files[name] = configurations.get(name) or known.get(name, "")
+    for name, text in files.items():
+        if text and not Path(text).expanduser().exists():
+            raise RuntimeError(f"{name}: {text} does not exist")
+
+
+def lifetime(configurations: Mapping[str, str]) -> dict[str, Any]:
+    """What happens when a node ends: it starts again, or everything is shut down."""
+    if configurations["respawn"].lower() == "true":
+        return {"respawn": True, "respawn_delay": _RESPAWN_DELAY}
+    return {"on_exit": Shutdown(reason="a node of rs_localizer has ended")}
+
+
 def need_package(name: str, why: str) -> None:
     """Raise ``RuntimeError`` if a package is not installed, before anything has been started."""
     try:
@@ -74,9 +149,7 @@ def need_package(name: str, why: str) -> None:
         ) from None
 
 
-def localizer(
-    configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]], **options: Any
-) -> Node:
+def localizer(configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]]) -> Node:
     """The node rs_localizer with its params file and the settings that were given."""
     return Node(
         package=PACKAGE,
@@ -87,7 +160,7 @@ def localizer(
         remappings=list(remappings),
         arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
         output="screen",
-        **options,
+        **lifetime(configurations),
     )
 
 
@@ -114,6 +187,7 @@ def common_arguments() -> list[DeclareLaunchArgument]:
         argument("params_file", share("config", "rs_localizer.yaml"), "parameters of rs_localizer"),
         argument("use_sim_time", "", "true: take the time from /clock"),
         argument("log_level", "info", "debug, info, warn, error or fatal"),
+        argument("respawn", "false", "true: start a node again that ends; false: end all others"),
         argument("rviz", "false", "start RViz with a view of the node's outputs, too"),
         *setting_arguments(),
     ]
@@ -130,7 +204,7 @@ def from_camera(kind: Kind, params_argument: str, nodes: Callable[[Any], list[No
     common = common_arguments()
     known = {item.name for item in common}
     name = NODES[kind]
-    return [
+    arguments = [
         argument(
             "camera",
             "none",
@@ -142,8 +216,8 @@ def from_camera(kind: Kind, params_argument: str, nodes: Callable[[Any], list[No
         argument(params_argument, share("config", f"{name}.yaml"), f"parameters of {name}"),
         *common,
         *(item for item in setting_arguments(kind) if item.name not in known),
-        OpaqueFunction(function=nodes),
     ]
+    return starting(arguments, nodes)
 
 
 def camera_driver(configurations: Mapping[str, str]) -> list[Node]:
@@ -164,14 +238,18 @@ def camera_driver(configurations: Mapping[str, str]) -> list[Node]:
             namespace=LaunchConfiguration("namespace"),
             parameters=[{"camera_info_url": url} | time],
             output="screen",
+            **lifetime(configurations),
         )
     ]
 
 
-def detector(name: str, params_file: str, parameters: Mapping[str, Any]) -> Node:
+def detector(
+    configurations: Mapping[str, str], name: str, params_file: str, parameters: Mapping[str, Any]
+) -> Node:
     """A node that looks at the camera's images; its executable has its name.
 
     Args:
+        configurations: the launch arguments.
         name: of the node.
         params_file: the launch argument that names its params file.
         parameters: those that were given besides.
@@ -190,4 +268,5 @@ def detector(name: str, params_file: str, parameters: Mapping[str, Any]) -> Node
         ],
         arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
         output="screen",
+        **lifetime(configurations),
     )

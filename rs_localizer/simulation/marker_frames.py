@@ -18,7 +18,7 @@ from rs_localizer.markers.prints import Marker
 from rs_localizer.simulation.frames import frame_stamps, middle_stamp, true_poses_at
 from rs_localizer.simulation.image_sequence import in_order
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 from rs_localizer.simulation.walls import three_walls
 
 CAMERA = Camera(
@@ -58,7 +58,7 @@ class MarkerWalls:
 
     def __init__(self, trajectory: Trajectory, seed: int, sensor: ImageSettings = SENSOR) -> None:
         self.motion = RecordedMotion(trajectory)
-        scene = three_walls(sampled_way(self.motion))
+        scene = three_walls(sampled_states(self.motion))
         assert scene.marker_map is not None
         self.markers: Sequence[Marker] = scene.marker_map.markers
         self._corners = scene.marker_map.points
@@ -101,5 +101,5 @@ def visible(quads: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
         area = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
         longest = np.maximum(np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1))
         large = (sides.min(axis=1) >= _LEAST_SIDE) & (area >= _LEAST_HEIGHT * longest)
-        found: NDArray[np.bool_] = inside.all(axis=(1, 2)) & large
-    return found
+        visible_markers: NDArray[np.bool_] = inside.all(axis=(1, 2)) & large
+    return visible_markers

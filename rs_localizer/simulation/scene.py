@@ -1,4 +1,4 @@
-"""Scenes: fixed maps of 3D points around the way of a simulated camera."""
+"""Scenes: fixed maps of 3D points around the path of a simulated camera."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rs_localizer.core.arrays import Array
 
 # Points of the map; enough that a narrow camera close to a wall still sees some hundreds.
 _POINTS = 30_000
-# Walls stand this far beyond the way of the camera (m); rooms as people record them in.
+# Walls stand this far beyond the path of the camera (m); rooms as people record them in.
 _WALL_DISTANCE = (1.5, 3.0)
 # Share of the points that stand about in the room, as boxes, instead of on the walls.
 _CLUTTER = 0.5
@@ -16,7 +16,7 @@ _BOXES = 120
 _BOX_SIZE = (0.1, 0.8)
 # Unevenness of the walls (m): pictures, shelves, pipes.
 _RELIEF = 0.1
-# Nothing stands closer than this to the way of the camera (m).
+# Nothing stands closer than this to the path of the camera (m).
 _CLEARANCE = 0.8
 
 

@@ -58,7 +58,7 @@ class TrueMotion(Protocol):
         """The camera at ``stamp_ns`` plus ``offsets`` (n,) seconds."""
 
 
-def sampled_way(motion: TrueMotion, spacing: float = 0.1) -> TrueState:
+def sampled_states(motion: TrueMotion, spacing: float = 0.1) -> TrueState:
     """The camera at instants ``spacing`` seconds apart, all along a motion."""
     states = [
         motion.state(first, np.arange(0.0, max((last - first) * 1e-9, spacing), spacing))

@@ -69,7 +69,7 @@ _FAMILY = "4x4_250"  # few cells: the largest that a far or slanted marker can s
 _CELL_TEXELS = 24
 # Sides of the markers (m) on the walls and, seen at a slant, on the floor; gaps in sides.
 _WALL_MARKER, _FLOOR_MARKER, _GAP = 0.42, 0.56, 0.5
-# From the way of the camera (m) to the two walls, to where they end, to the floor and to the top:
+# From the path of the camera (m) to the two walls, to where they end, to the floor and to the top:
 # a larger room would be all markers too small to read, a smaller one would show too few.
 _NEAR, _OPEN, _BELOW, _ABOVE = 1.5, 3.1, 0.9, 1.8
 # Each plane has its own light, so that edges can be seen: grey of its paper and its ink.
@@ -89,14 +89,14 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Box:
-    """The way of a camera in a frame whose diagonal x = y it mostly looks along; z is up."""
+    """The path of a camera in a frame whose diagonal x = y it mostly looks along; z is up."""
 
     axes: Array  # (3,3) map_from_box
     low: Array  # (3,)
     high: Array  # (3,)
 
 
-def three_walls(way: TrueState) -> Scene:
+def three_walls(path: TrueState) -> Scene:
     """Two walls and a floor full of markers, at right angles, in a corner before the camera.
 
     The corner stands where the camera looks on average.
@@ -104,11 +104,11 @@ def three_walls(way: TrueState) -> Scene:
     Args:
         way: of the camera, evenly in time, in a map whose z points up.
     """
-    box = _box(way, turned=0.25 * np.pi)
+    box = _box(path, turned=0.25 * np.pi)
     corner = np.array([*(box.high[:2] + _NEAR), box.low[2] - _BELOW])
     extent = corner - (box.low - _OPEN)
     height = box.high[2] + _ABOVE - corner[2]
-    # Larger markers where a long way would need more than there are.
+    # Larger markers where a long path would need more than there are.
     scale, most = 1.0, family(_FAMILY).count
     while True:
         pitches = scale * (1.0 + _GAP) * np.array([_WALL_MARKER, _FLOOR_MARKER])
@@ -139,18 +139,18 @@ def three_walls(way: TrueState) -> Scene:
     return Scene(tuple(planes), MarkerMap(tuple(markers)))
 
 
-def poster(way: TrueState) -> Scene:
+def poster(path: TrueState) -> Scene:
     """One large picture upright before the camera."""
-    box = _box(way, turned=0.0)
+    box = _box(path, turned=0.0)
     size = np.array([box.high[1] - box.low[1], box.high[2] - box.low[2]]) + 2.0 * _POSTER_DISTANCE
     middle = 0.5 * (box.low + box.high)
     top = np.array([box.high[0] + _POSTER_DISTANCE, *(middle[1:] + 0.5 * size)])
     return Scene((_picture(box.axes, top, np.array([0.0, -1.0, 0.0]), [0.0, 0.0, -1.0], size, 0),))
 
 
-def room(way: TrueState) -> Scene:
-    """A closed room around the way of the camera, every wall with a picture of its own."""
-    box = _box(way, turned=0.0)
+def room(path: TrueState) -> Scene:
+    """A closed room around the path of the camera, every wall with a picture of its own."""
+    box = _box(path, turned=0.0)
     low, high = box.low - _NEAR, box.high + _NEAR
     planes = []
     for axis in range(3):
@@ -163,13 +163,13 @@ def room(way: TrueState) -> Scene:
     return Scene(tuple(planes))
 
 
-def _box(way: TrueState, turned: float) -> _Box:
-    """The camera's way in axes that its mean horizontal gaze makes, turned about the vertical."""
-    gaze = way.rotations[:, :2, 2].mean(axis=0)
+def _box(path: TrueState, turned: float) -> _Box:
+    """The camera's path in axes that its mean horizontal gaze makes, turned about the vertical."""
+    gaze = path.rotations[:, :2, 2].mean(axis=0)
     angle = float(np.arctan2(gaze[1], gaze[0])) - turned
     cosine, sine = np.cos(angle), np.sin(angle)
     axes = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    seen_from = way.positions @ axes
+    seen_from = path.positions @ axes
     return _Box(axes, seen_from.min(axis=0), seen_from.max(axis=0))
 
 
@@ -213,13 +213,13 @@ _PLACES = (0.3, 0.7)
 _PAPER, _INK = 235, 26
 
 
-def marked_room(way: TrueState) -> Scene:
+def marked_room(path: TrueState) -> Scene:
     """The room of :func:`rs_localizer.simulation.walls.room` with two markers on each wall.
 
     Floor and ceiling have none.
     """
-    bare = room(way)
-    middle = way.positions.mean(axis=0)
+    bare = room(path)
+    middle = path.positions.mean(axis=0)
     planes, markers = list[TexturedPlane](), list[Marker]()
     for plane in bare.planes:
         if abs(plane.normal[2]) > 0.5:

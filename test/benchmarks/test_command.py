@@ -36,6 +36,7 @@ def test_tables_figures_and_summary(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert f"({name})" in text
 
 
+@pytest.mark.bench
 def test_same_seed_same_tables(tmp_path: Path) -> None:
     from benchmarks.experiments.trials import draw_trials
 

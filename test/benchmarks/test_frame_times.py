@@ -1,8 +1,10 @@
 import numpy as np
+import pytest
 
 from benchmarks.frame_times import main
 
 
+@pytest.mark.bench
 def test_frames_are_timed_and_slow_ones_profiled_apart(tmp_path, capsys):
     """Few frames before an IMU's delay is known: with and without one."""
     file = tmp_path / "times.npy"

@@ -10,8 +10,6 @@ from benchmarks import fusion
 from benchmarks.ekf import ANGULAR, LINEAR, Ekf, nees
 from rs_localizer.io.outputs import Pose, Twist
 
-PERIOD = 1 / 30
-
 
 def ekf(covariance: np.ndarray) -> Ekf:
     pose = Pose(np.zeros(3), np.eye(3), covariance)
@@ -55,6 +53,7 @@ def flights() -> tuple[fusion.Frames, fusion.Outputs]:
     return frames, fusion.outputs(frames, tracking=False)
 
 
+@pytest.mark.bench
 def test_poses_of_single_frames_make_a_consistent_filter(
     flights: tuple[fusion.Frames, fusion.Outputs],
 ) -> None:
@@ -66,6 +65,7 @@ def test_poses_of_single_frames_make_a_consistent_filter(
     assert fused.velocity.mean() < 9.0
 
 
+@pytest.mark.bench
 def test_covariances_about_fixed_axes_are_no_covariances_of_angles(
     flights: tuple[fusion.Frames, fusion.Outputs],
 ) -> None:

@@ -27,12 +27,6 @@ def test_no_reader_raises_another_error(tmp_path: Path) -> None:
     assert report.peak_mb < 200.0
 
 
-def test_an_execution_can_be_repeated(tmp_path: Path) -> None:
-    target = targets(tmp_path)["map .ply"]
-    assert case_of(target, "map .ply", 0, 5) == case_of(target, "map .ply", 0, 5)
-    assert case_of(target, "map .ply", 0, 5) != case_of(target, "map .ply", 0, 6)
-
-
 def test_what_fails_is_reported() -> None:
     def read(case: Any) -> None:
         if case == 3:

@@ -129,6 +129,7 @@ def test_conditions_have_names_of_their_own() -> None:
     ]
 
 
+@pytest.mark.bench
 def test_a_condition_against_p3p() -> None:
     bench = BENCHES["p3p"]
     condition = bench.conditions[-1]

@@ -44,24 +44,3 @@ def test_nodes_and_replay_agree(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert told
     assert 0 < int(told[1]) <= 8
     assert 1.0 < float(told[2]) <= float(told[3])
-
-
-@pytest.mark.parametrize(
-    ("live", "replayed", "identical", "complete"),
-    [
-        ((3, 3), (3, 3), (3, 3), True),
-        ((3, 0), (3, 0), (3, 0), True),  # p3p has no twists
-        ((3, 3), (3, 3), (2, 3), False),
-        ((4, 3), (3, 3), (3, 3), False),
-        ((3, 2), (3, 3), (3, 2), False),
-        ((0, 0), (0, 0), (0, 0), False),
-    ],
-)
-def test_what_counts_as_agreement(
-    live: tuple[int, int], replayed: tuple[int, int], identical: tuple[int, int], complete: bool
-) -> None:
-    counts = (
-        dict(zip(("/rs_localizer/pose", "/rs_localizer/twist"), numbers, strict=True))
-        for numbers in (live, replayed, identical)
-    )
-    assert image_flight.Agreement(4, *counts).complete == complete

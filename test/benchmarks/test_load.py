@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Imu, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from benchmarks.load.frames import Frames, simulated
 from benchmarks.load.measuring import steady
@@ -31,18 +32,7 @@ def test_frames_never_end_and_are_known_by_their_stamps(tmp_path: Path) -> None:
         assert cloud.width == 30
 
 
-def test_readings_go_with_their_frames(tmp_path: Path) -> None:
-    frames = simulated(points=30, outliers=0.3, rate=30.0, different=60, imu_rate=200.0)
-    frames.save(tmp_path / "frames.npz")
-    loaded = Frames.load(tmp_path / "frames.npz")
-    assert loaded.imus == frames.imus
-    assert (len(loaded.imus), loaded.imu_rate) == (400, 200.0)  # two seconds
-    first, again = (deserialize_message(loaded.imu(index), Imu) for index in (3, 403))
-    assert again.angular_velocity == first.angular_velocity
-    assert again.header.stamp.sec == first.header.stamp.sec + 2
-    assert first.header.frame_id == "camera_optical_frame"  # no TF is needed
-
-
+@pytest.mark.bench
 def test_every_frame_is_accounted_for() -> None:
     frames = simulated(points=60, outliers=0.2, rate=20.0, different=40, imu_rate=200.0)
     (result,) = steady(frames, cameras=1, count=60)

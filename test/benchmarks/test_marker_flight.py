@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 
 from benchmarks.marker_flight import load_flight, quality
 from rs_localizer.cli.main import main
-from rs_localizer.evaluation import marker_flight
 
 # Two walls and the floor come by while the hand shakes the camera.
 FLIGHT = "--images --trajectory tum_vi_room5 --start 21 --duration 0.8 --exposure 0.002".split()
@@ -40,22 +38,3 @@ def test_poses_of_images_are_those_of_the_truth(folder: Path) -> None:
     assert ours.reprojection < 0.5 < p3p.reprojection
     assert 3.0 * ours.position_fast < p3p.position_fast
     assert ours.position_fast < 0.02
-
-
-def test_missing_poses_count_as_wrong(folder: Path, tmp_path: Path) -> None:
-    flight = load_flight(folder / "images", folder / "markers")
-    lines = (folder / "ours" / "poses.txt").read_text().splitlines(keepends=True)
-    (tmp_path / "poses.txt").write_text("".join(lines[:-20]))
-    few = quality(flight, tmp_path)
-    assert few.localized == pytest.approx(4 / 24)
-    assert few.position == np.inf
-
-
-def test_the_table_says_it(folder: Path) -> None:
-    said = io.StringIO()
-    names = ("images", "markers", "ours", "p3p")
-    marker_flight.main([str(folder / name) for name in names], said)
-    first, _, ours, p3p = said.getvalue().splitlines()
-    assert first.startswith("24 frames; 24 show 3 markers or more, ")
-    assert ours.split()[:3] == ["ours", "100.0", "%"]
-    assert p3p.split()[0] == "p3p"

@@ -84,19 +84,6 @@ def test_frames_without_a_pose_are_told(
     assert capsys.readouterr().out.splitlines()[1] == "12 of 15 frames have a pose"
 
 
-@pytest.mark.parametrize("tolerance", ["-0.1", "nan", "soon"])
-def test_a_wrong_tolerance_is_wrong_usage(
-    files: Path, tolerance: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert evaluate(files, "--tolerance", tolerance) == 2
-    assert "--tolerance: must be " in capsys.readouterr().err
-
-
-def test_files_alone_have_no_twists(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert evaluate(files, estimate="replayed/poses.txt") == 0
-    assert set(rows(capsys.readouterr().out)) == {"position (m)", "orientation (deg)"}
-
-
 def test_ate_and_rpe(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("evo", reason="the optional extra evo")
     assert evaluate(files, "--ate") == 0
@@ -122,32 +109,6 @@ def test_plots(files: Path) -> None:
         image = cv2.imread(str(files / "plots" / name))
         assert image.shape[1] > 1000
         assert image.std() > 5.0
-
-
-def test_simulated_bag_against_itself(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag = str(files / "bag")
-    assert main(["simulate", bag, "--duration", "0.3"]) == 0
-    assert main(["evaluate", bag, bag]) == 0
-    found = rows(capsys.readouterr().out)
-    assert found["position (m)"] == [18, 0, 0, 0, 0]
-    assert found["linear velocity (m/s)"] == [18, 0, 0, 0, 0]
-    # Nothing of the one bag is near the other file in time.
-    assert main(["evaluate", bag, str(files / "truth.txt")]) == 1
-    error = capsys.readouterr().err
-    assert "no pose of" in error
-    assert "1.000 to 1.282 s against 1500000000.000 to 1500000001.300 s" in error
-    assert main(["evaluate", bag, bag, "--pose-topic", "/pose"]) == 1
-    assert "no geometry_msgs/msg/PoseStamped on /pose; found /truth/pose" in capsys.readouterr().err
-
-
-def test_tolerance(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert evaluate(files, "--tolerance", "0.0001") == 1
-    assert "is within 0.0001 s of" in capsys.readouterr().err
-
-
-def test_missing_arguments(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "only_one"]) == 2
-    assert "TRUTH" in capsys.readouterr().err
 
 
 def test_clocks_that_differ_are_told_and_mended(

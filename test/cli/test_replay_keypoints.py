@@ -127,7 +127,11 @@ def test_a_recording_of_everything(
     ("words", "code", "text"),
     [
         (["keypoints"], 1, "has /cam/keypoints and no map; give one with --map"),
-        (["keypoints", "--map", "nowhere.npz"], 1, "map_file: [Errno 2] No such file"),
+        (
+            ["keypoints", "--map", "nowhere.npz"],
+            1,
+            "map_file: nowhere.npz cannot be read: No",
+        ),
         (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth and -p are for offline replay"),
         (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),
         (["all", "--keypoints", "/nowhere"], 1, "topic /nowhere does not exist"),

@@ -9,18 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.settings import load_params_file
-
-CLEAN = ("--noise", "0", "--outliers", "0", "--points", "60")
-TURN = ("--angular-velocity", "0.5", "-1", "2", "--linear-velocity", "1", "0.5", "0")
 
 
 def simulate(out: Path, *words: str) -> int:
@@ -59,73 +53,6 @@ def test_bag_holds_frames_and_their_truth(tmp_path: Path, storage: str) -> None:
     assert cameras == {"camera_optical_frame"}
     assert clouds[0].header.frame_id == "map"
     assert len(set(read_correspondences(clouds[0]).table["id"])) == 150
-
-
-@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_each_row_sees_the_points_from_its_own_true_pose(tmp_path: Path, direction: str) -> None:
-    """At constant velocity the truth between two stamps is known from their poses and twists."""
-    words = (*CLEAN, *TURN, "--duration", "0.4", "--scan-direction", direction)
-    lens = ("--distortion", "-0.2", "0.05", "0.001", "-0.001")
-    assert simulate(tmp_path / "bag", *words, *lens) == 0
-    truth = read_motions(tmp_path / "bag", "/truth/pose", "/truth/twist")
-    assert truth.twists is not None
-    with open_bag(tmp_path / "bag") as bag:
-        messages = list(bag.messages(["/camera_info", "/correspondences"]))
-    camera = read_camera_info(messages[0][2]).camera(0.03, direction)
-    np.testing.assert_array_equal(camera.D, [-0.2, 0.05, 0.001, -0.001])
-    for _, _, message in messages[1::2]:
-        cloud = read_correspondences(message)
-        row = truth.poses.stamps_ns.tolist().index(cloud.stamp_ns)
-        angular, linear = truth.twists.angular[row], truth.twists.linear[row]
-        start = Rotation.from_quat(truth.poses.quaternions[row])
-        along = cloud.pixels[:, 1] / 479 if "top" in direction else 1 - cloud.pixels[:, 0] / 639
-        late = 0.03 * along[:, None]
-        turned = start * Rotation.from_rotvec(late * angular)
-        centres = truth.poses.positions[row] + late * start.apply(linear)
-        seen = camera.project(turned.inv().apply(cloud.points - centres))
-        np.testing.assert_allclose(seen, cloud.pixels, atol=1e-3)  # float32 in the message
-
-
-def test_twist_is_the_derivative_of_the_pose(tmp_path: Path) -> None:
-    words = ("--trajectory", "tum_vi_room5", "--start", "20", "--duration", "1")
-    assert simulate(tmp_path / "bag", *words, "--readout-time", "0.0002") == 0
-    truth = read_motions(tmp_path / "bag", "/truth/pose", "/truth/twist")
-    assert truth.twists is not None
-    # First row and middle row are 0.1 ms apart.
-    rotations = Rotation.from_quat(truth.poses.quaternions)
-    angular = (rotations[0::2].inv() * rotations[1::2]).as_rotvec() / 1e-4
-    np.testing.assert_allclose(truth.twists.angular[0::2], angular, atol=5e-3)
-    travel = (truth.poses.positions[1::2] - truth.poses.positions[0::2]) / 1e-4
-    linear = rotations[0::2].inv().apply(travel)
-    np.testing.assert_allclose(truth.twists.linear[0::2], linear, atol=2e-3)
-    assert np.linalg.norm(angular, axis=1).max() > 2.0
-    # The camera looks along the rig's x axis, and its z axis is up.
-    assert np.all(rotations.apply([0.0, 1.0, 0.0])[:, 2] < -0.5)
-
-
-def test_gaps_of_the_recording_stay_gaps(tmp_path: Path) -> None:
-    t = np.arange(0.0, 2.0, 0.01)
-    t = t[(t < 0.8) | (t > 1.2)]
-    lines = [f"{1.5e9 + s:.9f} {s} 0 0 0 0 0 1\n" for s in t]
-    (tmp_path / "poses.txt").write_text("".join(lines))
-    assert simulate(tmp_path / "bag", "--trajectory", str(tmp_path / "poses.txt")) == 0
-    truth = read_motions(tmp_path / "bag", "/truth/pose", "/truth/twist")
-    seconds = (truth.poses.stamps_ns - 1_500_000_000_000_000_000) * 1e-9
-    assert not np.any((seconds > 0.79 + 1e-6) & (seconds < 1.21 - 1e-6))
-    assert seconds.min() < 0.1
-    assert seconds.max() > 1.9
-
-
-def test_same_seed_same_bag(tmp_path: Path) -> None:
-    def pixels(name: str, seed: str) -> np.ndarray:
-        assert simulate(tmp_path / name, "--duration", "0.1", "--seed", seed) == 0
-        with open_bag(tmp_path / name) as bag:
-            (first, *_) = (message for _, _, message in bag.messages(["/correspondences"]))
-        return np.asarray(first.data)
-
-    one, same, other = pixels("a", "3"), pixels("b", "3"), pixels("c", "4")
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)
 
 
 @pytest.mark.parametrize(
@@ -169,12 +96,6 @@ def test_faults(
     assert not (tmp_path / "bag").exists()
 
 
-def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate(tmp_path / "bag", "--duration", "0.1") == 0
-    assert simulate(tmp_path / "bag", "--duration", "0.1") == 1
-    assert "exists already" in capsys.readouterr().err
-
-
 def test_the_next_command_has_the_shutter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -209,10 +130,3 @@ def test_fewer_points_than_asked_for_are_told(
     assert int(found[3]) == widths.count(0)
     assert simulate(tmp_path / "full", "--duration", "0.1") == 0
     assert "asked for" not in capsys.readouterr().out
-
-
-def test_help_shows_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["simulate", "--help"]) == 0
-    text = capsys.readouterr().out
-    for default in ("640", "480", "500.0", "plumb_bob", "0.03", "top_to_bottom", "30.0", "150"):
-        assert f"(default: {default})" in text

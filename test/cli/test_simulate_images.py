@@ -96,27 +96,6 @@ def detect(image: np.ndarray) -> dict[int, np.ndarray]:
     return found
 
 
-def test_same_seed_same_images(tmp_path: Path) -> None:
-    def first(name: str, *words: str) -> np.ndarray:
-        words = (*SMALL, "--duration", "0.2", "--grey-noise", "3", *words)
-        assert simulate(tmp_path / name, *words) == 0
-        return np.concatenate(
-            [m.data for topic, _, m in messages(tmp_path / name) if "image" in topic]
-        )
-
-    one = first("a", "--seed", "3")
-    np.testing.assert_array_equal(one, first("b", "--seed", "3"))
-    assert not np.array_equal(one, first("c", "--seed", "4"))
-    assert len(one) > 2 * len(first("d", "--seed", "3", "--quality", "40"))
-
-
-def test_pictures_have_no_marker_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = (*SMALL, "--duration", "0.1", "--walls", "poster", "--vignetting", "0.3")
-    assert simulate(tmp_path / "bag", *words) == 0
-    assert not (tmp_path / "bag/marker_map.yaml").exists()
-    assert capsys.readouterr().out == f"{tmp_path / 'bag'}: 3 images in 0.1 s\n"
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

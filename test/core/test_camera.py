@@ -49,13 +49,6 @@ def test_projecting_undoes_rays_also_with_binning_and_roi(model, D):
     )
 
 
-@pytest.mark.parametrize(("model", "D"), [(None, ()), *LENSES])
-def test_no_points_are_no_error(model, D):
-    lens = camera(D=D, distortion_model=model or "plumb_bob")
-    assert lens.project(np.zeros((0, 3))).shape == (0, 2)
-    assert [a.shape for a in lens.rays_and_jacobian(np.zeros((0, 2)))] == [(0, 2), (0, 2, 2)]
-
-
 @pytest.mark.parametrize(("model", "D"), LENSES)
 def test_pixel_jacobian_is_the_finite_difference_of_projecting(model, D):
     lens = camera(D=D, distortion_model=model, binning=(2, 1))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import LensError, by_lens, coefficients_of, corner_of
 
 K = np.array([[420.0, 0.0, 320.0], [0.0, 420.0, 240.0], [0.0, 0.0, 1.0]])
@@ -64,31 +64,6 @@ def test_pixels_are_those_of_the_point_that_moves_farthest():
     lens = LensError(np.array([0.05, -0.055]), np.eye(2), 400.0)
     far = np.sqrt(0.15 / 0.275)
     assert lens.pixels == pytest.approx(400.0 * (0.05 * far**3 - 0.055 * far**5), rel=0.01)
-
-
-@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
-def test_a_model_without_coefficients_is_a_pinhole_to_begin_with(model):
-    given = camera(model)
-    rays = RAYS.copy()
-    same = LensError(np.zeros(4), np.eye(4), 400.0).mended(given)
-    np.testing.assert_allclose(same.distort(rays)[0], given.distort(rays)[0], atol=1e-9)
-    assert coefficients_of(given) == 8
-    step = 1e-6 * np.eye(8)
-    ways = [LensError(one, np.eye(8), 400.0).mended(given).distort(rays)[0] for one in step]
-    by_steps = np.stack([1e6 * (way - given.distort(rays)[0]) for way in ways], axis=-1)
-    np.testing.assert_allclose(by_lens(given, rays), by_steps, rtol=1e-5, atol=1e-4)
-
-
-def test_of_a_region_aside_of_the_axis_the_farthest_corner_counts():
-    whole, roi = camera(), Roi(420, 300, 200, 160)
-    aside = Camera(640, 480, K, [], roi=roi)
-    lacks = LensError(np.array([-0.02, 0.0, 0.0, 0.0]), np.eye(4), 420.0 * corner_of(aside))
-    corners = np.array([[0.0, 0.0], [200.0, 0.0], [0.0, 160.0], [200.0, 160.0]])
-    rays = aside.rays(corners)
-    assert corner_of(aside) == pytest.approx(np.hypot(*rays.T).max())
-    moved = np.hypot(*(lacks.mended(aside).distort(rays)[0] - corners).T)
-    assert lacks.pixels == pytest.approx(moved.max())
-    assert corner_of(whole) == pytest.approx(400.0 / 420.0)
 
 
 def test_what_a_wrong_focal_length_moves_is_said() -> None:

@@ -108,11 +108,3 @@ def test_states_are_derivatives_of_the_poses(tau: float) -> None:
     np.testing.assert_allclose(state.linear_velocity_in_map, velocity, atol=1e-6)
     rate = Rotation.from_matrix(after_turn @ before_turn.T).as_rotvec() / seconds
     np.testing.assert_allclose(state.angular_velocity_in_map, rate, atol=1e-5)
-
-
-def test_without_a_readout_time_velocities_are_unknown() -> None:
-    state = rsl.camera_state(MOTION, rsl.Camera(640, 480, K))
-    assert np.isnan([*state.angular_velocity, *state.linear_velocity]).all()
-    assert np.isfinite(state.position).all()
-    with pytest.raises(ValueError, match="tau must be finite"):
-        rsl.camera_state(MOTION, rsl.Camera(640, 480, K), np.inf)

@@ -51,26 +51,12 @@ def test_accelerations_are_the_second_derivatives_at_the_middle_row():
     np.testing.assert_allclose(sum(turns) / h**2, motion.angular_acceleration, atol=1e-6)
 
 
-def test_the_centre_moves_on_a_straight_line():
-    motion = some_motion()
-    first, middle, last = (centre(motion, tau) for tau in (-0.5, 0.0, 0.5))
-    np.testing.assert_allclose(middle, 0.5 * (first + last), atol=1e-14)
-
-
 def test_no_velocity_is_a_global_shutter():
     motion = some_motion(speed=0.0)
     for tau in (-0.5, 0.3):
         rotation, translation = motion.at(tau)
         np.testing.assert_array_equal(rotation, motion.rotation)
         np.testing.assert_array_equal(translation, motion.translation)
-
-
-def test_many_rows_are_single_rows():
-    motion, tau = some_motion(acceleration=0.2), np.array([-0.5, 0.0, 0.37])
-    rotations, translations = motion.at_rows(tau)
-    for k, row in enumerate(tau):
-        np.testing.assert_allclose(rotations[k], motion.at(row)[0], atol=1e-15)
-        np.testing.assert_allclose(translations[k], motion.at(row)[1], atol=1e-15)
 
 
 def test_the_solvers_model_and_ours_agree_to_first_order():

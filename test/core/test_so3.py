@@ -50,13 +50,6 @@ def test_hat_is_the_cross_product(axis, angle):
     np.testing.assert_allclose(so3.hat(a) @ b, np.cross(a, b), atol=1e-15)
 
 
-def test_many_rotations_are_those_of_one_by_one():
-    vectors = np.random.default_rng(0).normal(size=(7, 3))
-    expected = [so3.exp(v) for v in vectors]
-    np.testing.assert_array_equal(so3.exp_many(vectors), expected)
-    assert so3.hat(vectors).shape == (7, 3, 3)
-
-
 @given(axes, angles, st.integers(0, 2))
 def test_right_jacobian_is_the_derivative_of_the_exponential(axis, angle, direction):
     at, step = Rotation.from_rotvec(vector(axis, angle)), 1e-6 * np.eye(3)[direction]

@@ -154,26 +154,6 @@ def test_predicted_pixels_move_with_the_rows() -> None:
     np.testing.assert_allclose(predicted_pixels(camera, static, points), expected, atol=1e-9)
 
 
-def test_long_names_stand_in_two_lines(recording: Recording) -> None:
-    found = compare(answers(recording, moving=True, shift=0.0), recording.truth)
-    lines = table("Title", recording, {"one": found, "P3P (one pose per image)": found})
-    first, second, third, *_ = lines.splitlines()
-    assert first.split() == ["Title", "one", "P3P", "(one", "pose"]
-    assert second.split() == ["per", "image)"]
-    assert third.split() == ["frames", "30", "30"]
-    assert max(map(len, lines.splitlines())) <= 80
-
-
-def test_picture_and_table_have_the_same_median_of_inliers(recording: Recording) -> None:
-    half = dict(list(answers(recording, moving=True, shift=0.0).items())[:10])
-    results = {"one": compare(half, recording.truth)}
-    median = np.median(results["one"].inlier_counts)
-    assert median > 0.0
-    figure = inlier_picture(recording, results, np.full(30, 105.0))
-    labels = figure.axes[0].get_legend_handles_labels()[1]
-    assert f"one: median {median:.3g}" in labels
-
-
 @pytest.mark.parametrize(("residual", "enlarged"), [(0.11, "500"), (3.0, "20"), (700.0, "0.1")])
 def test_arrows_stay_inside(residual: float, enlarged: str) -> None:
     """All the points lie at the border of the image, and the arrows point outwards."""

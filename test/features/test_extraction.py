@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.features import extraction, methods
+from rs_localizer.features import methods
 from rs_localizer.features.extraction import FeatureExtractor, Features
-from rs_localizer.features.methods import FeatureError, root_descriptors
+from rs_localizer.features.methods import FeatureError
 
 # OpenCV 5 has AKAZE in its contrib modules only.
 KINDS = [
@@ -47,19 +47,6 @@ def test_blobs_are_found_in_their_middle(kind: str, blobs: Any) -> None:
     assert len(errors) > 40
     # OpenCV's own SIFT is 0.25 px off to the right and down.
     assert np.abs(np.median(errors, axis=0)).max() < 0.02
-
-
-def test_large_images_are_reduced_and_their_keypoints_are_not(
-    blobs: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(extraction, "_LONGEST_SIDE", 250)
-    image, middles = blobs
-    found = FeatureExtractor("sift", 1000).extract(image)
-    off = found.pixels[:, None] - middles
-    errors = off[np.arange(len(found)), np.linalg.norm(off, axis=2).argmin(1)]
-    errors = errors[np.linalg.norm(errors, axis=1) < 1.0]
-    assert len(errors) > 30
-    assert np.abs(np.median(errors, axis=0)).max() < 0.05
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -111,14 +98,6 @@ def test_sift_is_colmaps(look: Any) -> None:
     assert np.abs(np.median(off[near], axis=0)).max() < 0.03
     apart = np.linalg.norm(ours.descriptors[rows[near]] - described[columns[near]], axis=1)
     assert np.median(apart) < 80.0  # of 512, the length of each
-
-
-def test_descriptors_of_sift_have_the_length_of_a_byte() -> None:
-    histograms = np.random.default_rng(0).exponential(20.0, (50, 128)).astype(np.float32)
-    packed = root_descriptors(histograms)
-    assert packed.dtype == np.uint8
-    np.testing.assert_allclose(np.linalg.norm(packed.astype(float), axis=1), 512.0, atol=4.0)
-    assert not root_descriptors(np.zeros((1, 128), np.float32)).any()
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -8,11 +8,6 @@ import pytest
 from rs_localizer.features.extraction import balanced
 
 
-def test_all_are_kept_where_they_are_few() -> None:
-    pixels = np.random.default_rng(0).uniform(0, 100, (20, 2))
-    np.testing.assert_array_equal(balanced(pixels, pixels[:, 0], (100, 100), 20), np.arange(20))
-
-
 @pytest.mark.parametrize("size", [(640, 480), (479, 641), (300, 1000)])
 def test_dim_parts_keep_keypoints(size: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
@@ -29,9 +24,3 @@ def test_dim_parts_keep_keypoints(size: tuple[int, int]) -> None:
     kept = scores[rows]
     assert kept[rows < 2000].min() > np.median(scores[:2000])
     assert kept[rows >= 2000].mean() > np.mean(scores[2000:]) + 0.2
-
-
-def test_on_equal_terms_the_best_remain() -> None:
-    pixels = np.full((10, 2), 5.0)
-    scores = np.array([3.0, 9, 1, 8, 7, 2, 6, 5, 4, 0])
-    np.testing.assert_array_equal(balanced(pixels, scores, (640, 480), 4), [1, 3, 4, 6])

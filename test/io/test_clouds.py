@@ -18,6 +18,7 @@ from rs_localizer.io.clouds import (
     make_cloud,
     read_correspondences,
     select_inliers,
+    thinned,
 )
 from rs_localizer.io.messages import MessageError
 
@@ -267,3 +268,26 @@ def test_no_inliers_make_an_empty_cloud(cloud: SimpleNamespace) -> None:
     kept = select_inliers(table, np.zeros(12, dtype=bool), np.zeros(12))
     result = make_cloud(make_message, 0, "map", kept)
     assert (result.width, len(result.data)) == (0, 0)
+
+
+def test_of_many_points_the_best_are_kept_in_their_order(make_cloud_message: Make) -> None:
+    rows = [[*row, score] for row, score in zip(ROWS, [3, 9, 1, 8, 7] * 3, strict=False)]
+    fields = [*PLAIN, ("score", 20, 7)]
+    read = read_correspondences(make_cloud_message(rows, fields, point_step=24))
+    assert thinned(read, 12, (640, 480)) is read
+    few = thinned(read, 4, (640, 480))
+    assert few.scores is not None
+    assert few.scores.tolist() == [9, 8, 9, 9]  # of the eights, the first one
+    assert few.points[:, 0].tolist() == [0.5, 1.5, 3.0, 5.5]
+    assert len(few.table) == len(few.pixels) == 4
+
+
+def test_without_scores_each_part_of_the_image_keeps_as_many(make_cloud_message: Make) -> None:
+    crowd = [[0.0, 0.0, 1.0, 10.0, 10.0]] * 200
+    spread = [
+        [1.0, 0.0, 1.0, 40.0 * column, 40.0 * row] for column in range(1, 16) for row in range(12)
+    ]
+    read = read_correspondences(make_cloud_message(crowd + spread, PLAIN, point_step=20))
+    few = thinned(read, 190, (640, 480))
+    assert len(few.points) == 190
+    assert np.count_nonzero(few.points[:, 0] == 1.0) == len(spread)

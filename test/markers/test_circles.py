@@ -54,15 +54,6 @@ def test_centres_are_where_they_were_drawn(
     np.testing.assert_allclose(seen.pixels, project(grid.points, pose), atol=0.4)
 
 
-def test_spacing_is_that_of_opencv() -> None:
-    """Object points of an asymmetric grid: (2 j + i % 2, i) spacings (OpenCV's calibration.cpp)."""
-    points = CircleGrid(4, 11, 0.02, asymmetric=True).points
-    i, j = np.divmod(np.arange(44), 4)
-    flat = np.column_stack([2 * j + i % 2, -i, 0 * i]) * 0.02
-    np.testing.assert_allclose(points - points[0], flat, atol=1e-12)
-    np.testing.assert_allclose(points.min(axis=0) + points.max(axis=0), 0.0, atol=1e-12)
-
-
 def test_an_inverted_chessboard(
     render: Any, look: Any, project: Any, rectangle: Any, chessboard_cells: Any
 ) -> None:
@@ -75,12 +66,3 @@ def test_an_inverted_chessboard(
     plain = Chessboard(6, 4, 0.03)
     upright = MarkerDetector(MarkerMap(boards=(plain,))).detect(255 - image)
     np.testing.assert_array_equal(upright.pixels, seen.pixels)
-
-
-@pytest.mark.parametrize(
-    ("grid", "text"),
-    [((1, 5, 0.1), "needs 2x3 circles"), ((4, 4, 0.0), "spacing must be a length")],
-)
-def test_impossible_grids(grid: Any, text: str) -> None:
-    with pytest.raises(ValueError, match=text):
-        CircleGrid(*grid)

@@ -89,13 +89,6 @@ def test_a_mirrored_room_shows_in_an_image() -> None:
     assert "the map is mirrored: only a left-handed room" in str(shown(told, true))
 
 
-def test_a_marker_at_another_place_shows_in_an_image() -> None:
-    true = corner()
-    moved = [*true.markers]
-    moved[2] = Marker(moved[2].family, moved[2].id, moved[2].corners + np.array([0, 0, 0.4]))
-    assert "does not fit the image" in str(shown(MarkerMap(tuple(moved)), true))
-
-
 def test_a_few_markers_of_many_at_another_place_show_in_an_image() -> None:
     true = MarkerMap(
         wall("4x4_250", (9, 6), 0.12, 0.04, pose=Pose(np.array([0.5, 2.0, 0.0]), UPRIGHT))
@@ -103,17 +96,6 @@ def test_a_few_markers_of_many_at_another_place_show_in_an_image() -> None:
     places = iter(range(54))
     told = changed(true, lambda corners: corners + np.array([0, 0, 0.12 * (next(places) == 20)]))
     assert "do not lie as it says" in str(shown(told, true))
-
-
-def test_corners_that_were_not_found_say_nothing() -> None:
-    true = corner()
-    image = seen(true)
-    some = image.ids % 4 != 2
-    told = changed(true, lambda corners: corners[[1, 0, 3, 2]])
-    found = Detections(
-        image.ids[some], told.points[some], image.pixels[some], image.scores[some], (), (), (), ()
-    )
-    assert MapCheck(told).fault(found) is None
 
 
 def marker(id_: int, x: float, size: float = 0.1, rotation: Any = None) -> Marker:
@@ -139,12 +121,3 @@ BEHIND = np.diag([-1.0, 1.0, -1.0])
 def test_problems_of_a_map(markers: Any, boards: Any, text: str) -> None:
     (found,) = problems(MarkerMap(tuple(markers), tuple(boards)))
     assert text in found
-
-
-def test_prints_in_different_planes_do_not_overlap() -> None:
-    tilted = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    assert problems(MarkerMap((marker(0, 0), marker(1, 0.05, rotation=tilted)))) == []
-    above = Marker.at("4x4_50", 1, 0.1, Pose(np.array([0, 0, 0.1]), np.eye(3)))
-    assert problems(MarkerMap((marker(0, 0), above))) == []
-    turned = Rotation.from_euler("z", 45, degrees=True).as_matrix()
-    assert problems(MarkerMap((marker(0, 0), marker(1, 0.15, rotation=turned)))) == []

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.markers.detection import MarkerDetector
-from rs_localizer.markers.dictionaries import DictionaryError, pattern
+from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.edges import refine
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.maps import MarkerMap, wall
@@ -133,24 +133,6 @@ def test_markers_that_are_not_in_the_map_are_named(render: Any, look: Any) -> No
     assert found.repeated == ()
 
 
-def test_a_marker_that_is_seen_twice_is_not_used(render: Any, look: Any) -> None:
-    first, second, third = wall("5x5_50", (3, 1), 0.06, 0.03)
-    prints = [
-        (pattern(first.family, number), m.corners)
-        for number, m in ((0, first), (1, second), (0, third))
-    ]
-    found = MarkerDetector(MarkerMap((first, second))).detect(render(prints, look()))
-    assert found.ids.tolist() == [4, 5, 6, 7]
-    assert found.repeated == ("5x5_50 0",)
-
-
-def test_small_markers_are_left_out(render: Any, look: Any) -> None:
-    marker = Marker.at("4x4_50", 0, SIZE)
-    image = render([(pattern(marker.family, 0), marker.corners)], look(distance=0.9))
-    assert len(MarkerDetector(MarkerMap((marker,))).detect(image).ids) == 4
-    assert len(MarkerDetector(MarkerMap((marker,)), min_side=40.0).detect(image).ids) == 0
-
-
 def test_noise_shows_nothing() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
     marker_map = MarkerMap(
@@ -158,23 +140,6 @@ def test_noise_shows_nothing() -> None:
         (Charuco(5, 7, 0.04, 0.03, family("5x5_100")), Chessboard(6, 4, 0.03)),
     )
     assert len(MarkerDetector(marker_map).detect(noise).ids) == 0
-
-
-@pytest.mark.parametrize(
-    "image", [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4)), np.zeros((0, 4))]
-)
-def test_other_arrays_are_refused(image: Any) -> None:
-    with pytest.raises(ValueError, match=r"an image must be \(h,w\) uint8, got"):
-        MarkerDetector(MarkerMap(wall("4x4_50", (1, 1), 0.1, 0.1))).detect(image)
-
-
-def test_families_of_another_opencv_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    missing = Family("9x9_10", "9x9", 9, 10, 0)
-    with pytest.raises(DictionaryError, match="does not know the family 9x9_10"):
-        pattern(missing, 0)
-    changed = Family("4x4_50", "4x4", 4, 50, 1)
-    with pytest.raises(DictionaryError, match="another pattern for 4x4_50 0"):
-        pattern(changed, 0)
 
 
 # -- boards -------------------------------------------------------------------------------------
@@ -285,25 +250,3 @@ def test_charuco_corners_are_those_of_opencvs_board(
     found = detector.detect(render([(cells, outline)], pose))
     assert 3 <= len(found.ids) < 3 * (rows - 1)
     np.testing.assert_allclose(found.pixels, project(board.points[found.ids], pose), atol=0.15)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (8, 8), (2, 70_000), (70_000, 2), (40, 33_000)])
-def test_tiny_and_narrow_images_show_no_chessboard(shape: tuple[int, int]) -> None:
-    detector = MarkerDetector(MarkerMap(boards=(Chessboard(6, 4, 0.03),)))
-    assert len(detector.detect(np.zeros(shape, np.uint8)).ids) == 0
-
-
-def test_of_large_families_foreign_markers_are_told_now_and_then(render: Any, look: Any) -> None:
-    """What is in the map is found in every image, and in the same place."""
-    known, foreign = (Marker.at("5x5_1000", i, 0.08, Pose(np.array([x, 0.0, 0.0])))
-                      for i, x in ((3, -0.06), (700, 0.06)))  # fmt: skip
-    prints = [(pattern(one.family, one.id), one.corners) for one in (known, foreign)]
-    image = render(prints, look(4.0, 5.0))
-    detector = MarkerDetector(MarkerMap((known,)))
-    found = [detector.detect(image) for _ in range(31)]
-    told = [k for k, seen in enumerate(found) if seen.unknown]
-    assert told == [0, 1, 2, 3, 4, 30]
-    assert found[0].unknown == ("5x5_1000 700",)
-    for seen in found:
-        assert seen.ids.tolist() == [0, 1, 2, 3]
-        np.testing.assert_array_equal(seen.pixels, found[0].pixels)

@@ -14,7 +14,7 @@ from rs_localizer.markers.formats.common import Unsaid
 from rs_localizer.markers.formats.files import FORMATS, OWN, read_any, write_any
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Chessboard, Marker
+from rs_localizer.markers.prints import Marker
 
 SIZE = 0.16
 
@@ -120,11 +120,6 @@ def test_the_family_goes_along(tmp_path: Path, name: str, family: str) -> None:
             read_any(path, Unsaid(size=SIZE))
 
 
-def test_apriltag_ros_has_its_own_name_of_the_family(tmp_path: Path) -> None:
-    write_any(tmp_path / "map.yaml", some_map(), "apriltag_ros")
-    assert "tag_family: tag36h11\n" in (tmp_path / "map.yaml").read_text()
-
-
 def test_deviations_of_a_survey_are_kept(tmp_path: Path) -> None:
     known = np.array([0.001, 0.002, 0.0031, 0.01, 0.02, 0.03])
     marker = Marker(some_map().markers[0].family, 0, some_map().markers[0].corners, known)
@@ -179,18 +174,3 @@ def test_broken_json(tmp_path: Path, text: str, said: str) -> None:
 def test_broken_yaml(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(MarkerMapError, match=said):
         read_any(written(tmp_path, text))
-
-
-def test_what_a_format_cannot_hold(tmp_path: Path) -> None:
-    board = MarkerMap(boards=(Chessboard(6, 4, 0.03),))
-    mixed = MarkerMap((*some_map().markers, Marker.at("4x4_50", 0, SIZE)))
-    with pytest.raises(MarkerMapError, match="a field of WPILib cannot hold boards"):
-        write_any(tmp_path / "a.json", board, "wpilib")
-    with pytest.raises(MarkerMapError, match="TagSLAM holds markers of one family, found 4x4 and"):
-        write_any(tmp_path / "a.yaml", mixed, "tagslam")
-
-
-def test_wpilib_has_one_size(tmp_path: Path) -> None:
-    markers = [Marker.at("apriltag_36h11", id_, 0.1 * id_, Pose()) for id_ in (1, 2)]
-    with pytest.raises(MarkerMapError, match=r"tags of one size, found 0\.1 to 0\.2 m"):
-        write_any(tmp_path / "field.json", MarkerMap(tuple(markers)), "wpilib")

@@ -10,11 +10,11 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.markers.families import FAMILIES, family
+from rs_localizer.markers.families import family
 from rs_localizer.markers.map_files import read_marker_map, write_marker_map
 from rs_localizer.markers.maps import MarkerMap, MarkerMapError, wall
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid, Marker
+from rs_localizer.markers.prints import Charuco, Chessboard, Marker
 
 TURN = Rotation.from_euler("xyz", [20.0, -35.0, 110.0], degrees=True)
 IDENTITY = {"position": [0, 0, 0], "quaternion": [0, 0, 0, 1]}
@@ -89,23 +89,6 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     entries = yaml.safe_load((tmp_path / "map.yaml").read_text())["markers"]
     assert "size" in entries[0]
     assert "corners" in entries[-1]
-
-
-def test_wall_is_a_grid_around_its_middle() -> None:
-    pose = Pose(np.array([0.0, 5.0, 1.0]), TURN.as_matrix())
-    markers = wall("apriltag_36h11", (3, 2), 0.1, 0.05, pose=pose)
-    assert [marker.id for marker in markers] == list(range(6))
-    centres = TURN.inv().apply([m.points.mean(axis=0) - pose.position for m in markers])
-    expected = [[x, y, 0] for y in (0.075, -0.075) for x in (-0.15, 0, 0.15)]
-    np.testing.assert_allclose(centres, expected, atol=1e-12)
-    assert markers[4].size == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(
-    "name", ["4x4_50", "DICT_4X4_50", "tag36h11", "36h11", "DICT_APRILTAG_16h5", "aruco_6x6_250"]
-)
-def test_families_by_the_names_that_users_write(name: str) -> None:
-    assert family(name).name in FAMILIES
 
 
 PLAIN = {"family": "4x4_50", "id": 1, "size": 1, "position": [0, 0, 0]}
@@ -195,45 +178,3 @@ def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
 def test_faults_of_maps(tmp_path: Path, tree: Any, text: str) -> None:
     with pytest.raises(MarkerMapError, match=text):
         read(tmp_path, tree)
-
-
-def test_files_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(MarkerMapError, match="cannot be read: No such file"):
-        read_marker_map(tmp_path / "missing.yaml")
-    (tmp_path / "map.yaml").write_text("a: [1")
-    with pytest.raises(MarkerMapError, match="is not a YAML file"):
-        read_marker_map(tmp_path / "map.yaml")
-
-
-def test_a_written_map_explains_itself(tmp_path: Path) -> None:
-    write_marker_map(tmp_path / "wall.yaml", MarkerMap(wall("4x4_50", (2, 1), 0.1, 0.05)))
-    text = (tmp_path / "wall.yaml").read_text()
-    for words in ("metres", "quaternion: x y z w", "x to the right, y up, z out of the paper"):
-        assert words in text
-    assert len(read_marker_map(tmp_path / "wall.yaml").markers) == 2
-
-
-@pytest.mark.parametrize(
-    ("factor", "fine"), [(1.0, True), (0.995, True), (0.9, False), (2.0, False)]
-)
-def test_quaternions_have_unit_length(tmp_path: Path, factor: float, fine: bool) -> None:
-    quaternion = [factor * value for value in (0.5, 0.5, 0.5, 0.5)]
-    tree = {"map_frame": "map", "markers": [MARKER | {"quaternion": quaternion}]}
-    if fine:
-        read(tmp_path, tree)
-        return
-    with pytest.raises(MarkerMapError, match=r"\(x y z w\) must have the length 1, found"):
-        read(tmp_path, tree)
-
-
-@pytest.mark.parametrize("kind", ["circles", "asymmetric_circles", "chessboard"])
-@pytest.mark.parametrize("inverted", [False, True])
-def test_boards_without_marks_come_back(tmp_path: Path, kind: str, inverted: bool) -> None:
-    if kind == "chessboard":
-        board: Any = Chessboard(6, 4, 0.03, inverted=inverted)
-    else:
-        board = CircleGrid(4, 5, 0.03, kind == "asymmetric_circles", inverted)
-    write_marker_map(tmp_path / "map.yaml", MarkerMap(boards=(board,)))
-    (found,) = read_marker_map(tmp_path / "map.yaml").boards
-    assert found.name == board.name
-    np.testing.assert_allclose(found.points, board.points)

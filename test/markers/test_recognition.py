@@ -33,9 +33,3 @@ def test_the_size_of_a_chessboard(
     image = render([(cells, rectangle(0.22, 0.22 * (rows + 1) / (columns + 1)))], look(8.0))
     assert chessboard_size(image) == (columns, rows)
     assert recognized(image) == [f"a chessboard of {columns}x{rows} inner corners"]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_noise_is_nothing(seed: int) -> None:
-    image = np.random.default_rng(seed).integers(0, 255, (60, 80), dtype=np.uint8)
-    assert recognized(image) == []

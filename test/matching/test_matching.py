@@ -106,25 +106,9 @@ def test_the_two_nearest_within_the_gate(kind: str) -> None:
             assert np.isclose(table[owner, column], table[:, column].min(), rtol=1e-5)
 
 
-def test_numbers_beyond_all_bounds_raise_nothing() -> None:
-    huge = np.full((3, 4), 3e38, np.float32)
-    found = Matcher(make_map(3, descriptors=huge)).match(
-        keypoints(2, descriptors=-huge[:2]), Matching()
-    )
-    assert len(found) == 0
-
-
 def matched(matcher: Matcher, points: Keypoints, **settings: Any) -> dict[int, int]:
     found = matcher.match(points, Matching(**settings))
     return dict(zip(found.keypoints.tolist(), found.landmarks.tolist(), strict=True))
-
-
-def test_ids() -> None:
-    matcher = Matcher(make_map(4, ids=np.array([70, -5, 0, 33])))
-    given = keypoints(5, ids=np.array([33, 8, -5, 99, 70]))
-    assert matched(matcher, given) == {0: 3, 2: 1, 4: 0}
-    assert matcher.match(given, Matching()).scores is None
-    assert matched(matcher, keypoints(2, ids=np.array([8, 9]))) == {}
 
 
 def test_an_id_that_comes_twice_in_an_image() -> None:
@@ -165,30 +149,6 @@ def test_the_mutual_check_and_the_best_of_several() -> None:
     assert matched(matcher, keypoints(2, descriptors=bits(2, 2))) == {0: 0}
 
 
-def test_a_landmark_without_rivals_is_judged_by_those_of_the_others() -> None:
-    alone = Matcher(make_map(1, descriptors=bits(0)))
-    assert matched(alone, keypoints(1, descriptors=bits(31))) == {0: 0}
-
-
-def test_at_most_so_many_keypoints() -> None:
-    landmarks = np.random.default_rng(0).integers(0, 256, (30, 32), dtype=np.uint8)
-    matcher = Matcher(make_map(30, descriptors=landmarks))
-    first = matched(matcher, keypoints(30, descriptors=landmarks), max_keypoints=10)
-    assert first == {k: k for k in range(10)}
-    scores = np.arange(30.0)
-    best = matched(matcher, keypoints(30, descriptors=landmarks, scores=scores), max_keypoints=10)
-    assert best == {k: k for k in range(20, 30)}
-
-
-def test_by_what() -> None:
-    landmarks = bits(0, 20)
-    matcher = Matcher(make_map(2, ids=np.array([1, 2]), descriptors=landmarks))
-    both = keypoints(2, ids=np.array([2, 1]), descriptors=landmarks)
-    assert matched(matcher, both) == matched(matcher, both, by="descriptor") == {0: 0, 1: 1}
-    assert matched(matcher, both, by="id") == {0: 1, 1: 0}
-    assert matched(matcher, keypoints(2, ids=np.array([2, 1]))) == {0: 1, 1: 0}
-
-
 @pytest.mark.parametrize(
     ("landmarks", "points", "settings", "text"),
     [
@@ -227,9 +187,3 @@ def test_bytes_are_numbers_where_the_map_has_numbers() -> None:
     rows = np.random.default_rng(0).integers(0, 256, (20, 128), dtype=np.uint8)
     matcher = Matcher(make_map(20, descriptors=rows.astype(np.float32)))
     assert matched(matcher, keypoints(5, descriptors=rows[:5])) == {k: k for k in range(5)}
-
-
-def test_no_keypoints() -> None:
-    matcher = Matcher(make_map(2, ids=np.arange(2), descriptors=bits(0, 1)))
-    assert matched(matcher, keypoints(0, descriptors=np.zeros((0, 4), np.uint8))) == {}
-    assert matched(matcher, keypoints(0, ids=np.zeros(0, np.int64))) == {}

@@ -79,25 +79,6 @@ def is_seen(view: Camera, point: Any, pixel: Any) -> bool:
     return bool(z > 0.0 and np.abs(ray - (x / z, y / z)).max() < 1e-3)
 
 
-def test_the_gate_is_as_wide_as_the_prediction_is_uncertain(points: Any) -> None:
-    view = camera("ideal")
-    covariance = np.diag(np.repeat([0.03**2, 1e-8, 1e-8, 1e-8], 3))
-    wide = predicted(view, Prior(motion=MOTION, covariance=covariance), points, 20.0)
-    assert wide.gate == pytest.approx(3.0 * 0.03 * np.sqrt(400.0 * 410.0), rel=1e-3)
-    lost = predicted(view, Prior(motion=MOTION, covariance=np.eye(12)), points, 20.0)
-    assert lost.gate == pytest.approx(400.0)  # half the diagonal: everything
-
-
-def test_nothing_in_view() -> None:
-    behind = MOTION.rotation.T @ (np.array([[0.0, 0.0, -5.0]]) - MOTION.translation).T
-    found = predicted(camera("ideal"), SURE, np.ascontiguousarray(behind.T), 20.0)
-    assert len(found.landmarks) == 0
-    matcher = Matcher(Map(behind.T.copy(), None, np.zeros((1, 32), np.uint8), "map"))
-    given = Keypoints(0, np.zeros((1, 2)), None, np.zeros((1, 32), np.uint8), None, 0)
-    assert len(matcher.match(given, Matching(), camera("ideal"), SURE)) == 0
-    assert len(matcher.match(given, Matching(gate=0.0), camera("ideal"), SURE)) == 1
-
-
 @pytest.mark.parametrize("mutual", [True, False])
 def test_a_prediction_tells_apart_what_looks_the_same(points: Any, mutual: bool) -> None:
     """Only a hundred kinds of landmarks: by their looks alone none is recognized."""

@@ -24,6 +24,8 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.recording import make_camera_info
+from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import FrameSettings, simulate_frames
@@ -42,7 +44,7 @@ MOTION = Motion(
 )
 
 
-class MockLocalizer:
+class MockLocalizer(Localizer):
     """Knows one motion, keeps every second point, and remembers how it was made."""
 
     made: list[MockLocalizer]
@@ -378,3 +380,21 @@ def test_signs_and_frames_against_the_true_motion(
         assert frame.twist is not None
         assert np.allclose(frame.twist.linear, linear, atol=1e-6)
         assert np.allclose(frame.twist.angular, angular, atol=1e-6)
+
+
+def test_no_more_than_max_points_are_used_and_that_is_said_once() -> None:
+    camera = Camera(640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]))
+    rows = np.zeros(3000, [(name, "<f8") for name in "xyzuv"])
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-1.0, -0.7, 2.0), (1.0, 0.7, 4.0), (len(rows), 3))
+    pixels = camera.project(points)
+    for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
+        rows[name] = column
+    notices: list[str] = []
+    frames = FrameLocalizer(NodeConfig(max_points=500), lambda name, text: notices.append(text))
+    frames.calibrate(read_camera_info(make_camera_info(camera, 0)))
+    for stamp_ns in (1, 2):
+        result = frames.localize(make_cloud(make_message, stamp_ns, "map", rows))
+        assert isinstance(result, Localized)
+        assert len(result.estimate.inliers) == 500
+    assert notices == ["3000 points have come; max_points of them, 500, are used"]

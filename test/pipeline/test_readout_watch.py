@@ -25,7 +25,7 @@ from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.true_motion import RecordedMotion, sampled_way
+from rs_localizer.simulation.true_motion import RecordedMotion, sampled_states
 
 READOUT = 0.02
 CAMERA = Camera(
@@ -39,7 +39,7 @@ START = 600  # frames into the recording, where the hand is on its way
 @cache
 def clouds(direction: str = "top_to_bottom", count: int = FRAMES) -> list[Any]:
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
-    world = room(sampled_way(motion).positions, np.random.default_rng(0), count=3000)
+    world = room(sampled_states(motion).positions, np.random.default_rng(0), count=3000)
     first = motion.intervals_ns[0][0]
     stamps = [first + round((START + k) * 1e9 / 30) for k in range(count)]
     seen = FrameSettings(points=80, noise=0.5, outliers=0.1)

@@ -137,7 +137,8 @@ def parameters(description: list[Piece], executable: str) -> dict[str, Any]:
     return {k: v.arguments[0] if isinstance(v, Piece) else v for k, v in given.items()}
 
 
-MAP = {"markers.launch.py": {"marker_map": "wall.yaml"}}
+WALL = __file__  # any file that exists
+MAP = {"markers.launch.py": {"marker_map": WALL}}
 LOCALIZING = ["localizer.launch.py", "markers.launch.py", "features.launch.py"]
 DETECTORS = {"markers.launch.py": DetectorConfig, "features.launch.py": FeatureConfig}
 
@@ -197,17 +198,17 @@ def test_the_detector_knows_the_localizers_shutter(describe: Describe, tmp_path:
     file.write_text(
         "/**:\n  ros__parameters: {readout_time: 0.021, stamp_offset: 0.004, min_inliers: 20}\n"
     )
-    chosen = {"marker_map": "wall.yaml", "params_file": str(file), "stamp_offset": "0.005"}
+    chosen = {"marker_map": WALL, "params_file": str(file), "stamp_offset": "0.005"}
     description = describe("markers.launch.py", **chosen, min_side="12", use_sim_time="true")
     assert parameters(description, "marker_detector") == {
-        "marker_map": "wall.yaml", "readout_time": 0.021, "stamp_offset": 0.005,
+        "marker_map": WALL, "readout_time": 0.021, "stamp_offset": 0.005,
         "min_side": 12.0, "use_sim_time": True,
     }  # fmt: skip
     assert parameters(description, "localizer") == {"stamp_offset": 0.005, "use_sim_time": True}
 
 
 def test_features_and_localizer_share_the_camera(describe: Describe) -> None:
-    chosen = {"features": "orb", "max_keypoints": "500", "map_file": "map.npz", "image": "eye"}
+    chosen = {"features": "orb", "max_keypoints": "500", "map_file": WALL, "image": "eye"}
     description = describe("features.launch.py", **chosen, use_sim_time="true")
     launched = node(description, "feature_detector")
     assert dict(launched.options["remappings"]).keys() == {
@@ -216,14 +217,14 @@ def test_features_and_localizer_share_the_camera(describe: Describe) -> None:
     assert parameters(description, "feature_detector") == {
         "features": "orb", "max_keypoints": 500, "use_sim_time": True,
     }  # fmt: skip
-    assert parameters(description, "localizer") == {"map_file": "map.npz", "use_sim_time": True}
+    assert parameters(description, "localizer") == {"map_file": WALL, "use_sim_time": True}
 
 
 def test_markers_need_a_map(describe: Describe, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="marker_map must name a file"):
         describe("markers.launch.py")
     file = tmp_path / "detector.yaml"
-    file.write_text("/**:\n  ros__parameters: {marker_map: wall.yaml}\n")
+    file.write_text(f"/**:\n  ros__parameters: {{marker_map: {WALL}}}\n")
     description = describe("markers.launch.py", detector_params_file=str(file))
     assert "marker_map" not in parameters(description, "marker_detector")
 
@@ -249,6 +250,51 @@ def test_what_cannot_be_started_is_said_before_anything_is(
         describe(file, **MAP.get(file, {}), **given)
 
 
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("localizer.launch.py", "params_file"),
+        ("localizer.launch.py", "map_file"),
+        ("markers.launch.py", "marker_map"),
+        ("markers.launch.py", "detector_params_file"),
+        ("features.launch.py", "features_params_file"),
+        ("two_cameras.launch.py", "right_params_file"),
+    ],
+)
+def test_a_missing_file_ends_the_launch(describe: Describe, file: str, name: str) -> None:
+    given = MAP.get(file, {}) | {name: "/nowhere/wall.yaml"}
+    with pytest.raises(RuntimeError, match=f"^{name}: /nowhere/wall.yaml does not exist$"):
+        describe(file, **given)
+
+
+def test_a_missing_file_of_a_params_file_ends_the_launch(
+    describe: Describe, tmp_path: Path
+) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text("/**:\n  ros__parameters: {map_file: /nowhere/map.npz}\n")
+    with pytest.raises(RuntimeError, match=r"^map_file: /nowhere/map\.npz does not exist$"):
+        describe("localizer.launch.py", params_file=str(file))
+
+
+def test_a_misspelled_argument_is_named(describe: Describe) -> None:
+    from_launch = describe("localizer.launch.py")
+    launching = sys.modules["rs_localizer.ros.launching"]
+    names = sorted(declared(from_launch))
+    with pytest.raises(RuntimeError, match="'readout_tme': did you mean 'readout_time'"):
+        launching.need_known(["readout_tme:=0.02"], names)
+    launching.need_known(["readout_time:=0.02", "robot:=of an including launch file"], names)
+
+
+@pytest.mark.parametrize("file", LOCALIZING)
+def test_a_node_that_ends_ends_the_others_or_starts_again(describe: Describe, file: str) -> None:
+    for respawn in ("false", "true"):
+        description = describe(file, **MAP.get(file, {}), respawn=respawn)
+        for piece in description:
+            if piece.kind == "Node" and piece.options["package"] == "rs_localizer":
+                assert ("on_exit" in piece.options) == (respawn == "false")
+                assert piece.options.get("respawn", False) == (respawn == "true")
+
+
 def test_a_driver_that_is_installed_is_started(
     describe: Describe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,7 +302,7 @@ def test_a_driver_that_is_installed_is_started(
     index.mkdir(parents=True)
     (index / "usb_cam").touch()
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    description = describe("markers.launch.py", marker_map="wall.yaml", camera="usb_cam")
+    description = describe("markers.launch.py", marker_map=WALL, camera="usb_cam")
     assert node(description, "usb_cam_node_exe").options["package"] == "usb_cam"
 
 

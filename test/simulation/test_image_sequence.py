@@ -5,11 +5,9 @@ from __future__ import annotations
 import threading
 import time
 
-import cv2
-import numpy as np
 import pytest
 
-from rs_localizer.simulation.image_sequence import Encoding, in_order
+from rs_localizer.simulation.image_sequence import in_order
 
 
 def test_results_come_in_order_and_few_wait() -> None:
@@ -39,14 +37,3 @@ def test_an_error_ends_the_work() -> None:
     with pytest.raises(ValueError, match="five"):
         list(results)
     assert threading.active_count() == before
-
-
-def test_encodings() -> None:
-    image = cv2.GaussianBlur(
-        np.random.default_rng(0).integers(0, 256, (60, 80), np.uint8), (0, 0), 3.0
-    )
-    exact = np.frombuffer(Encoding("png")(image), np.uint8)
-    np.testing.assert_array_equal(cv2.imdecode(exact, cv2.IMREAD_UNCHANGED), image)
-    good = np.frombuffer(Encoding("jpeg", 95)(image), np.uint8)
-    assert np.abs(cv2.imdecode(good, cv2.IMREAD_UNCHANGED).astype(int) - image).max() < 6
-    assert len(Encoding("jpeg", 20)(image)) < len(good)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.simulation.planes import TexturedPlane
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
@@ -192,54 +192,6 @@ def test_exposure_blurs_along_the_motion_and_shifts_nothing() -> None:
     assert len(ramp) == pytest.approx(0.9 * travel, abs=2)
     np.testing.assert_allclose(np.diff(blurred[ramp]).mean(), 200.0 / travel, rtol=0.1)
     assert (blurred - sharp).sum() == pytest.approx(0.0, abs=100.0)  # half a pixel
-
-
-def test_a_cropped_image_is_a_part_of_the_whole_one() -> None:
-    planes = corner_of_a_room()
-    cropped = replace(CAMERA, roi=Roi(20, 10, 50, 40))
-    # The stamp is that of the first delivered row.
-    row_ns = round(0.04 / 71 * 1e9)
-    whole = Renderer(CAMERA, planes).image(MOTION, 300_000_000)
-    part = Renderer(cropped, planes).image(MOTION, 300_000_000 + 10 * row_ns)
-    assert np.abs(part.astype(int) - whole[10:50, 20:70]).max() <= 1
-
-
-def test_noise_and_vignetting() -> None:
-    plane = TexturedPlane(
-        np.array([2.0, 4.0, 4.0]), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]), 0.1,
-        np.full((80, 80), 100, np.uint8),
-    )  # fmt: skip
-    still = ConstantVelocity(np.zeros(3), np.zeros(3), 1.0)
-    noisy = Renderer(CAMERA, [plane], ImageSettings(noise=5.0))
-    image = noisy.image(still, 0, (1, 2))
-    assert image.std() == pytest.approx(5.0, rel=0.05)
-    assert image.mean() == pytest.approx(100.0, abs=0.3)
-    np.testing.assert_array_equal(image, noisy.image(still, 0, (1, 2)))
-    assert np.any(image != noisy.image(still, 0, (1, 3)))
-    dark = Renderer(CAMERA, [plane], ImageSettings(vignetting=0.4)).image(still, 0)
-    np.testing.assert_array_equal(dark[[0, 0, -1, -1], [0, -1, 0, -1]], 60)
-    assert dark[36, 48] == 100
-
-
-def test_rays_that_the_lens_does_not_have_see_the_background() -> None:
-    """A barrel so strong that it folds: its corners show nothing."""
-    camera = replace(CAMERA, D=[-0.9, 0.0, 0.0, 0.0])
-    image = Renderer(camera, corner_of_a_room()).image(MOTION, 0)
-    assert image[0, 0] == image[-1, -1] == 60
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"right": np.array([0.0, -1.0, 0.1])}, "perpendicular unit vectors"),
-        ({"texel": 0.0}, "a texel must be more than 0"),
-        ({"texture": np.zeros((3, 3, 3), np.uint8)}, "grey image of bytes, got .3, 3, 3."),
-        ({"texture": np.zeros((3, 3))}, "float64"),
-    ],
-)
-def test_impossible_planes_are_refused(change: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        replace(chessboard(), **change)
 
 
 @pytest.mark.parametrize(

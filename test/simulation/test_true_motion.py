@@ -56,20 +56,6 @@ def test_velocities_are_the_derivatives_of_the_poses(name: str) -> None:
         np.testing.assert_allclose(state.angular[1], turn.as_rotvec() / (2.0 * step), atol=1e-7)
 
 
-def test_constant_velocity_is_what_it_says() -> None:
-    motion = ConstantVelocity(np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.0, 2.0]), 3.0)
-    state = motion.state(1_000_000_000, np.array([-1.0, 0.0]))
-    # At the start: looks along x with z up, and moves forward.
-    np.testing.assert_allclose(state.rotations[0] @ [0, 0, 1], [1, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(state.rotations[0] @ [0, 1, 0], [0, 0, -1], atol=1e-15)
-    np.testing.assert_allclose(state.positions, [[0, 0, 0], [2, 0, 0]], atol=1e-15)
-    # Turning about the camera's down axis is turning to the right; the way stays straight.
-    np.testing.assert_allclose(
-        state.rotations[1] @ [0, 0, 1], [np.cos(0.5), -np.sin(0.5), 0], atol=1e-15
-    )
-    np.testing.assert_allclose(state.linear[1], [-2 * np.sin(0.5), 0, 2 * np.cos(0.5)], atol=1e-14)
-
-
 @pytest.mark.parametrize(("name", "tolerance"), [("smoothed", 1e-3), ("interpolated", 1e-6)])
 def test_spline_follows_the_recording(name: str, tolerance: float) -> None:
     t = np.linspace(0.1, 3.9, 401)
@@ -110,18 +96,7 @@ def test_gaps_split_the_motion() -> None:
     np.testing.assert_allclose(after.positions[0], recorded_way(np.array([1.5]))[0][0], atol=1e-3)
 
 
-def test_sparse_recordings_are_interpolated() -> None:
-    t = np.arange(0.0, 4.0, 0.04)
-    state = RecordedMotion(recording(t), "optical", 0.05).state(START_NS, t)
-    np.testing.assert_allclose(state.positions, recorded_way(t)[0], atol=1e-12)
-
-
 @pytest.mark.parametrize("count", [1, 4])
 def test_too_short_recordings_are_refused(count: int) -> None:
     with pytest.raises(ValueError, match=rf"more than 4 poses .* has {count} poses"):
         RecordedMotion(recording(np.arange(count) * 0.01))
-
-
-def test_unknown_axes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"axes must be one of .*; got 'up'"):
-        RecordedMotion(recording(np.arange(9) * 0.01), axes="up")

@@ -213,16 +213,6 @@ def test_the_truth_is_among_the_solutions(motion):
     assert np.mean(np.nanmin(error, axis=1) < 1e-7) > 0.999
 
 
-def test_solutions_come_first_and_by_the_length_of_v():
-    v = solutions(problems(1003, 10, physical=True))[0]
-    length = np.linalg.norm(v, axis=2)
-    count = np.isfinite(length).sum(axis=1)
-    assert count.max() >= 3
-    for lengths, n in zip(length, count, strict=True):
-        assert np.isfinite(lengths[:n]).all()
-        assert (np.diff(lengths[:n]) >= 0).all()
-
-
 def test_the_bound_is_a_parameter():
     p = problems(1000, 11, physical=True, noise=1.0)
     narrow, usual, wide = (solutions(p, bound=b)[0] for b in (0.1, 0.6, 3.0))
@@ -245,23 +235,6 @@ def batch(points, rays, tau, rotations):
         np.arange(6 * h).reshape(h, 6), rotations, 1, models,
     )  # fmt: skip
     return np.moveaxis(models, (2, 0), (0, 1))
-
-
-def test_models_are_the_nearest_rotation_times_the_initial_one():
-    p = problems(101, 12, physical=True)
-    v, c, w, t = solutions(p)
-    models = batch(p.points @ p.start, p.rays, p.tau, p.start)
-    exists = np.isfinite(v[..., 0])
-    assert (np.isfinite(models).all(axis=2) == exists).all()
-    assert (np.isfinite(models).any(axis=2) == exists).all()
-    for sample, number in zip(*np.nonzero(exists), strict=True):
-        x, y, z = v[sample, number]
-        u, _, vt = np.linalg.svd(np.array([[1, -z, y], [z, 1, -x], [-y, x, 1]]))
-        expected = [(u @ vt @ p.start[sample]).ravel()]
-        expected += [part[sample, number] for part in (c, w, t)]
-        np.testing.assert_allclose(
-            models[sample, number], np.concatenate(expected), rtol=1e-6, atol=1e-8
-        )
 
 
 def test_the_unit_of_length_and_the_origin_do_not_matter():
@@ -347,26 +320,3 @@ def test_degenerate_samples_end_without_noise_and_leave_others_alone(kind):
         assert not np.isinf(models).any()
         exists = np.isfinite(models)
         assert (exists.all(axis=2) == exists.any(axis=2)).all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"points": np.zeros((2, 5, 3))}, r"r6p takes points \(h,6,3\).* got \(2, 5, 3\)"),
-        ({"rays": np.zeros((2, 6, 3))}, r"\(2, 6, 3\)"),
-        ({"tau": np.zeros((1, 6))}, r"\(1, 6\)"),
-    ],
-)
-def test_wrong_shapes_are_refused_with_what_was_found(changes, said):
-    given = {
-        "points": np.zeros((2, 6, 3)),
-        "rays": np.zeros((2, 6, 2)),
-        "tau": np.zeros((2, 6)),
-    }
-    with pytest.raises(ValueError, match=said):
-        r6p.find_solutions(**(given | changes))
-
-
-def test_no_samples_give_no_solutions():
-    found = r6p.find_solutions(np.zeros((0, 6, 3)), np.zeros((0, 6, 2)), np.zeros((0, 6)))
-    assert [x.shape for x in found] == [(0, 20, 3)] * 4

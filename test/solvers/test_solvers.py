@@ -156,19 +156,6 @@ def test_joint_gives_the_solutions_of_both(minimal):
             np.testing.assert_array_equal(together[:, k], alone[:, 0])
 
 
-@pytest.mark.parametrize("name", ROLLING)
-def test_one_initial_rotation_serves_all_samples(minimal, name):
-    p = minimal.problem(11, find_solver(name).sample_size, 0.05, 0.05, 0.05, seed=10)
-    one = solve_minimal(name, p.points, p.rays, p.tau, p.start[0])
-    many = solve_minimal(name, p.points, p.rays, p.tau, np.repeat(p.start[:1], 11, axis=0))
-    turned = solve_minimal(name, p.points @ p.start[0].T, p.rays, p.tau)
-    for a, b in zip(one, many, strict=True):
-        np.testing.assert_array_equal(a, b)
-    for k in (1, 2, 3):
-        np.testing.assert_allclose(turned[k], one[k], rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(turned[0] @ p.start[0], one[0], atol=1e-8)
-
-
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_turning_the_world_turns_only_the_rotation(minimal, name):
     p = minimal.problem(9, find_solver(name).sample_size, 0.05, 0.05, 0.05, seed=11)

@@ -56,6 +56,15 @@ _LONG = 2.0
 _LOOK_PERIOD = 0.5
 
 
+# DDS loses best-effort messages in many packets before any subscriber sees them: of images of
+# 500 kB, 614 kB and 922 kB 20, 4 and 2 of 20 came, with Ubuntu's socket buffers.
+_LARGE = (
+    ": best-effort messages above half a megabyte are lost in the network stack; have them "
+    "published reliably or as image/compressed, or raise net.core.rmem_max"
+)
+_LARGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """An input of a node."""
@@ -211,4 +220,6 @@ class Inputs:
         if len(unfit) == len(publishers):
             return "; ".join(unfit), True
         count = len(publishers)
-        return f"it has {count} publisher{'s' if count > 1 else ''}, but no message comes", False
+        text = f"it has {count} publisher{'s' if count > 1 else ''}, but no message comes"
+        unreliable = subscription.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        return text + (_LARGE if unreliable and wanted in _LARGE_TYPES else ""), False

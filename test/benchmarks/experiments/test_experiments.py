@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 
 import pytest
-from benchmarks.experiments.table import EXPERIMENTS
 
+from benchmarks.__main__ import EXPERIMENTS
 from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
 from benchmarks.experiments import augmented_reality, readout_time
 from benchmarks.experiments.results import Context, Result, Verdict
@@ -142,14 +142,12 @@ OPEN = {
         for what in ("localized", "orientation")
     ),
     "inertial.offset",
-    "inertial.planes-error",
     *(
         f"inertial.vibration-{noise}-{what}"
         for noise in ("0.3px", "1px")
         for what in ("rate", "coverage")
     ),
     *(f"inertial.few-{few}" for few in (7, 8, 12)),
-    "inertial.planes-coverage",
     "inertial.cost",
     *(
         f"inertial.minimal-{motion}-{few}-{known}"
@@ -188,6 +186,7 @@ def result(name: str) -> Result:
         return EXPERIMENTS[name](context)
 
 
+@pytest.mark.bench
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
 def test_verdicts(name: str) -> None:
     claims = {claim.name: claim for claim in result(name).claims}
@@ -204,6 +203,7 @@ def test_verdicts(name: str) -> None:
     assert wrong == []
 
 
+@pytest.mark.bench
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
 def test_everything_is_said_and_shown(name: str) -> None:
     found = result(name)
@@ -219,12 +219,3 @@ def test_everything_is_said_and_shown(name: str) -> None:
         assert {len(row) for row in table.rows} == {len(table.columns)}
     for figure in found.figures.values():
         assert all(axes.lines for axes in figure.axes)
-
-
-def test_every_solver_is_timed() -> None:
-    from rs_localizer.solvers.table import SOLVERS
-
-    timed = {row[0] for row in result("timings").tables["timings"].rows}
-    assert timed == set(SOLVERS)
-    for row in result("timings").tables["timings"].rows:
-        assert all(value > 0.0 for value in row[2:6])

@@ -35,12 +35,6 @@ def test_shares(count: int, trials: int, low: float, high: float) -> None:
     assert found.trials == trials
 
 
-def test_nothing_is_known_of_nothing() -> None:
-    empty = share(np.zeros(0, bool))
-    assert (empty.low, empty.high) == (0.0, 1.0)
-    assert bootstrap(lambda chosen: 1.0, 0).high == np.inf
-
-
 def test_frames_of_one_recording_count_less() -> None:
     rng = np.random.default_rng(0)
     groups = np.repeat(np.arange(40), 5)
@@ -53,6 +47,7 @@ def test_frames_of_one_recording_count_less() -> None:
     assert width["apart"] < 1.4 * (plain.high - plain.low)
 
 
+@pytest.mark.bench
 def test_intervals_hold_the_true_figures() -> None:
     rng = np.random.default_rng(1)
     held = {"share": [], "grouped": [], "median": [], "ratio": []}
@@ -81,10 +76,6 @@ def test_the_median_of_trials_without_result_is_infinite() -> None:
     assert found.value == found.high == np.inf
     few = quantile(np.array([1.0, 2.0, np.inf]))
     assert (few.value, few.low, few.high) == (2.0, -np.inf, np.inf)
-
-
-def test_one_group_says_nothing_of_a_ratio() -> None:
-    assert bootstrap(lambda chosen: 1.0, 5, np.zeros(5, int)).high == np.inf
 
 
 def test_several_intervals_are_wider() -> None:

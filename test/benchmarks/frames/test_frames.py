@@ -11,7 +11,7 @@ import pytest
 
 import rs_localizer as rsl
 from benchmarks.frames import __main__ as command
-from benchmarks.frames.compared import changes_of, read, totals
+from benchmarks.frames.compared import changes_of, changes_together, read, totals
 from benchmarks.frames.conditions import (
     BENCHES,
     HAND,
@@ -19,6 +19,7 @@ from benchmarks.frames.conditions import (
     Condition,
     Points,
     conditions,
+    named,
     turning,
 )
 from benchmarks.frames.generated import generate
@@ -90,6 +91,17 @@ def test_refusals_count_and_frames_of_a_recording_are_one() -> None:
     assert totals({"a/x": every, "b/y": fewer})["all"]["localized"] == 90.0
 
 
+def test_small_changes_are_certain_of_many_conditions_together() -> None:
+    before = {f"a/{k}": judged(40, seed=k) for k in range(30)}
+    after = {f"a/{k}": judged(40, wider=0.8, farther=1.05, seed=k) for k in range(30)}
+    changes = {name: changes_of(before[name], after[name]) for name in before}
+    together = changes_together(before, after, changes)
+    assert together["pose@m"].sign == -1
+    assert together["localized"].sign == 0
+    assert together["deg"].after == pytest.approx(1.05)
+    assert together["deg"].sign == -1
+
+
 def test_conditions_have_names_of_their_own_and_every_bench_some() -> None:
     names = [(one.bench, one.name) for one in conditions()]
     assert len(set(names)) == len(names)
@@ -150,13 +162,19 @@ def test_the_gyroscope_says_how_the_camera_turns() -> None:
 
 
 def test_calibrations_are_off_as_described() -> None:
-    (centre,) = (one for one in conditions() if one.name == "centre 1px/rich/1px")
+    centre = named("camera/centre 1px/rich/1px")
     for variant in range(4):
         off = camera_of(centre, variant).K - centre.camera.matrix
         assert np.linalg.norm(off[:2, 2]) == pytest.approx(1.0)
-    (focal,) = (one for one in conditions() if one.name == "focal 0.3%/wall/1px")
+    focal = named("camera/focal 0.3%/wall/1px")
     ratios = {round(float(camera_of(focal, k).K[0, 0] / focal.camera.focal), 6) for k in range(4)}
     assert ratios == {0.997, 1.003}
+    boards = named("camera/ten boards/rich/1px")
+    for variant in range(2):
+        found = camera_of(boards, variant)
+        off = found.K - boards.camera.matrix
+        assert 1e-3 < np.abs(off).max() < 3.0  # px
+        np.testing.assert_allclose(found.D, boards.camera.distortion, atol=0.03)
 
 
 def test_settings_have_dotted_names() -> None:

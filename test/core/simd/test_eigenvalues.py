@@ -81,18 +81,3 @@ def test_lanes_with_different_problems_do_not_disturb_each_other():
     np.testing.assert_array_equal(found[3], np.zeros(n))
     np.testing.assert_allclose(found[4], lapack(plain), atol=1e-12)
     np.testing.assert_allclose(found[6], np.sort(np.diag(plain)), atol=1e-12)
-
-
-@pytest.mark.parametrize("scale", [1e-60, 1e60])
-def test_the_scale_does_not_matter(scale):
-    matrices = np.random.default_rng(3).normal(size=(LANES, 8, 8))
-    for ours, expected in zip(find(scale * matrices), find(matrices), strict=True):
-        np.testing.assert_allclose(ours / scale, expected, rtol=1e-9)
-
-
-def test_lane_arrays_begin_at_cache_lines_and_with_zeros():
-    for count in (1, 5, 441):
-        array = lane_array(count)
-        assert array.shape == (count * LANES,)
-        assert array.ctypes.data % (8 * LANES) == 0
-        assert not array.any()

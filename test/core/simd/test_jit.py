@@ -119,15 +119,6 @@ def test_a_damaged_file_is_removed_and_compiled_anew(
     assert hits(again) == 1
 
 
-def test_a_lost_file_is_compiled_anew(load: Load, cache: Path) -> None:
-    load()(1.5)
-    files(cache, ".nbc")[0].unlink()
-    assert load()(1.5) == 3.0
-    again = load()
-    again(1.5)
-    assert hits(again) == 1
-
-
 def test_a_full_disk_is_a_warning(
     load: Load, cache: Path, recwarn: pytest.WarningsRecorder
 ) -> None:
@@ -197,13 +188,6 @@ def test_a_cache_of_another_user_is_not_used(load: Load, cache: Path) -> None:
     with pytest.warns(RuntimeWarning, match="not used"):
         assert compiled(1.5) == 3.0
     assert hits(compiled) == 0
-
-
-def test_a_folder_that_cannot_be_made_is_a_warning(load: Load, cache: Path) -> None:
-    cache.write_text("a file in its place")
-    compiled = load()
-    with pytest.warns(RuntimeWarning, match="compiled again at the next start"):
-        assert compiled(1.5) == 3.0
 
 
 def test_a_kernel_is_compiled_anew_when_one_that_it_calls_changes(

@@ -53,15 +53,3 @@ def test_use_keeps_a_folder(cache: Path) -> None:
     jit._mark(old)
     jit._remove_others(used)
     assert old.is_dir()
-
-
-def test_a_folder_is_marked_once_a_day(cache: Path) -> None:
-    today = folder(cache, "0" * 16, 0.5)
-    before = today.stat().st_mtime_ns
-    jit._mark(today)
-    assert today.stat().st_mtime_ns == before
-
-
-def test_a_folder_that_is_gone_is_no_error(cache: Path) -> None:
-    jit._mark(cache / ("0" * 16))
-    jit._remove_others(cache / "nowhere" / ("0" * 16))
