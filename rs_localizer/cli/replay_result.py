@@ -240,6 +240,7 @@ def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:
         ("samples of the smoothed motion", str(len(smoothed.frames))),
         (f"  bridged, listed in {BRIDGED}", str(len(smoothed.bridged))),
         ("  left out, not determined", str(smoothed.undetermined)),
+        ("  shaken faster than it follows, left as they were", str(smoothed.shaken)),
     ]
 
 

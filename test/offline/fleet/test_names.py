@@ -30,11 +30,6 @@ def test_what_is_there_besides_is_not_overwritten(tmp_path: Path) -> None:
     assert folder_names([tmp_path / "summary.csv"], {"summary.csv"}) == [name]
 
 
-def test_a_folder_keeps_its_point(tmp_path: Path) -> None:
-    (tmp_path / "flight.2").mkdir()
-    assert folder_names([tmp_path / "flight.2"]) == ["flight.2"]
-
-
 def test_all_names_differ_and_are_names() -> None:
     rng = random.Random(0)
     parts = ["a", "b", "a_b", "b.x"]
