@@ -20,10 +20,9 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
-from benchmarks.frames.compared import compare, totals, totals_line
+from benchmarks.frames.compared import compare, read, totals, totals_line, write
 from benchmarks.frames.conditions import BENCHES, Condition, conditions
 from benchmarks.frames.judged import Judged, judge
 from benchmarks.frames.timed import times
@@ -33,7 +32,7 @@ _SHOWN = {
     "twist@mid": "twist@m", "over_5_sigma": ">5s", "deg_50": "deg", "deg_95": "deg95",
     "mm_50": "mm", "deg/s_50": "deg/s", "m/s_50": "m/s", "sharp_turn_s": "shp_t@s",
     "sharp_turn": "shp_turn", "sharp_way": "shp_way", "sharp_angular": "shp_w",
-    "sharp_linear": "shp_v", "ms": "ms",
+    "sharp_linear": "shp_v", "ms": "ms", "ms_95": "ms95",
 }  # fmt: skip
 
 
@@ -97,6 +96,8 @@ def _run(options: argparse.Namespace) -> int:
             if not judged or wanted[len(judged) - 1].bench != condition.bench:
                 heads = " ".join(f"{name:>8}" for name in _SHOWN.values())
                 sys.stdout.write(f"{condition.bench:{width}} {heads}\n")
+                if judged:  # who stops the run keeps the benches that are done
+                    write(options.out, wanted, judged)
             judged.append(one)
             table.writerow(row)
             file.flush()
@@ -105,17 +106,10 @@ def _run(options: argparse.Namespace) -> int:
             sys.stdout.flush()
         if pool:
             pool.shutdown()
-    names = [f"{one.bench}/{one.name}" for one in wanted]
+    write(options.out, wanted, judged)
     sys.stdout.write(f"\n{totals_line('', None)}\n")
-    for bench, total in totals(dict(zip(names, judged, strict=True))).items():
+    for bench, total in totals(read(options.out)).items():
         sys.stdout.write(f"{totals_line(bench, total)}\n")
-    np.savez_compressed(
-        options.out.with_suffix(".npz"),
-        names=names,
-        counts=[len(one.reasons) for one in judged],
-        figures=np.concatenate([one.figures for one in judged]),
-        reasons=np.concatenate([one.reasons for one in judged]),
-    )
     return 0
 
 

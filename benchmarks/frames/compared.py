@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 from scipy.stats import t as student
 
+from benchmarks.frames.conditions import Condition
 from benchmarks.frames.judged import FIGURES, REGION, Judged, far_off, quantile, sharpness
 from benchmarks.independent.rotations import Array
 
@@ -66,6 +67,17 @@ def compare(options: argparse.Namespace) -> int:
     return int(any(change.sign < 0 for each in changes.values() for change in each.values()))
 
 
+def write(table: Path, conditions: Sequence[Condition], judged: Sequence[Judged]) -> None:
+    """The frames of the first conditions, beside their table."""
+    np.savez_compressed(
+        table.with_suffix(".npz"),
+        names=[f"{one.bench}/{one.name}" for one in conditions[: len(judged)]],
+        counts=[len(one.reasons) for one in judged],
+        figures=np.concatenate([one.figures for one in judged]),
+        reasons=np.concatenate([one.reasons for one in judged]),
+    )
+
+
 def read(table: Path) -> dict[str, Judged]:
     """The frames beside a table, by ``bench/condition``."""
     kept = np.load(table.with_suffix(".npz"))
@@ -90,8 +102,8 @@ def changes_of(before: Judged, after: Judged) -> dict[str, Change]:
         errors = [one.of(figure)[both] for one in (before, after)]
         if len(errors[0]) and np.isfinite(errors[0]).all() and np.isfinite(errors[1]).all():
             found[name] = _error(errors[0], errors[1], before.of("recording")[both])
-    low, high = (float(np.mean(one.of("ms"))) for one in (before, after))
-    found["ms"] = Change(low, high, np.nan, np.nan, 0)
+    taken = [quantile(one.of("ms"), 0.5) for one in (before, after)]
+    found["ms"] = Change(taken[0], taken[1], np.nan, np.nan, 0)
     return found
 
 
@@ -190,14 +202,22 @@ def totals(judged: Mapping[str, Judged]) -> dict[str, dict[str, float]]:
             row[name] = quantile(joined.of(figure)[some], 0.5)
         for name in _SHARP:
             row[f"s_{name}"] = sharpness(joined.of(name)[some])
-        row["ms"] = float(np.mean(joined.of("ms")))
+        row["ms"], row["ms_95"] = (quantile(joined.of("ms"), q) for q in (0.5, 0.95))
         found[bench] = row
     return found
 
 
 def totals_line(label: str, row: Mapping[str, float] | None) -> str:
     """One line of the table; without a row: the names of the columns."""
-    names = ("localized", *_SHARES[1:-1], ">5s", *_ERRORS, *(f"s_{name}" for name in _SHARP), "ms")
+    names = (
+        "localized",
+        *_SHARES[1:-1],
+        ">5s",
+        *_ERRORS,
+        *(f"s_{name}" for name in _SHARP),
+        "ms",
+        "ms_95",
+    )
     cells = (f"{name if row is None else f'{row[name]:.3g}':>10}" for name in names)
     return f"{label:12}{''.join(cells)}"
 

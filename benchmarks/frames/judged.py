@@ -87,7 +87,9 @@ class Judged:
                 f"sharp_{name}": sharpness(self.of(name))
                 for name in ("turn_s", "turn", "way", "angular", "linear")
             },
-            "ms": float(np.mean(self.of("ms"))),
+            # What is compiled on the way, is in a few frames.
+            "ms": quantile(self.of("ms"), 0.5),
+            "ms_95": quantile(self.of("ms"), 0.95),
             "reasons": ", ".join(
                 f"{count} {reason}"
                 for reason, count in Counter(filter(None, self.reasons)).most_common()

@@ -3,31 +3,43 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import shlex
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, many
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.batch import (
+    Plan,
+    add_batch_arguments,
+    folder_name,
+    inputs,
+    is_batch,
+    run_batch,
+)
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
-from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
-from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.image_input import clock_of, of_bag, of_files, tell_times
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
-from rs_localizer.cli.shots import clock_of, of_bag, of_files, tell_times
-from rs_localizer.cli.topics import add_topics, given_topics
+from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.evaluation.calibration_plots import save_plots
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
-from rs_localizer.io.calibration.files import read_calibration, write_calibration
+from rs_localizer.io.calibration import read_calibration, write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.topics import IMU
+from rs_localizer.markers.boards import BoardSizes
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.offline.image_sources import (
     Carried,
     Shot,
@@ -42,6 +54,9 @@ from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.observe import Observed, in_order
+
+# Of each result of many.
+_SHUTTER = "shutter.yaml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,7 +106,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="directory for pictures; of many recordings, its name in the folder of each",
     )
-    add_fleet_arguments(parser)
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="write the files although the result is refused (the exit code stays 1)",
+    )
+    add_batch_arguments(parser)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,14 +122,18 @@ class _Source:
     camera: Camera | None
     size: tuple[int, int]
     imu: ImuRecording | None = None
+    map: MarkerMap | None = None  # of images
+    own_stamps: bool = True
 
 
-def run(args: argparse.Namespace) -> None:
-    if is_fleet(args):
+def run(args: argparse.Namespace) -> Figures | None:
+    if is_batch(args):
         given_settings(args)  # refuses wrong ones before there are workers
-        many.calibrate(args)
+        _calibrate_batch(args)
     else:
-        calibrate_one(argparse.Namespace(**vars(args), recording=args.recordings[0]))
+        alone = argparse.Namespace(**vars(args), recording=args.recordings[0])
+        return _figures(calibrate_one(alone))
+    return None
 
 
 def calibrate_one(args: argparse.Namespace) -> Calibration:
@@ -122,8 +146,9 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
     camera = replace(camera, scan_direction=config.scan_direction)
     with tqdm(total=len(source.images), unit="image", desc="localize", disable=None) as bar:
         found = calibrate(
-            camera, source.images, intrinsics=intrinsics, imu=source.imu, done=bar.update
-        )
+            camera, source.images, intrinsics=intrinsics, imu=source.imu,
+            own_stamps=source.own_stamps, done=bar.update,
+        )  # fmt: skip
     tell(found, args.rate)
     if intrinsics:
         tell_lens(found)
@@ -132,10 +157,10 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
     if args.plots is not None:
         save_plots(camera, found, args.plots)
     refusal = verdict.refusal(found)
+    if args.out is not None and (args.force or not refusal):
+        _write(args, found, source.map, intrinsics, config)
     if refusal:
         raise ValueError(refusal)
-    if args.out is not None:
-        _write(found, args.out, intrinsics, config)
     return found
 
 
@@ -157,7 +182,7 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
         source = of_files(path, camera, clock_of(path, args.rate))
         found = _detected(args, source.shots)
         tell_times(source.clock)
-        return found
+        return replace(found, own_stamps=path.is_dir() and args.rate is None)
     with open_bag(path) as bag:
         imu = None
         if args.imu is not None:
@@ -190,19 +215,19 @@ def _unknown(size: tuple[int, int]) -> Camera:
 
 def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Source:
     """Markers or a board in images."""
-    detector = FrameDetector(DetectorConfig(), lambda name, text: None, find_map(args))
+    marker_map = find_map(args)
+    detector = FrameDetector(DetectorConfig(), lambda name, text: None, marker_map)
     detector.warm_up()
+    sizes = BoardSizes(marker_map)
     images: list[Observed] = []
-    camera, size, count = None, (0, 0), 0
+    camera, size = None, (0, 0)
     for shot in tqdm(shots, unit="image", desc="detect", disable=None):
-        if isinstance(shot, Carried):
-            continue
-        count += 1
-        if not isinstance(shot.image, Image):
+        if isinstance(shot, Carried) or not isinstance(shot.image, Image):
             continue
         height, width = shot.image.pixels.shape
         size = (width, height)
         found = detector.detect(shot.image).detections
+        sizes.look(shot.image.pixels, len(found.points) > 0)
         images.append(Observed(shot.image.stamp_ns, found.points, found.pixels))
         if camera is None and (args.calibration is not None or is_bag(args.recording)):
             camera = read_camera_info(shot.camera_info).camera(0.0, NodeConfig().scan_direction)
@@ -212,24 +237,99 @@ def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Sou
                     f"{camera.size[0]}x{camera.size[1]}"
                 )
     seen = sum(len(image.points) > 0 for image in images)
-    print(f"{seen} of {count} images show the map")
-    return _Source(images, camera, size)
+    print(f"{seen} of {len(images)} images show the map")
+    if fault := sizes.fault():
+        print(f"warning: {fault}", file=sys.stderr)
+    return _Source(images, camera, size, map=marker_map)
 
 
-def _write(found: Calibration, path: Path, intrinsics: bool, config: NodeConfig) -> None:
+def _write(
+    args: argparse.Namespace,
+    found: Calibration,
+    marker_map: MarkerMap | None,
+    intrinsics: bool,
+    config: NodeConfig,
+) -> None:
+    """FILE.yaml, and beside it the lens and the map as they were found; and what comes next."""
+    path: Path = args.out
     path.parent.mkdir(parents=True, exist_ok=True)
-    lens = path.with_name(f"{path.stem}_camera_info.yaml")
-    files = (path, lens) if intrinsics else (path,)
-    with atomic_files(*files) as (part, *lens_part):
-        part.write_text(
-            "/**:\n  ros__parameters:\n"
-            f"    readout_time: {verdict.readout_time(found)!r}\n"
-            f"    readout_time_deviation: {found.deviation!r}\n"
-            f"    scan_direction: {verdict.scan_direction(found)}\n"
-            + imu_parameters(found, config),
-            encoding="utf-8",
-        )
-        if lens_part:
-            write_calibration(lens_part[0], found.fit.camera)
-    for file in files:
+    lens, shape = args.calibration, args.map
+    text = (
+        "/**:\n  ros__parameters:\n"
+        f"    readout_time: {verdict.readout_time(found)!r}\n"
+        f"    readout_time_deviation: {found.deviation!r}\n"
+        f"    scan_direction: {verdict.scan_direction(found)}\n" + imu_parameters(found, config)
+    )
+    writers: dict[Path, Callable[[Path], object]] = {}
+    if intrinsics:
+        values = found.lens._asdict().items()
+        text += "".join(f"    calibration.{name}: {value:.4g}\n" for name, value in values)
+        lens = path.with_name(f"{path.stem}_camera_info.yaml")
+        writers[lens] = lambda part: write_calibration(part, found.fit.camera)
+    if marker_map is not None and verdict.shape_is_free(found):
+        shape = path.with_name(f"{path.stem}_map.yaml")
+        bent = marker_map.with_points(verdict.moved(found, marker_map.points))
+        writers[shape] = lambda part: write_marker_map(part, bent)
+    writers[path] = lambda part: part.write_text(text, encoding="utf-8")
+    with atomic_files(*writers) as parts:
+        for part, write in zip(parts, writers.values(), strict=True):
+            write(part)
+    for file in writers:
         print(f"written: {file}")
+    print(f"next: {_next(args, path, lens, shape)}")
+
+
+def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | None) -> str:
+    """The commands that make poses of this recording with what was found."""
+    recording: Path = args.recording
+    seen, poses = (out.with_name(f"{out.stem}_{what}") for what in ("seen", "poses"))
+    options = {"--map": shape, "--calibration": lens, "--rate": args.rate, "--image": args.image}
+    given = [
+        word for name, value in options.items() if value is not None for word in (name, str(value))
+    ]
+    replay = ["replay", str(recording), "--params", str(out), "--out", str(poses)]
+    if shape is None:  # a recording of correspondences
+        return shlex.join(["rs_localizer", *replay])
+    replay[1] = str(seen)
+    detect = ["rs_localizer", "detect", str(recording), *given, "--out", str(seen)]
+    return f"{shlex.join(detect)} && {shlex.join(['rs_localizer', *replay])}"
+
+
+def _calibrate_batch(args: argparse.Namespace) -> None:
+    """``calibrate`` with each of many recordings."""
+    plots = folder_name("--plots", args.plots)
+    options = ("intrinsics", "imu", "board", "map")
+    given = [name for name in options if getattr(args, name) not in (None, False)]
+    files = inputs(args.map, args.calibration, args.params)
+    kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
+    run_batch(argparse.Namespace(**vars(args) | {"plots": plots}), Plan(kind, lambda _: files))
+
+
+def _calibrate_warm(_: argparse.Namespace) -> None:
+    """Compile what images of any kind, and many at once, need."""
+    from rs_localizer.markers.detection import warm_up as warm_up_markers
+    from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.trajectory.warm_up import warm_up
+
+    warm_up_markers()
+    FrameLocalizer(NodeConfig()).warm_up()
+    warm_up()
+
+
+def _calibrate_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
+    """One of them: its result in ``out``, and figures for the summary."""
+    out.mkdir(parents=True)
+    plots = None if args.plots is None else out / args.plots
+    own = {"recording": recording, "out": out / _SHUTTER, "plots": plots}
+    return _figures(calibrate_one(argparse.Namespace(**vars(args) | own)))
+
+
+def _figures(found: Calibration) -> Figures:
+    return {
+        "readout time (ms)": 1e3 * verdict.readout_time(found),
+        "deviation (ms)": 1e3 * found.deviation,
+        "scan direction": str(verdict.scan_direction(found)),
+        "images": found.images,
+        "with a pose": len(found.posed.times),
+        "noise (px)": float(found.fit.deviation),
+    }

@@ -41,9 +41,15 @@ def tell(found: Calibration, rate: float | None) -> None:
 
 def tell_lens(found: Calibration) -> None:
     """The numbers of the lens."""
-    values, state = found.fit.border_covariance, found.fit.state
-    deviations = np.sqrt(np.diag(values)[1 : 1 + len(state.lens)])
+    state = found.fit.state
+    deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
     names = ("fx", "fy", "cx", "cy")
+    print(f"{'lens':26} {found.fit.camera.distortion_model}")
     for k, value in enumerate(state.lens):
         name = names[k] if k < len(names) else f"D[{k - len(names)}]"
         print(f"{name:26} {value:.5g} +- {found.inflation * deviations[k]:.2g}")
+    errors = found.lens
+    print(
+        f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
+        f"{100.0 * errors.focal_length:.2g} %, distortion {errors.distortion:.2g} px at the corners"
+    )

@@ -67,6 +67,37 @@ class Acceleration:
 
 
 @dataclass(frozen=True, slots=True)
+class CalibrationErrors:
+    """What the calibration of the lens may be off by: parts of an error that do not overlap.
+
+    The defaults are those of a board that was held before an ordinary camera for half a minute;
+    ``rs_localizer calibrate`` writes those of its own.
+    """
+
+    principal_point: float = setting(
+        1.0,
+        "Standard deviation of the principal point, in pixels",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    focal_length: float = setting(
+        0.002,
+        "Standard deviation of the focal length, as a share of it",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    distortion: float = setting(
+        0.5,
+        "Standard deviation of the distortion at the corners of the image, in pixels",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+
+    def __post_init__(self) -> None:
+        check(self, "calibration.")
+
+
+@dataclass(frozen=True, slots=True)
 class LocalizerConfig:
     """Settings of one pose estimate (keyword arguments of :class:`rs_localizer.Localizer`)."""
 
@@ -111,6 +142,7 @@ class LocalizerConfig:
     )
     velocity_prior: VelocityPrior = field(default_factory=VelocityPrior)
     acceleration: Acceleration = field(default_factory=Acceleration)
+    calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
     map_deviation: float = setting(
         0.0,
         "How well the points of the map are known, in m (one standard deviation; neighbours are "

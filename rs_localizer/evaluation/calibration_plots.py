@@ -19,7 +19,7 @@ _DPI = 130
 
 
 def save_plots(camera: Camera, calibration: Calibration, directory: Path) -> None:
-    """Write ``readout_time.png`` and ``residuals.png`` into a directory."""
+    """Write ``readout_time.png``, ``residuals.png`` and ``coverage.png`` into a directory."""
     directory.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(10.0, 4.0), dpi=_DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -29,6 +29,9 @@ def save_plots(camera: Camera, calibration: Calibration, directory: Path) -> Non
     figure = Figure(figsize=(10.0, 4.0), dpi=_DPI, layout="constrained")
     _residuals(list(figure.subplots(1, 2)), camera, calibration)
     figure.savefig(directory / "residuals.png")
+    figure = Figure(figsize=(6.0, 6.0 * camera.height / camera.width), dpi=_DPI)
+    _coverage(figure.subplots(), camera, calibration)
+    figure.savefig(directory / "coverage.png")
 
 
 def _likelihood(axes: Axes, camera: Camera, calibration: Calibration) -> None:
@@ -52,6 +55,13 @@ def _blocks(axes: Axes, calibration: Calibration) -> None:
     axes.axhspan(value - band, value + band, color=_GREY, alpha=0.6)
     axes.axhline(value, color=_ORANGE)
     axes.set(xlabel="time (s)", ylabel="readout time (ms)", title="Its parts (two deviations)")
+
+
+def _coverage(axes: Axes, camera: Camera, calibration: Calibration) -> None:
+    seen = calibration.posed.observations
+    axes.plot(*seen.pixels[seen.trusted].T, ",", color=_BLUE)
+    axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal",
+             title="Where the map was shown")  # fmt: skip
 
 
 def _residuals(pair: list[Axes], camera: Camera, calibration: Calibration) -> None:

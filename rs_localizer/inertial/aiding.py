@@ -31,8 +31,6 @@ _FIRST = np.arange(3)
 # Points that fit with the gyroscope, beyond those that fit without it, that speak for it although
 # it contradicts what the camera sees.
 _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
-
-
 # Deviations of an offset that was found at once, as the filter takes them.
 _WIDER = 3.0
 
@@ -228,16 +226,28 @@ class GyroscopeAid:
         self._state = Alone.NONE
         self._watch.judge(False, None)
         posterior = found.joint_covariance[:PARAMETERS, :PARAMETERS]
+        possible = True
         if foreseen.predicted is not None:
-            self.filter.update(foreseen.predicted, step, posterior)
+            possible = self.filter.update(foreseen.predicted, step, posterior)
         else:
             self.filter.begin(foreseen.within, step[RATE], posterior)
         (delay, variance), unit = found.delay, self._readout_time
-        self.filter.hear_delay(unit * delay, unit**2 * variance)
+        if not (self.filter.hear_delay(unit * delay, unit**2 * variance) and possible):
+            self._doubt()
+
+    def _doubt(self) -> None:
+        """Take the time offset for less well known, and look for it again: of all that a gyroscope
+        is off by, only its stamps change at once, with the clock of one of the two.
+        """
+        if self._settings.estimate_time_offset:
+            self.filter.doubt_offset()
+            self._search = self._search or OffsetSearch(self.filter.errors.time_offset)
 
     def _contradicted(self, middle_ns: int, alone: Estimate | Failure | None) -> None:
         """Take in a frame that does not agree, with the result of the camera alone if it counts."""
         self.filter.forget_motion()
+        if alone:
+            self._doubt()
         self._watch.judge(bool(alone), _believed(middle_ns, alone) if alone else None)
         self._state = Alone.NONE
         if alone:

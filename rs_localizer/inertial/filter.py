@@ -46,9 +46,14 @@ RATE = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 """Of a step: what the gyroscope leaves to the points."""
 # Deviations between two values of one offset.
 _FAR = 4.0
-# What the rows say of the time offset is not believed beyond chance (squared, in variances),
-# but then its variance grows.
-_MOST_DELAY, _WIDER = 16.0, 2.0
+# What the rows say of the time offset is not believed beyond chance (squared, in variances).
+_MOST_DELAY = 16.0
+# Nor is the offset that the motion says, when it moves by so much (squared) more than the frame's
+# information lets it.
+_MOST_MOVED, _ROUNDING = 16.0, 1e-12  # s^2
+# A doubt makes the variance of the time offset so many times as large: one by chance costs little,
+# four in a row make of a tenth of a millisecond all that is assumed of an IMU nobody knows.
+_DOUBT = 16.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,15 +139,18 @@ class GyroscopeFilter:
         )  # fmt: skip
         return Predicted(motion_of(later), predicted, with_parameters)
 
-    def update(self, predicted: Predicted, step: Array, posterior: Array) -> None:
+    def update(self, predicted: Predicted, step: Array, posterior: Array) -> bool:
         """Take in a frame that was found near its prediction.
 
         Args:
             step: (18,) from the prediction to the estimate.
             posterior: (18,18) covariance of the estimate.
+
+        Returns:
+            Whether the time offset that it says can be, by the one that is known.
         """
-        everything = np.arange(PARAMETERS)
-        self._update(everything, predicted.covariance, predicted.with_parameters, step, posterior)
+        before, tied = predicted.covariance, predicted.with_parameters
+        return self._update(np.arange(PARAMETERS), before, tied, step, posterior)
 
     def begin(self, within: TurnWithin, left: Array, posterior: Array) -> None:
         """Take in a frame of which nothing was known but its turn.
@@ -154,33 +162,38 @@ class GyroscopeFilter:
         with_parameters = within.by_parameters @ self.errors.covariance
         self._update(RATE, within.known.error, with_parameters, left, posterior)
 
-    def hear_delay(self, delay: float, variance: float) -> None:
+    def doubt_offset(self) -> None:
+        """Frames contradict the time offset: it is not known as well as it seemed to be."""
+        covariance = self.errors.covariance.copy()
+        known = float(covariance[OFFSET, OFFSET])
+        covariance[OFFSET, OFFSET] = min(_DOUBT * known, max(known, OFFSET_DEVIATION**2))
+        self._set(np.append(self.errors.bias, self.errors.time_offset), covariance)
+
+    def hear_delay(self, delay: float, variance: float) -> bool:
         """Take in what the rows of a frame say of the time offset: to be later by ``delay`` (s).
 
         Their motion stays what it is, so that this is not the best filter, but a consistent one.
+
+        Returns:
+            Whether it can be: a delay beyond chance is not believed.
         """
         covariance = self.errors.covariance
-        known = float(covariance[OFFSET, OFFSET])
-        total = known + variance + JITTER**2
+        total = float(covariance[OFFSET, OFFSET]) + variance + JITTER**2
         if not self._settings.estimate_time_offset:
-            return
-        beyond = math.isinf(variance) and delay != 0.0
-        if beyond or delay * delay > _MOST_DELAY * total:
-            # The offset is not known as well as it seemed to be.
-            wider = covariance.copy()
-            wider[OFFSET, OFFSET] = min(_WIDER * known, max(known, OFFSET_DEVIATION**2))
-            self._set(np.append(self.errors.bias, self.errors.time_offset), wider)
-            return
+            return True
+        if (math.isinf(variance) and delay != 0.0) or delay * delay > _MOST_DELAY * total:
+            return False
         if math.isinf(variance):
-            return
+            return True
         gain = covariance[:, OFFSET] / total
         parameters = np.append(self.errors.bias, self.errors.time_offset) + gain * delay
         self._with_motion = self._with_motion - np.outer(self._with_motion[:, OFFSET], gain)
         self._set(parameters, covariance - np.outer(gain, covariance[OFFSET]))
+        return True
 
     def _update(
         self, known: IntArray, before: Array, with_parameters: Array, step: Array, posterior: Array
-    ) -> None:
+    ) -> bool:
         """``known``: places of a step that the prediction ``before`` was of."""
         whole = len(known) == PARAMETERS
         after = np.ascontiguousarray(posterior if whole else posterior[np.ix_(known, known)])
@@ -194,6 +207,8 @@ class GyroscopeFilter:
         self._with_motion = np.ascontiguousarray(tied)
         bias, time_offset = errors.bias + change[BIAS], errors.time_offset + float(change[OFFSET])
         self.errors = GyroscopeErrors(bias, time_offset, covariance, errors.noise)
+        gained = errors.covariance[OFFSET, OFFSET] - covariance[OFFSET, OFFSET]
+        return bool(change[OFFSET] ** 2 <= _MOST_MOVED * max(gained, 0.0) + _ROUNDING)
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.dictionaries import Gray
+from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Charuco, Chessboard, CircleGrid
 
 # Half the window of the sub-pixel search, as a share of the smallest distance between corners:
@@ -25,6 +27,8 @@ _LARGEST_SEARCH = 1024
 # OpenCV's search fails in smaller ones (px), which cannot show a board.
 _SMALLEST_SEARCH = 16
 _REFINE_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+# The size of a chessboard is looked at in one of so many images, until so many have shown it.
+_EVERY, _SIZES = 10, 9
 # Circles between this many pixels and this share of the image are looked for: OpenCV's own upper
 # limit of 5000 px is soon passed by a board that fills the image of a large sensor.
 _LEAST_AREA, _LARGEST_SHARE = 12.0, 0.02
@@ -58,6 +62,52 @@ def find_chessboard(image: Gray, board: Chessboard, previous: Array | None = Non
         previous,
         lambda candidate: _starts_black(candidate, image),
     )
+
+
+class BoardSizes:
+    """Looks now and then whether a chessboard has the size that it is said to have.
+
+    Args:
+        marker_map: with the chessboard, if there is one.
+    """
+
+    def __init__(self, marker_map: MarkerMap) -> None:
+        boards = [board for board in marker_map.boards if isinstance(board, Chessboard)]
+        self._board = boards[0] if boards else None
+        self._images = self._next = 0
+        self._sizes: list[tuple[int, int]] = []
+
+    def look(self, image: Gray, seen: bool) -> None:
+        """Take an image, and whether the board as it is said to be was found in it."""
+        self._images += 1
+        if self._board is None or self._images <= self._next or len(self._sizes) >= _SIZES:
+            return
+        self._next = self._images + _EVERY
+        upright = cv2.bitwise_not(image) if self._board.inverted else image
+        small = _shrunk(np.asarray(upright, np.uint8))[0]
+        if min(small.shape) < _SMALLEST_SEARCH:
+            return
+        flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+        if found and meta is not None:
+            rows, columns = sorted(meta.shape)
+            own = sorted((self._board.columns, self._board.rows))
+            larger = rows >= own[0] and columns >= own[1]
+            if larger or not seen:  # smaller ones are parts of it
+                self._sizes.append((columns, rows))
+
+    def fault(self) -> str | None:
+        """The size that most of the images show, where it is another one."""
+        if self._board is None or not self._sizes:
+            return None
+        size, count = Counter(self._sizes).most_common(1)[0]
+        own = max(self._board.columns, self._board.rows), min(self._board.columns, self._board.rows)
+        if size == own or 2 * count <= len(self._sizes):
+            return None
+        return (
+            f"the images show a chessboard of {size[0]}x{size[1]} inner corners, --board or the "
+            f"map says {self._board.columns}x{self._board.rows}: corners may be mistaken for others"
+        )
 
 
 def find_charuco(

@@ -20,6 +20,7 @@
         position: [0.0, 0.0, 0.0]
         quaternion: [0.0, 0.0, 0.0, 1.0]
         inverted: false            # optional: white on black paper
+        shape: [[0.0, 0.0, 0.001], ...]  # optional, of any board: how far from flat each corner is
       - type: circles              # or asymmetric_circles, OpenCV's pattern
         columns: 4                 # circles
         rows: 11
@@ -145,18 +146,19 @@ def _board(entry: Entry) -> Board:
     spacing = entry.number("spacing") if "circles" in kind else 0.0
     square = 0.0 if "circles" in kind else entry.number("square")
     pose = _pose(entry)
+    shape = entry.take("shape", list) if "shape" in entry else None
     if kind != _CHARUCO:
         inverted = entry.take("inverted", bool, False)
         entry.finish()
         with entry.named():
             if kind == _CHESSBOARD:
-                return Chessboard(columns, rows, square, pose, inverted)
-            return CircleGrid(columns, rows, spacing, kind == _ASYMMETRIC, inverted, pose)
+                return Chessboard(columns, rows, square, pose, inverted, shape)
+            return CircleGrid(columns, rows, spacing, kind == _ASYMMETRIC, inverted, pose, shape)
     marker, name = entry.number("marker"), entry.take("family", str)
     first_id, legacy = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
     entry.finish()
     with entry.named():
-        return Charuco(columns, rows, square, marker, family(name), first_id, legacy, pose)
+        return Charuco(columns, rows, square, marker, family(name), first_id, legacy, pose, shape)
 
 
 def _pose(entry: Entry) -> Pose:
@@ -178,6 +180,8 @@ _EXPLANATION = """\
 #     Axes of a print: x to the right, y up, z out of the paper toward who looks at it.
 #     [0, 0, 0, 1]: the same axes as the map. [0.7071, 0, 0, 0.7071]: upright in a map whose z is up
 #     and whose y points into the wall.
+#   shape: of a board: how far from flat each of its points is, x y z along its axes, as calibrate
+#     finds it
 #   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
 #   position_deviation, rotation_deviation: standard deviations of a survey along the axes of
 #     map_frame, m and rad
@@ -211,6 +215,7 @@ def _marker_entry(marker: Marker) -> dict[str, Any]:
 
 def _board_entry(board: Board) -> dict[str, Any]:
     sizes: dict[str, Any] = {"columns": board.columns, "rows": board.rows}
+    shape = {} if board.shape is None else {"shape": _numbers(np.round(board.shape, 7))}
     if not isinstance(board, Charuco):
         inverted = {"inverted": True} if board.inverted else {}
         if isinstance(board, Chessboard):
@@ -218,7 +223,7 @@ def _board_entry(board: Board) -> dict[str, Any]:
         else:
             kind = _ASYMMETRIC if board.asymmetric else _CIRCLES
             sizes["spacing"] = float(board.spacing)
-        return {"type": kind} | sizes | _pose_entry(board.pose) | inverted
+        return {"type": kind} | sizes | _pose_entry(board.pose) | inverted | shape
     return (
         {"type": _CHARUCO}
         | sizes
@@ -230,6 +235,7 @@ def _board_entry(board: Board) -> dict[str, Any]:
             "legacy": board.legacy,
         }
         | _pose_entry(board.pose)
+        | shape
     )
 
 

@@ -6,13 +6,13 @@ Its file is read and written by :mod:`rs_localizer.markers.map_files`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Charuco, Marker
+from rs_localizer.markers.prints import Board, Charuco, Marker, with_points
 
 
 class MarkerMapError(ValueError):
@@ -69,6 +69,23 @@ class MarkerMap:
         The ``id`` of a detected corner is its row here.
         """
         return np.concatenate([item.points for item in (*self.markers, *self.boards)])
+
+    def with_points(self, points: Array) -> MarkerMap:
+        """The same map with its corners (n,3) elsewhere, in the order of :attr:`points`."""
+        sizes = [len(item.points) for item in (*self.markers, *self.boards)]
+        parts = np.split(points, np.cumsum(sizes)[:-1])
+        own = len(self.markers)
+        return replace(
+            self,
+            markers=tuple(
+                replace(marker, corners=part)
+                for marker, part in zip(self.markers, parts[:own], strict=True)
+            ),
+            boards=tuple(
+                with_points(board, part)
+                for board, part in zip(self.boards, parts[own:], strict=True)
+            ),
+        )
 
 
 def wall(

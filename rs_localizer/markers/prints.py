@@ -8,7 +8,7 @@ upright print seen from its front. Corners of boards go row by row from the top 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -91,17 +91,19 @@ class Chessboard:
     square: float  # m
     pose: Pose = field(default_factory=Pose)
     inverted: bool = False  # white squares on black, with black paper around them
+    shape: Array | None = None  # (n,3) m, how far from flat each corner is, in the print's axes
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:  # OpenCV's own limit
             raise ValueError(f"a board needs 3x3 inner corners, got {self.columns}x{self.rows}")
         _not_too_many(self.columns, self.rows)
         _positive(self.square, "square")
+        _check_shape(self, self.columns * self.rows)
 
     @property
     def points(self) -> Array:
         """Inner corners (n,3), row by row."""
-        return self.pose(_grid(self.columns, self.rows, self.square))
+        return self.pose(_bent(_grid(self.columns, self.rows, self.square), self.shape))
 
     @property
     def spacing(self) -> float:
@@ -133,22 +135,24 @@ class CircleGrid:
     asymmetric: bool = False
     inverted: bool = False  # white circles on black
     pose: Pose = field(default_factory=Pose)
+    shape: Array | None = None  # (n,3) m, how far from flat each centre is, in the print's axes
 
     def __post_init__(self) -> None:
         if self.columns < 2 or self.rows < 3:
             raise ValueError(f"a grid needs 2x3 circles, got {self.columns}x{self.rows}")
         _not_too_many(self.columns, self.rows)
         _positive(self.spacing, "spacing")
+        _check_shape(self, self.columns * self.rows)
 
     @property
     def points(self) -> Array:
         """Centres (n,3), row by row."""
         if not self.asymmetric:
-            return self.pose(_grid(self.columns, self.rows, self.spacing))
+            return self.pose(_bent(_grid(self.columns, self.rows, self.spacing), self.shape))
         row, column = np.mgrid[: self.rows, : self.columns].astype(np.float64)
         x = 2.0 * column + row % 2.0 - 0.5 * (2 * self.columns - 1)
         flat = np.stack([x, 0.5 * (self.rows - 1) - row, np.zeros_like(x)], axis=-1)
-        return self.pose(flat.reshape(-1, 3) * self.spacing)
+        return self.pose(_bent(flat.reshape(-1, 3) * self.spacing, self.shape))
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -178,6 +182,7 @@ class Charuco:
     first_id: int = 0
     legacy: bool = False
     pose: Pose = field(default_factory=Pose)
+    shape: Array | None = None  # (n,3) m, how far from flat each corner is, in the print's axes
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 2 or self.columns * self.rows < 6:
@@ -187,6 +192,7 @@ class Charuco:
         _not_too_many(self.columns, self.rows)
         _positive(self.square, "square")
         _positive(self.marker, "marker")
+        _check_shape(self, (self.columns - 1) * (self.rows - 1))
         if self.marker >= self.square:
             raise ValueError(
                 f"the markers of {self.marker} m do not fit into squares of {self.square} m"
@@ -208,7 +214,8 @@ class Charuco:
     @property
     def points(self) -> Array:
         """Inner corners (n,3) of the squares, row by row: (columns - 1) x (rows - 1)."""
-        return self.pose(_grid(self.columns - 1, self.rows - 1, self.square))
+        flat = _grid(self.columns - 1, self.rows - 1, self.square)
+        return self.pose(_bent(flat, self.shape))
 
     @property
     def markers(self) -> list[Marker]:
@@ -237,6 +244,21 @@ class Charuco:
 
 
 Board = Chessboard | CircleGrid | Charuco
+
+
+def with_points(board: Board, points: Array) -> Board:
+    """The board with its points at (n,3) in the map."""
+    flat = replace(board, shape=None).points
+    return replace(board, shape=(points - flat) @ board.pose.rotation)
+
+
+def _bent(flat: Array, shape: Array | None) -> Array:
+    return flat if shape is None else flat + shape
+
+
+def _check_shape(board: Board, count: int) -> None:
+    if board.shape is not None:
+        object.__setattr__(board, "shape", finite(board.shape, (count, 3), "shape"))
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:

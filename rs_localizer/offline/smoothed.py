@@ -15,6 +15,10 @@ from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.trajectory.observe import Observed
 from rs_localizer.trajectory.smoothing import smooth
 
+# Recordings are smoothed in windows of so many seconds and so much on both sides of them: what an
+# image farther away says is forgotten, since accelerations fade within 0.1 s.
+_WINDOW_NS, _MARGIN_NS = 60_000_000_000, 2_000_000_000
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedFrames:
@@ -23,6 +27,7 @@ class SmoothedFrames:
     frames: list[Localized]
     bridged: IntArray  # (b,) ns, stamps of those without an image of their own
     undetermined: int  # moments that neighbours do not determine
+    shaken: int  # images that shake faster than a smooth motion, and keep their own poses
 
 
 def smooth_frames(
@@ -39,39 +44,68 @@ def smooth_frames(
     Raises:
         ValueError: when the frames are no single recording of one map, or too few.
     """
-    config = localizer.config
-    calibration = localizer.calibration
-    if calibration is None or not localized:
+    if localizer.calibration is None or not localized:
         raise ValueError("no image has a pose: there is nothing to smooth")
     maps = {frame.map_frame for frame in localized}
     if len(maps) > 1:
         raise ValueError(f"points lie in several frames: {', '.join(sorted(maps))}")
     once = {frame.input_stamp_ns: frame for frame in localized}
-    frames = [once[stamp] for stamp in sorted(once)]
+    stamps = np.array(sorted(once), dtype=np.int64)
+    inputs = np.array(sorted(set(stamps_ns)), dtype=np.int64)
+    if rate is not None:
+        count = int((stamps[-1] - stamps[0]) * 1e-9 * rate) + 1
+        inputs = stamps[0] + np.round(np.arange(count) * 1e9 / rate).astype(np.int64)
+    # The last window takes a rest that would be short.
+    windows = max(int((stamps[-1] - stamps[0]) // _WINDOW_NS), 1)
+    edges = stamps[0] + _WINDOW_NS * np.arange(1, windows)
+    result, bridged, undetermined, shaken = [], [], 0, 0
+    for k, wanted in enumerate(np.split(inputs, np.searchsorted(inputs, edges))):
+        first = 0 if k == 0 else np.searchsorted(stamps, edges[k - 1] - _MARGIN_NS)
+        last = len(stamps) if k == windows - 1 else np.searchsorted(stamps, edges[k] + _MARGIN_NS)
+        near = [once[int(stamp)] for stamp in stamps[first:last]]
+        part = _smoothed(localizer, near, wanted, rate is not None)
+        result += part.frames
+        bridged.append(part.bridged)
+        undetermined += part.undetermined
+        shaken += part.shaken
+    return SmoothedFrames(result, np.concatenate(bridged), undetermined, shaken)
+
+
+def _smoothed(
+    localizer: FrameLocalizer, frames: list[Localized], inputs: IntArray, sampled_evenly: bool
+) -> SmoothedFrames:
+    """Frames at the stamps ``inputs`` (m,) by the motion through ``frames``."""
+    config, calibration = localizer.config, localizer.calibration
+    assert calibration is not None
     camera = calibration.camera(config.readout_time, config.scan_direction)
     images = [
         Observed(frame.input_stamp_ns, _columns(frame, "xyz"), _columns(frame, "uv"))
         for frame in frames
     ]
-    found = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
+    motion = smooth(camera, images, [frame.estimate for frame in frames], config.stamp_offset)
     delay, _ = published_moment(config, camera, 0)
-    inputs = np.array(sorted(set(stamps_ns)), dtype=np.int64)
-    if rate is not None:
-        first, last = frames[0].input_stamp_ns, frames[-1].input_stamp_ns
-        count = int((last - first) * 1e-9 * rate) + 1
-        inputs = first + np.round(np.arange(count) * 1e9 / rate).astype(np.int64)
     moments = inputs + delay
-    sampled = found.sample(moments)
+    sampled = motion.sample(moments)
+    once = {} if sampled_evenly else {frame.input_stamp_ns: frame for frame in frames}
+    own_poses = {
+        frame.input_stamp_ns
+        for frame, shaken in zip(frames, motion.shaken, strict=True)
+        if shaken and not sampled_evenly
+    }
     nothing = frames[0].inliers[:0]
-    result = []
-    kept = np.zeros(len(moments), dtype=np.bool_)
+    result, kept, shaken = [], np.zeros(len(moments), dtype=np.bool_), 0
     for k, estimate in enumerate(sampled.estimates):
+        stamp = int(inputs[k])
+        own = once.get(stamp)
+        if own is not None and stamp in own_poses:
+            result.append(own)
+            kept[k], shaken = True, shaken + 1
+            continue
         if not sampled.determined[k]:
             continue
-        own = once.get(int(inputs[k])) if rate is None else None
         frame = localizer.mounted(
             Localized(
-                input_stamp_ns=int(inputs[k]),
+                input_stamp_ns=stamp,
                 stamp_ns=int(moments[k]),
                 map_frame=frames[0].map_frame,
                 body_frame=calibration.frame,
@@ -85,8 +119,9 @@ def smooth_frames(
         if not isinstance(frame, Refusal):
             result.append(frame)
             kept[k] = True
-    bridged = kept & (sampled.bridged if rate is not None else ~np.isin(inputs, list(once)))
-    return SmoothedFrames(result, moments[bridged], int(np.count_nonzero(~kept)))
+    without = sampled.bridged if sampled_evenly else ~np.isin(inputs, list(once))
+    undetermined = int(np.count_nonzero(~kept))
+    return SmoothedFrames(result, moments[kept & without], undetermined, shaken)
 
 
 def _columns(frame: Localized, names: str) -> NDArray[np.float64]:

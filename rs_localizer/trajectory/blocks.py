@@ -10,19 +10,20 @@ import numpy as np
 from scipy.stats import chi2
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.trajectory.banded import Undetermined
+from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.fit import Fit, fit
 from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
 from rs_localizer.trajectory.model import Observations, State
 from rs_localizer.trajectory.start import refined
 
-# Parts of the recording that are calibrated on their own.
-_BLOCK_SECONDS, _MOST_BLOCKS = 3.0, 8
+# Parts of the recording that are calibrated on their own: three at least, for two that agree may do
+# so by chance, and more of a longer one.
+_BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
 # Blocks that would differ this much by chance once in a hundred recordings disagree.
 _DISAGREEMENT = 0.01
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Block:
     """A part of the recording on its own."""
 
@@ -30,33 +31,37 @@ class Block:
     end: float  # s
     readout_time: float  # s
     deviation: float  # s
+    camera: Camera  # with the lens of this part
     delay: float = math.nan  # s, of the gyroscope where there is one
     delay_deviation: float = math.nan  # s
 
 
-def blocks_of(observations: Observations, found: Fit) -> tuple[Block, ...]:
-    """Parts of the recording, each with lens and landmarks as the whole has them."""
+def blocks_of(
+    camera: Camera, observations: Observations, whole: Fit, count: int | None = None
+) -> tuple[Block, ...]:
+    """Equal parts of the recording, each with a lens and a shape of the map of its own.
+
+    Args:
+        camera: whose lens the whole was started from.
+        count: of the parts; None: as many as the recording is long enough for.
+    """
     first, last = observations.times.min(), observations.times.max()
-    count = int(np.clip((last - first) / _BLOCK_SECONDS, 2, _MOST_BLOCKS))
-    edges = np.linspace(first, last + 1e-6, count + 1)
+    if count is None:
+        count = int(np.clip((last - first) / _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS))
     blocks: list[Block] = []
-    for start, end in pairwise(edges):
-        inside = (observations.times >= start) & (observations.times < end)
+    for start, end in pairwise(np.linspace(first, last + 1e-6, count + 1)):
         # Not only what fits the whole: a part that differs would be left out of its own estimate.
-        part = observations.subset(inside)
-        part = replace(part, landmarks=found.state.landmarks)
-        state = _cut(found.state, start, end)
+        part = observations.subset((observations.times >= start) & (observations.times < end))
+        state = _cut(whole.state, start, end)
         if state is None or not np.any(part.trusted):
             continue
-        held = replace(found.freedom, lens=False, landmarks=0.0)
         try:
-            own = fit(found.camera, part, state, held)
-        except Undetermined:
+            own = fit(camera, part, state, whole.freedom)
+        except ValueError:  # undetermined, or a lens that no camera has
             continue
-        deviation = own.readout_time_deviation
-        blocks.append(
-            Block(float(start), float(end), own.state.readout_time, deviation, *_delay(own))
-        )
+        value, deviation = own.state.readout_time, own.readout_time_deviation
+        delay = _delay(own)
+        blocks.append(Block(float(start), float(end), value, deviation, own.camera, *delay))
     return tuple(blocks)
 
 

@@ -10,6 +10,44 @@ from rs_localizer.core.arrays import Array, IntArray
 PLACE, BODY = 3, 6
 """Numbers of a free point, and of a rigid body: its place, then its turn in the map's axes."""
 
+_FLAT = 1e-6  # thickness of a plane by its size: rounding of single precision
+# Standard deviations by half the size of a print. Paper curls by one part in a hundred (2 mm of an
+# A4 sheet), in waves that are smaller the shorter they are; printers and screens stretch one
+# direction by up to three parts in a thousand more than the other.
+_BENDS = {2: 1e-2, 3: 5e-3, 4: 2.5e-3}  # by the degree of the polynomial
+_STRETCH = 3e-3
+
+
+def is_flat(points: Array) -> bool:
+    """Whether points (p,3) lie in one plane."""
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(sizes[2] < _FLAT * sizes[0])
+
+
+def paper_covariance(points: Array, deviation: float) -> Array:
+    """Covariance (3 p, 3 p) of what the points (p,3) of a flat print are off their places.
+
+    Out of the plane low polynomials, which neither turn nor shift it, in the plane stretch and
+    shear; and of each point by itself its ``deviation`` (m).
+    """
+    middle = points.mean(axis=0)
+    axes = np.linalg.svd(points - middle)[2]
+    flat = (points - middle) @ axes[:2].T
+    half = 0.5 * float(np.ptp(flat, axis=0).max())
+    x, y = (flat / half).T
+    plane = np.column_stack([np.ones_like(x), x, y])
+    modes = [
+        _STRETCH * (np.outer(along, axes[0]) + np.outer(across, axes[1]))
+        for along, across in ((x, -y), (y, x))
+    ]
+    for degree, size in _BENDS.items():
+        for power in range(degree + 1):
+            bend = x ** (degree - power) * y**power
+            bend = bend - plane @ np.linalg.lstsq(plane, bend, rcond=None)[0]
+            modes.append(size * np.outer(bend, axes[2]))
+    root = half * np.reshape(modes, (len(modes), -1))
+    return np.asarray(root.T @ root + deviation**2 * np.eye(root.shape[1]))
+
 
 class Pieces:
     """The free parts of a map.

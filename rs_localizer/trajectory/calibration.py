@@ -12,9 +12,11 @@ import numpy as np
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.blocks import Block, blocks_of, disagreement
+from rs_localizer.trajectory.bodies import is_flat
 from rs_localizer.trajectory.fit import Fit, cheaper, cost_at, fit, image_speeds
 from rs_localizer.trajectory.gyro import NoMount
 from rs_localizer.trajectory.imu import ImuRecording, MountFound, mount_of, with_gyro
+from rs_localizer.trajectory.lens import LensErrors, lens_difference, lens_errors
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
 from rs_localizer.trajectory.observe import Observed, Posed, collect, in_order, localize_each
 from rs_localizer.trajectory.spline import Spline
@@ -22,18 +24,27 @@ from rs_localizer.trajectory.stamps import Stamps, examine
 from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
 
 _LEAST_IMAGES = 20
-# A board: few landmarks, seen often. Its shape is known to about this part of its size.
+# A board: few landmarks, seen often. Each is where it should be to about this part of its size (a
+# quarter of a millimetre of an A4 sheet), beside what bends all of it.
 _MOST_BOARD_POINTS, _LEAST_SIGHTS, _BOARD_SHARE = 400, 30, 1e-3
-# A given lens, and one that is to be found (see Freedom.lens_deviations).
-_GIVEN_LENS, _UNKNOWN_LENS = (0.02, 0.1), (0.3, 1.0)
-# Blocks whose scatter is this part of the value: the camera may turn its picture.
+_GIVEN_LENS = (0.02, 0.1)  # deviations of a given one, see Freedom.lens_deviations
+# Parts that differ by this share of the value beyond chance, and by more than a value may be off:
+# the camera may turn its picture.
 _STABILISED = 0.1
+_HALVES_SIGMAS = 3.0
 # Images that were not taken at their even stamps may be missing others between them: the mean
 # interval, and with it the readout time, is off by about this part of what they are off.
 _INTERVAL_SHARE = 0.5
-# A readout time is determined to this part of it, or to this many seconds.
-_DETERMINED_SHARE, _DETERMINED = 0.1, 1e-3
-_GLOBAL_SIGMAS = 3.0
+# A readout time is determined to this part of the interval between images, 1.7 ms at 30 Hz: by the
+# estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
+# cameras have slow sensors.
+_DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
+# A part says something that is known to this part of the interval; so many have to, or the
+# recording has to be so long (s).
+_TELLING_SHARE, _LEAST_TELLING, _LONG = 0.15, 3, 9.0
+# A global shutter has 0 within so many deviations, and these within this (s): the fastest rolling
+# shutters take 4 ms.
+_GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
 # Standard deviations of the images' own times, by the interval, to begin with.
 _FIRST_JITTERS = (0.1, 0.3)
 # Less than this does no harm, and may be a motion that the knots do not follow.
@@ -48,15 +59,18 @@ class Calibration:
     """What a recording says of its camera."""
 
     readout_time: float  # s; negative: against the scan direction that was given
-    deviation: float  # s, with the blocks' disagreement and doubts of the stamps
+    deviation: float  # s, with what blocks and halves disagree in, and doubts of the stamps
     formal_deviation: float  # s, of the noise alone
     blocks: tuple[Block, ...]
+    halves: tuple[Block, ...]
     inflation: float  # of the deviation, because the blocks disagree; 1: they do not
     reversed_cost: float  # by how much the reversed direction costs more, noise variances
     stamps: Stamps
+    own_stamps: bool  # the images' own, not those of a rate
     fit: Fit
     posed: Posed
-    images: int
+    images: int  # that show the map
+    lens: LensErrors  # standard deviations of the lens that was found
     mount: MountFound | None = None  # of the IMU, where there is one
     no_mount: str = ""  # why there is none
 
@@ -71,14 +85,41 @@ class Calibration:
         return 0.5 * self.reversed_cost / self.inflation**2 / math.log(10.0)
 
     @property
+    def limit(self) -> float:
+        """Deviation (s) from which on a readout time is not determined."""
+        return _DETERMINED_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
+
+    @property
+    def seconds(self) -> float:
+        """How long the images with a pose last."""
+        return float(np.ptp(self.posed.times))
+
+    @property
+    def telling(self) -> int:
+        """How many blocks say something by themselves."""
+        limit = _TELLING_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
+        return sum(block.deviation < limit for block in self.blocks)
+
+    @property
+    def long_enough(self) -> bool:
+        """Whether parts of it can speak against the whole."""
+        return self.telling >= _LEAST_TELLING or self.seconds >= _LONG
+
+    @property
     def determined(self) -> bool:
         """Whether the motion determines the readout time."""
-        return self.deviation < max(_DETERMINED_SHARE * abs(self.readout_time), _DETERMINED)
+        return self.deviation < self.limit and self.long_enough
+
+    @property
+    def near_zero(self) -> bool:
+        """Whether 0 lies within the error."""
+        return abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
 
     @property
     def global_shutter(self) -> bool:
-        """Whether 0 lies within the error."""
-        return self.determined and abs(self.readout_time) < _GLOBAL_SIGMAS * self.deviation
+        """Whether nothing else than a global shutter is left."""
+        sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
+        return self.determined and self.near_zero and sure and self.own_stamps
 
     @property
     def held(self) -> int:
@@ -96,8 +137,19 @@ class Calibration:
     @property
     def stabilised(self) -> bool:
         """Whether the parts disagree as those of a camera that turns its picture do."""
-        least = max(_STABILISED * abs(self.readout_time), _DETERMINED)
-        return self.inflation > 1.0 and self.scatter > least
+        least = max(_STABILISED * abs(self.readout_time), self.limit)
+        apart, noise = _apart(self.halves)
+        by_halves = apart > max(_HALVES_SIGMAS * noise, 2.0 * least)
+        return bool((self.inflation > 1.0 and self.scatter > least) or by_halves)
+
+
+def _apart(halves: tuple[Block, ...]) -> tuple[float, float]:
+    """By how much the readout times of two halves differ, and the deviation of that (s)."""
+    if len(halves) < 2:
+        return 0.0, math.inf
+    one, other = halves
+    noise = math.hypot(one.deviation, other.deviation)
+    return abs(one.readout_time - other.readout_time), noise
 
 
 def calibrate(
@@ -106,20 +158,25 @@ def calibrate(
     *,
     intrinsics: bool = False,
     imu: ImuRecording | None = None,
+    own_stamps: bool = True,
     done: Callable[[], object] = lambda: None,
 ) -> Calibration:
     """Readout time, and lens, of a camera from a recording in which it moves.
 
     Args:
         camera: its lens, and the axis and assumed direction of its scan; not its readout time.
-        images: with at least a dozen correspondences each.
+        images: with at least a dozen correspondences each; those that show nothing say when the
+            camera took images.
         intrinsics: the lens is to be found; otherwise it is known to a percent or two.
         imu: how it goes with the camera is to be found; its turns then help to find all else.
+        own_stamps: stamps are the camera's; otherwise those of a file, which are the images' own
+            only where they are uneven.
         done: called after each image.
 
     Raises:
         ValueError: when the recording determines nothing, saying what was found.
     """
+    taken = np.unique([image.stamp_ns for image in images])
     images = in_order(images)
     if len(images) < _LEAST_IMAGES:
         raise ValueError(f"{len(images)} images show the map, at least {_LEAST_IMAGES} are needed")
@@ -132,7 +189,7 @@ def calibrate(
             f"needed; of the last one without, {failures[-1]}"
         )
     posed = collect(camera, images, results)
-    stamps = examine(posed.image_times)
+    stamps = examine((taken - taken[0]) * 1e-9)
     freedom = _freedom(posed.observations, intrinsics)
     try:
         found = _best(camera, posed, stamps.interval, freedom)
@@ -146,17 +203,18 @@ def calibrate(
         except (NoMount, Undetermined) as error:
             no_mount = str(error)
     judged = _judged(camera, posed, seen, stamps, found, len(images))
-    return replace(judged, no_mount=no_mount)
+    return replace(judged, no_mount=no_mount, own_stamps=own_stamps or stamps.irregular)
 
 
 def _freedom(observations: Observations, intrinsics: bool) -> Freedom:
     landmarks, sights = observations.landmarks, len(observations.points)
-    board = len(landmarks) <= min(_MOST_BOARD_POINTS, sights / _LEAST_SIGHTS)
+    often = len(landmarks) <= min(_MOST_BOARD_POINTS, sights / _LEAST_SIGHTS)
     size = float(np.linalg.norm(np.ptp(landmarks, axis=0)))
     return Freedom(
         lens=True,
-        lens_deviations=_UNKNOWN_LENS if intrinsics else _GIVEN_LENS,
-        landmarks=_BOARD_SHARE * size if board else 0.0,
+        lens_deviations=None if intrinsics else _GIVEN_LENS,
+        landmarks=_BOARD_SHARE * size if often else 0.0,
+        paper=often and is_flat(landmarks),
     )
 
 
@@ -232,17 +290,26 @@ def _judged(
     camera: Camera, posed: Posed, seen: Observations, stamps: Stamps, found: Fit, images: int
 ) -> Calibration:
     opposite = cost_at(camera, seen, found, -found.state.readout_time)
-    blocks = blocks_of(seen, found)
+    blocks, halves = blocks_of(camera, seen, found), blocks_of(camera, seen, found, 2)
     formal = found.readout_time_deviation
     inflation, mount = _disagreement(blocks, "readout_time", "deviation"), None
     if seen.gyro is not None:
         doubt = _disagreement(blocks, "delay", "delay_deviation")
         mount = mount_of(camera, found, seen.gyro, doubt)
+    at = slice(1, 1 + len(found.state.lens))
+    lens = lens_errors(found.camera, inflation**2 * found.border_covariance[at, at])
+    if len(halves) == 2:
+        lens = lens.or_half(lens_difference(halves[0].camera, halves[1].camera))
     return Calibration(
         readout_time=found.state.readout_time,
-        deviation=math.hypot(formal * inflation, _interval_deviation(found, stamps)),
+        deviation=math.hypot(
+            formal * inflation, _interval_deviation(found, stamps), 0.5 * _apart(halves)[0]
+        ),
         formal_deviation=formal,
         blocks=blocks,
+        halves=halves,
+        own_stamps=True,
+        lens=lens,
         inflation=inflation,
         reversed_cost=opposite - found.cost,
         stamps=stamps,

@@ -1,28 +1,62 @@
-"""A first lens from images in which the camera hardly moves (Zhang 2000, by OpenCV)."""
+"""A first lens, and its distortion model, from images in which the camera hardly moves (Zhang
+2000, by OpenCV).
+"""
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
+from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.trajectory.observe import Observed
 
 _MOST_IMAGES, _LEAST_IMAGES = 30, 4
 # Of the points that the fullest image shows.
 _LEAST_SHARE = 0.6
 # Focal lengths by image width to begin with, before scenes that are no plane.
-_FOCAL_LENGTHS = (0.7, 1.0, 1.4)
+_FOCAL_LENGTHS = (0.35, 0.7, 1.0, 1.4)
+
+
+class _Candidate(NamedTuple):
+    model: DistortionModel
+    numbers: int  # of the distortion
+    flags: int  # of OpenCV's calibration
+
+
+# Kinds of lenses in the order in which they are preferred: a later one is taken where it predicts
+# images that it has not seen better by a tenth; less is what the choice of the images makes. Few
+# images that look alike have lenses far off that fit them, unless the centre is held.
+_CANDIDATES = (
+    _Candidate(
+        DistortionModel.PLUMB_BOB,
+        5,
+        cv2.CALIB_FIX_PRINCIPAL_POINT
+        | cv2.CALIB_FIX_ASPECT_RATIO
+        | cv2.CALIB_ZERO_TANGENT_DIST
+        | cv2.CALIB_FIX_K3,
+    ),
+    _Candidate(DistortionModel.PLUMB_BOB, 5, cv2.CALIB_FIX_K3),
+    _Candidate(DistortionModel.EQUIDISTANT, 4, 0),
+    _Candidate(DistortionModel.RATIONAL_POLYNOMIAL, 8, cv2.CALIB_RATIONAL_MODEL),
+)
+_RICHER = 0.9
+# OpenCV 5 has one set of flags, earlier ones had another for fisheyes.
+_FLAGS: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2
+_FISHEYE = (
+    _FLAGS.CALIB_RECOMPUTE_EXTRINSIC | _FLAGS.CALIB_FIX_SKEW | _FLAGS.CALIB_USE_INTRINSIC_GUESS
+)
+_POSE_STEPS = 4  # of Gauss and Newton from a pose in rays: they double the digits
 _LEAST_POINTS = 8
 _FLAT = 1e-6  # thickness of a plane by its size
 
 
 def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
-    """A pinhole camera with radial and tangential distortion.
+    """A lens of the simplest model that predicts images it has not seen as well as any.
 
     Args:
         size: width and height, pixels.
@@ -37,21 +71,107 @@ def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
             f"{len(chosen)} images show enough of the map for a first calibration, at least "
             f"{_LEAST_IMAGES} are needed; give --calibration"
         )
-    points = [np.asarray(image.points, np.float32) for image in chosen]
-    pixels = [np.asarray(image.pixels, np.float32) for image in chosen]
-    best: tuple[float, Any, Any] | None = None
-    for K, flags in _starts(size, np.concatenate([image.points for image in chosen])):
-        try:
-            error, found, D, _, _ = cv2.calibrateCamera(
-                points, pixels, size, K, np.zeros(5), flags=flags | cv2.CALIB_FIX_K3
+    best, least = None, np.inf
+    for candidate in _CANDIDATES:
+        lens = _calibrated(size, chosen, candidate)
+        error = np.inf if lens is None else _unseen_error(lens, chosen, candidate)
+        if error < least:
+            best, least = lens, _RICHER * error
+    if best is None:
+        raise ValueError("no lens fits the images; show the board from several sides")
+    return best
+
+
+def _unseen_error(lens: Camera, images: list[Observed], candidate: _Candidate) -> float:
+    """Error (px rms) of each half of the images under a lens that the other half finds near this
+    one.
+    """
+    halves = images[::2], images[1::2]
+    squared, count = 0.0, 0
+    for known, unseen in (halves, halves[::-1]):
+        camera = _calibrated(lens.size, known, candidate, lens.K)
+        if camera is None:
+            return np.inf
+        for image in unseen:
+            squared += reprojection_error(camera, image) ** 2 * len(image.points)
+            count += len(image.points)
+    return float(np.sqrt(squared / count))
+
+
+def reprojection_error(camera: Camera, image: Observed) -> float:
+    """Error (px rms, of u and v together) of the best global-shutter pose of an image; where the
+    lens has no ray for a pixel, or there is no pose, infinite.
+    """
+    rays = camera.rays(image.pixels)
+    if not np.isfinite(rays).all():
+        return np.inf
+    found, turn, place = cv2.solvePnP(image.points, rays, np.eye(3), None)
+    if not found:
+        return np.inf
+    # In pixels, not in rays: far from the middle they are not the same.
+    rotation = cv2.Rodrigues(turn)[0]
+    rotation, place = np.asarray(rotation, float), np.asarray(place, float).ravel()
+    for _ in range(_POSE_STEPS):
+        local = image.points @ rotation.T + place
+        if not np.all(local[:, 2] > 0.0):
+            return np.inf
+        pixels, by_ray = camera.distort(local[:, :2] / local[:, 2:])
+        by_point = (
+            np.concatenate(
+                [by_ray, -np.einsum("nij,nj->ni", by_ray, local[:, :2] / local[:, 2:])[:, :, None]],
+                2,
             )
+            / local[:, 2, None, None]
+        )
+        by_turn = -by_point @ so3.hat(local)
+        step = np.linalg.lstsq(
+            np.concatenate([by_turn, by_point], 2).reshape(-1, 6),
+            (image.pixels - pixels).ravel(), rcond=None,
+        )[0]  # fmt: skip
+        change = so3.exp(step[:3])
+        rotation, place = change @ rotation, change @ place + step[3:]
+    off = camera.project(image.points @ rotation.T + place) - image.pixels
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def _calibrated(
+    size: tuple[int, int],
+    images: list[Observed],
+    candidate: _Candidate,
+    start: Array | None = None,
+) -> Camera | None:
+    """The lens of this kind that fits the images best, from ``start`` (3,3) or from anywhere;
+    None: none does.
+    """
+    points = [np.asarray(image.points, np.float32)[:, None] for image in images]
+    pixels = [np.asarray(image.pixels, np.float32)[:, None] for image in images]
+    best: tuple[float, Any, Any] | None = None
+    model = candidate.model
+    everything = np.concatenate([image.points for image in images])
+    near = [] if start is None else [(start.copy(), cv2.CALIB_USE_INTRINSIC_GUESS)]
+    for K, flags in near or _starts(size, everything):
+        try:
+            if model == DistortionModel.EQUIDISTANT:
+                given = [np.asarray(image.points)[None] for image in images]
+                seen = [np.asarray(image.pixels)[None] for image in images]
+                error, found, D, _, _ = cv2.fisheye.calibrate(
+                    given, seen, size, K, np.zeros(4), flags=_FISHEYE
+                )
+            else:
+                flags |= candidate.flags
+                error, found, D, _, _ = cv2.calibrateCamera(
+                    points, pixels, size, K, np.zeros(candidate.numbers), flags=flags
+                )
         except cv2.error:
             continue
         if np.isfinite(error) and (best is None or error < best[0]):
-            best = (error, found, D.ravel()[:5])
+            best = (error, found, D.ravel()[: candidate.numbers])
     if best is None:
-        raise ValueError("no lens fits the images; show the board from several sides")
-    return Camera(width=size[0], height=size[1], K=best[1], D=best[2])
+        return None
+    try:
+        return Camera(width=size[0], height=size[1], K=best[1], D=best[2], distortion_model=model)
+    except ValueError:  # numbers that no camera has
+        return None
 
 
 def _slow(images: list[Observed]) -> list[Observed]:

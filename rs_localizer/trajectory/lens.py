@@ -1,4 +1,4 @@
-"""Intrinsics and distortion as numbers that an estimator may change, with derivatives."""
+"""Intrinsics and distortion as numbers that an estimator may change: derivatives, prior, errors."""
 
 from __future__ import annotations
 
@@ -16,6 +16,42 @@ _PINHOLE = (slice(6, 10), 10, slice(3, 5))
 _FISHEYE = (slice(0, 4), 4, slice(11, 13))
 # What a lens without coefficients is given when its distortion is to be found.
 _COEFFICIENTS = {DistortionModel.PLUMB_BOB: 5, DistortionModel.RATIONAL_POLYNOMIAL: 8}
+# What is known of a lens that nobody has calibrated, as standard deviations: focal length by the
+# first guess of it; centre by the image's width (a lens is decentred by less, a crop of the sensor
+# may be by more); focal lengths by each other (pixels are square but for the rounding of scaled
+# videos; before a camera that never rolls, a board that is stretched looks the same); what a
+# coefficient does at the farthest corner by half the diagonal. Distortion is a series that
+# converges: each order does about a third of the one before, a tangential one 0.3 %.
+_FOCAL_LENGTH, _CENTRE, _ASPECT = 0.3, 0.05, 0.002
+_ORDERS, _TANGENTIAL = (0.1, 0.03, 0.01, 0.003), 0.003
+_RADIAL = {
+    DistortionModel.PLUMB_BOB: {0: 0, 1: 1, 4: 2},
+    DistortionModel.RATIONAL_POLYNOMIAL: {0: 0, 1: 1, 4: 2, 5: 0, 6: 1, 7: 2},
+    DistortionModel.EQUIDISTANT: {0: 0, 1: 1, 2: 2, 3: 3},
+}
+_WIDEST = np.tan(np.radians(70.0))  # corners are not looked at beyond: no pinhole has any there
+_GRID = 9  # points along each side of the image, of an error that is averaged over it
+
+
+class LensPrior(NamedTuple):
+    """What is known of a lens beforehand."""
+
+    mean: Array  # (m,) as of lens_values
+    information: Array  # (m,m)
+
+
+class LensErrors(NamedTuple):
+    """Standard deviations of a calibration, as parts of the error that do not overlap."""
+
+    principal_point: float  # px, of all of the image alike
+    focal_length: float  # share
+    distortion: float  # px at the corners, of what is neither
+
+    def or_half(self, difference: LensErrors) -> LensErrors:
+        """Together with half of what two halves of a recording differ by."""
+        return LensErrors(
+            *(float(np.hypot(a, 0.5 * b)) for a, b in zip(self, difference, strict=True))
+        )
 
 
 class Projected(NamedTuple):
@@ -69,3 +105,84 @@ def project(camera: Camera, values: Array, points: Array, free: bool) -> Project
     columns = [*range(*pinhole.indices(first)), *range(first, first + len(D))] if free else []
     by_lens = jacobian[:, :, columns] / binning[:, None]
     return Projected((sensor.reshape(-1, 2) - offset) / binning, by_ray, by_lens)
+
+
+def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPrior:
+    """What is known of a lens before its numbers are estimated.
+
+    Args:
+        camera: a given lens, or a first guess of an unknown one.
+        deviations: of a given one, of focal lengths and centre by focal length, and of distortion;
+            None: it is unknown.
+    """
+    values = lens_values(camera)
+    focal = float(values[:2].mean())
+    spread = np.empty(len(values))
+    if deviations is not None:
+        spread[:4], spread[4:] = deviations[0] * focal, deviations[1]
+        return LensPrior(values, np.diag(spread**-2.0))
+    width, height = camera.size
+    mean = values.copy()
+    mean[2:] = 0.0
+    mean[2:4] = 0.5 * (width - 1.0), 0.5 * (height - 1.0)
+    spread[:2], spread[2:4] = _FOCAL_LENGTH * focal, _CENTRE * max(width, height)
+    corner = np.array([[0.5 * width / values[0], 0.5 * height / values[1], 1.0]])
+    corner[0, :2] *= min(1.0, _WIDEST / float(np.linalg.norm(corner[0, :2])))
+    plain = np.concatenate([mean[:4], np.zeros(len(values) - 4)])
+    moves = np.linalg.norm(project(camera, plain, corner, True).by_lens[0], axis=0)[4:]
+    radial = _RADIAL[DistortionModel(camera.distortion_model)]
+    shares = [_ORDERS[radial[k]] if k in radial else _TANGENTIAL for k in range(len(moves))]
+    spread[4:] = np.array(shares) * 0.5 * np.hypot(width, height) / moves
+    information = np.diag(spread**-2.0)
+    square = np.array([1.0, -1.0]) / (_ASPECT * focal)
+    information[:2, :2] += np.outer(square, square)
+    return LensPrior(mean, information)
+
+
+def lens_errors(camera: Camera, covariance: Array) -> LensErrors:
+    """What a covariance (m,m) of a camera's lens numbers means for its pixels."""
+    rays, design = _field(camera)
+    by_lens = project(camera, lens_values(camera), rays, True).by_lens
+    return _parts(design, (by_lens @ _root(covariance)).reshape(2 * len(rays), -1))
+
+
+def lens_difference(camera: Camera, other: Camera) -> LensErrors:
+    """By how much another lens is off this one."""
+    rays, design = _field(camera)
+    off = project(other, lens_values(other), rays, False).pixels
+    off -= project(camera, lens_values(camera), rays, False).pixels
+    return _parts(design, off.reshape(-1, 1))
+
+
+def _field(camera: Camera) -> tuple[Array, Array]:
+    """Rays (n,3) through the image, the corners first, and by the three shifts and scale that an
+    error of the lens may be taken for, how it moves their pixels (2 n, 3).
+    """
+    width, height = camera.size
+    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, _GRID), np.linspace(0.0, height - 1.0, _GRID))
+    corners = np.array([[0.0, 0.0], [width - 1, 0.0], [0.0, height - 1], [width - 1, height - 1]])
+    pixels = np.concatenate([corners, np.column_stack([u.ravel(), v.ravel()])])
+    rays = np.column_stack([camera.rays(pixels), np.ones(len(pixels))])
+    usable = np.isfinite(rays).all(axis=1)
+    design = np.zeros((len(pixels), 2, 3))
+    design[:, 0, 0] = design[:, 1, 1] = 1.0
+    design[:, :, 2] = pixels - lens_values(camera)[2:4]
+    return rays[usable], design[usable].reshape(-1, 3)
+
+
+def _parts(design: Array, moved: Array) -> LensErrors:
+    """Of displacements (2 n, k) of pixels, k of them independent."""
+    numbers = np.linalg.lstsq(design, moved, rcond=None)[0]
+    rest = (moved - design @ numbers)[:8]  # the corners
+    size = np.sqrt(np.sum(numbers**2, axis=1))
+    return LensErrors(
+        float(np.hypot(size[0], size[1]) / np.sqrt(2.0)),
+        float(size[2]),
+        float(np.sqrt(np.sum(rest**2) / len(rest))),
+    )
+
+
+def _root(covariance: Array) -> Array:
+    """A matrix whose product with its transpose is the covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -15,10 +15,10 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored, Undetermined
-from rs_localizer.trajectory.bodies import Pieces
+from rs_localizer.trajectory.bodies import Pieces, paper_covariance
 from rs_localizer.trajectory.gyro_kernels import MOUNT
 from rs_localizer.trajectory.gyro_terms import GyroTerms
-from rs_localizer.trajectory.lens import lens_values, project
+from rs_localizer.trajectory.lens import lens_prior, project
 from rs_localizer.trajectory.model import Freedom, Observations, State
 from rs_localizer.trajectory.normal_kernels import Normal, accumulate
 from rs_localizer.trajectory.prior_kernels import add_accelerations, add_rest, eliminate_stamps
@@ -49,7 +49,7 @@ class Problem:
         self, camera: Camera, observations: Observations, start: State, freedom: Freedom
     ) -> None:
         self.camera, self.observations, self.freedom = camera, observations, freedom
-        self.start_lens = lens_values(camera)
+        self.lens_prior = lens_prior(camera, freedom.lens_deviations)
         # The parts are always the same, whatever the number of workers: so is every sum.
         edges = np.linspace(0, len(observations.times), _PARTS + 1).astype(int)
         self._parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
@@ -57,6 +57,11 @@ class Problem:
         self._last: tuple[State, Curve, list[Sights]] | None = None
         self.lens_count = len(start.lens) if freedom.lens else 0
         self.pieces = _pieces(observations, freedom)
+        self.shape_information: Array | None = None
+        if freedom.paper and self.pieces.count:
+            seen = observations.landmarks[self.pieces.slots >= 0]
+            covariance = paper_covariance(seen, freedom.landmarks)
+            self.shape_information = np.asarray(np.linalg.inv(covariance), np.float64)
         readout = 1 if freedom.readout_time else 0
         self.border = readout + self.lens_count + self.pieces.columns
         self.gyro: GyroTerms | None = None
@@ -183,22 +188,24 @@ class Problem:
         cost = 0.0
         diagonal = np.arange(self.border)
         if self.lens_column >= 0:
-            pinhole, distortion = self.freedom.lens_deviations
-            deviations = np.full(self.lens_count, distortion)
-            deviations[:4] = pinhole * self.start_lens[:2].mean()
-            offset = (state.lens - self.start_lens) / deviations
+            offset = state.lens - self.lens_prior.mean
+            pull = self.lens_prior.information @ offset
             at = slice(self.lens_column, self.lens_column + self.lens_count)
-            normal.border_slope[at] += offset / deviations
-            normal.corner[diagonal[at], diagonal[at]] += deviations**-2
-            cost += float(offset @ offset)
+            normal.border_slope[at] += pull
+            normal.corner[at, at] += np.tril(self.lens_prior.information)
+            cost += float(offset @ pull)
         if self.point_column >= 0 and not self.pieces.rigid:
             free = self.pieces.slots >= 0
             offset = (state.landmarks - self.observations.landmarks)[free].ravel()
-            offset /= self.freedom.landmarks
             at = self.point_columns
-            normal.border_slope[at] += offset / self.freedom.landmarks
-            normal.corner[diagonal[at], diagonal[at]] += self.freedom.landmarks**-2
-            cost += float(offset @ offset)
+            if self.shape_information is not None:
+                pull = self.shape_information @ offset
+                normal.corner[at, at] += np.tril(self.shape_information)
+            else:
+                pull = offset / self.freedom.landmarks**2
+                normal.corner[diagonal[at], diagonal[at]] += self.freedom.landmarks**-2
+            normal.border_slope[at] += pull
+            cost += float(offset @ pull)
         if self.pieces.rigid:  # a body none of whose landmarks fits stays where it is
             at = self.point_columns
             normal.corner[diagonal[at], diagonal[at]] += _LOOSE_BODY**-2

@@ -16,6 +16,7 @@ from rs_localizer.trajectory.accelerations import told
 from rs_localizer.trajectory.fit import Fit, cheaper, fit
 from rs_localizer.trajectory.model import Freedom, Observations, start_state
 from rs_localizer.trajectory.observe import Observed, collect
+from rs_localizer.trajectory.problem import LIMIT
 from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
 
 # Between images the motion is told as long as its deviations stay within so many of the usual ones.
@@ -25,6 +26,10 @@ _BRIDGED = 1.5
 # Where images show how accelerations fade, that bridges the knots (s) between them: these need not
 # be as wide as a hand's motion would allow, and narrow ones follow all of it.
 _NARROW_SPACING = 0.025
+# A frame whose points lie this much farther from the smooth motion than from its own is shaken in a
+# way that knots cannot follow: by so many times the noise, and beyond the chance (so many standard
+# deviations) of its points. Where so much of the frames is, the motion between them is none.
+_SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
 
@@ -46,6 +51,8 @@ class Smoothed:
     readout_time: float  # s
     start_ns: int
     times: Array  # (f,) s since then, of the images' middle rows
+    # (f,) images that shake faster than the motion: their own estimates are better.
+    shaken: BoolArray
 
     def sample(self, stamps_ns: IntArray) -> Sampled:
         """The camera's motion at times (m,) in ns."""
@@ -56,9 +63,15 @@ class Smoothed:
         certain = np.all(_deviations(covariances) < _MOST_UNCERTAIN * usual, axis=1)
         return Sampled(
             self._estimates(times, covariances),
-            spline.layout.inside(times) & certain,
+            spline.layout.inside(times) & certain & ~self._beside_shaken(times),
             self._apart(times) > _BRIDGED * np.median(np.diff(self.times)),
         )
+
+    def _beside_shaken(self, times: Array) -> BoolArray:
+        """Whether the image before or after these times (m,) is shaken."""
+        after = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
+        before = np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)
+        return self.shaken[before] | self.shaken[after]
 
     def _apart(self, times: Array) -> Array:
         """How far apart (m,) the images before and after these times are, s."""
@@ -152,7 +165,22 @@ def smooth(
     finer = _lively(camera, seen, fit(camera, seen, halved, found.freedom, found.deviation))
     more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
     best = finer if cheaper(finer, found, float(more)) else found
-    return Smoothed(best, readout_time, posed.start_ns, posed.times)
+    shaken = _shaken(best, seen, estimates)
+    return Smoothed(best, readout_time, posed.start_ns, posed.times, shaken)
+
+
+def _shaken(found: Fit, seen: Observations, estimates: list[Estimate]) -> BoolArray:
+    """Which images (f,) shake in a way that the motion does not follow."""
+    own = np.array([max(one.residual_rms, found.freedom.least_noise) ** 2 for one in estimates])
+    count = np.bincount(seen.frames, minlength=len(estimates))
+    # Robust, as the estimates are: outliers of the motion count as its limit.
+    squared = np.minimum(found.squared_errors, (LIMIT * found.deviation) ** 2)
+    off = np.bincount(seen.frames, squared, len(estimates)) / np.maximum(count, 1)
+    # An estimate's errors are those of two coordinates, less what it took to fit them.
+    left = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
+    limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
+    shaken = np.asarray((count > 0) & (off > limit * own / left), np.bool_)
+    return np.ones_like(shaken) if shaken.mean() > _MOST_SHAKEN else shaken
 
 
 def _lively(camera: Camera, seen: Observations, found: Fit) -> Fit:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
-from rs_localizer.io.calibration.files import read_calibration
+from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
 from rs_localizer.simulation.true_motion import RecordedMotion
@@ -53,19 +53,25 @@ def test_what_is_looked_for_in_images(
 
 
 def test_the_webcam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its images have no times of their own: refused, and written on request only."""
     out, plots = tmp_path / "webcam.yaml", tmp_path / "plots"
     recording = str(data.path(data.WEBCAM))
     words = ["calibrate", recording, "--intrinsics", "--out", str(out), "--plots", str(plots)]
-    assert main(words) == 0
+    assert main(words) == 1
+    said = capsys.readouterr()
+    assert "beside their stamps" in said.err
+    assert "times less likely" not in said.out
+    assert not out.exists()
+    pictures = {"readout_time.png", "residuals.png", "coverage.png"}
+    assert {file.name for file in plots.iterdir()} == pictures
+    assert main([*words[:-2], "--force"]) == 1
     values = load_params_file(out)
-    # A third of the interval, by single poses (see ATTRIBUTION.md); its stamps are not its own.
+    # A third of the interval, by single poses (see ATTRIBUTION.md).
     assert 0.010 < values["readout_time"] < 0.015
     assert 0.0 < values["readout_time_deviation"] < 2e-3
     assert values["scan_direction"] == "top_to_bottom"
-    assert "beside their stamps" in capsys.readouterr().out
     camera = read_calibration(tmp_path / "webcam_camera_info.yaml")
     assert camera.K[0, 0] == pytest.approx(529.0, rel=0.02)
-    assert {file.name for file in plots.iterdir()} == {"readout_time.png", "residuals.png"}
 
 
 def test_a_simulated_flight_against_the_assumed_direction(flight: Path, tmp_path: Path) -> None:

@@ -107,19 +107,3 @@ def test_wrong_usage(
     assert main(["detect", here.bag, *words, "--out", str(here.out)]) == 2
     assert text in capsys.readouterr().err
     assert not here.out.exists()
-
-
-def test_images_without_anything_leave_nothing(
-    here: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = here.path / "dark"
-    folder.mkdir()
-    for k in range(2):
-        cv2.imwrite(str(folder / f"{k}.png"), np.zeros((120, 160), np.uint8))
-    (here.path / "camera.json").write_text(
-        '{"width": 160, "height": 120, "fx": 200, "fy": 200, "cx": 79.5, "cy": 59.5}'
-    )
-    words = ["--calibration", str(here.path / "camera.json"), "--rate", "30"]
-    assert main(["detect", str(folder), "--features", "orb", *words, "--out", str(here.out)]) == 1
-    assert "detect: none of the 2 images has any keypoint" in capsys.readouterr().err
-    assert not here.out.exists()

@@ -17,7 +17,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.messages import stamp_ns
-from rs_localizer.io.recording import make_camera_info, write_image
+from rs_localizer.io.recording import make_camera_info
 
 K = np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(320, 240, K)
@@ -93,17 +93,6 @@ def test_a_video_has_its_own_times(here: Any, capsys: pytest.CaptureFixture[str]
     said = capsys.readouterr().out
     assert "presentation times of the video, 20 images/s on average; the first image at 7.5" in said
     assert "warning: the readout time of 60 ms is longer than the 50 ms from image to im" in said
-
-
-def test_a_rate_overrides_the_times_and_is_warned_of(
-    here: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    video = mp4(here.path / "a.mp4", [board(6, 4, x) for x in range(4)], 20.0)
-    assert detect(here, video, *here.board, "--rate", "30") == 0
-    assert stamps(here.out) == [10**9 + round(k * 1e9 / 30) for k in range(4)]
-    said = capsys.readouterr().out
-    assert "times: --rate 30; the first image at 1 s" in said
-    assert "--rate 30 disagrees with the file, whose own times mean 20 images/s" in said
 
 
 def test_another_board_is_named_after_the_first_images(
@@ -214,10 +203,3 @@ def test_transforms_and_imu_of_a_bag_are_kept(
     found = read_motions(poses).poses.positions
     expected = -TURN.T @ (place(6, 4) + 2.0 * np.eye(3)[2])
     np.testing.assert_allclose(np.median(found, axis=0), expected, atol=0.05)
-
-
-def test_a_bag_has_its_own_times(here: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    with BagWriter(here.path / "bag") as bag:
-        write_image(bag, "/image", 10**9, "png", cv2.imencode(".png", board(6, 4))[1].tobytes())
-    assert detect(here, str(here.path / "bag"), *here.board, "--rate", "30") == 2
-    assert "--rate is for videos and folders; a bag has its own times" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import write_frame
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import TransformTree
 from rs_localizer.offline.replay import find_topics
 from rs_localizer.simulation.imu import ImuSettings, make_imu
 
@@ -59,15 +59,6 @@ def test_a_recording_holds_readings_and_where_they_were_taken(tmp_path: Path) ->
     assert stamps == sorted(stamps)
 
 
-def test_an_imu_changes_nothing_else(tmp_path: Path) -> None:
-    clouds = []
-    for name, words in (("without", ()), ("with", ("--imu",))):
-        assert simulate(tmp_path / name, *TURN, *words) == 0
-        with open_bag(tmp_path / name) as bag:
-            clouds.append([bytes(m.data) for _, _, m in bag.messages(["/correspondences"])])
-    assert clouds[0] == clouds[1]
-
-
 def test_a_vibration_is_in_the_truth(tmp_path: Path) -> None:
     angular = []
     for name, words in (("still", ()), ("shaken", ("--vibration", "0.3", "60"))):
@@ -78,11 +69,6 @@ def test_a_vibration_is_in_the_truth(tmp_path: Path) -> None:
     shaking = np.linalg.norm(angular[1] - angular[0], axis=1)
     most = np.radians(0.3) * 2.0 * np.pi * 60.0
     assert 0.8 * most < shaking.max() <= 1.02 * most
-
-
-def test_options_of_the_imu_need_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate(tmp_path / "bag", "--imu-rate", "100") == 2
-    assert "options of the IMU need --imu" in capsys.readouterr().err
 
 
 def test_replay_uses_it_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -228,18 +228,6 @@ def test_rows_names_and_older_files(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert all(query["angular_velocity"] is None for query in told["queries"].values())
 
 
-def test_a_binary_model_is_the_same(tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
-    files = make(tmp_path, motions(1))
-    binary = tmp_path / "binary"
-    binary.mkdir()
-    pycolmap.Reconstruction(str(files.sfm)).write_binary(str(binary))
-    assert localize(files) == 0
-    assert localize(files, reference_sfm=binary, results=tmp_path / "binary.txt") == 0
-    one, other = (read(tmp_path / f"{name}.txt") for name in ("poses", "binary"))
-    assert np.all(errors(one["0.jpg"], other["0.jpg"]) < 1e-6)
-
-
 def test_bad_files_are_told_of_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -48,14 +48,6 @@ def test_a_model_of_colmap_becomes_a_file(
     assert main([*words, "--overwrite"]) == 0
 
 
-def test_text(tmp_path: Path) -> None:
-    out = tmp_path / "map.ply"
-    words = ["map", "convert", str(COLMAP / "binary"), str(out), "--text"]
-    assert main([*words, "--database", str(COLMAP / "database.db")]) == 0
-    assert out.read_bytes().isascii()
-    assert read_map_file(out, "map").equals(read_map_file(COLMAP / "binary", "map"))
-
-
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [

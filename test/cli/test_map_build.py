@@ -11,7 +11,7 @@ import pytest
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration.files import write_calibration
+from rs_localizer.io.calibration import write_calibration
 from rs_localizer.simulation.walls import collage
 
 K = np.array([[260.0, 0.0, 159.5], [0.0, 260.0, 119.5], [0.0, 0.0, 1.0]])
@@ -98,20 +98,6 @@ def test_repeated_texture(
     assert "texture that does not repeat" in said
 
 
-def test_a_single_image(
-    tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    images = written(tmp_path / "images", [picture(0)])
-    assert "1 images make no map" in refused(images, calibration, capsys)
-
-
-def test_images_of_another_size(
-    tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    images = written(tmp_path / "images", [picture(k, (640, 480)) for k in range(3)])
-    assert "another resolution" in refused(images, calibration, capsys)
-
-
 def test_files_that_are_broken(
     tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -143,17 +129,6 @@ def test_wrong_usage(
     images = written(tmp_path / "images", [picture(0)])
     assert build(images, calibration, tmp_path / "map", *more) == 2
     assert fault in capsys.readouterr().err
-
-
-def test_a_point_after_the_end(
-    tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    images = written(tmp_path / "images", [picture(0)])
-    points = [word for name in "ab" for s in "05" for word in ("--point", name, s, "1", "2")]
-    given = [*points, "--distance", "a", "b", "1"]
-    assert build(images, calibration, tmp_path / "map", *given) == 2
-    assert "the images end before 5 s" in capsys.readouterr().err
-    assert not (tmp_path / "map").exists()
 
 
 def test_what_is_there_is_not_overwritten(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rs_localizer.cli.main import main
@@ -31,25 +30,6 @@ def test_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "exists already" in capsys.readouterr().err
     assert make(out, "--size", "0.05", "--overwrite") == 0
     assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
-
-
-def test_standing_prints_have_z_up(tmp_path: Path) -> None:
-    words = ["--charuco", "5x7", "--square", "0.03", "--map-frame", "hall", "--standing"]
-    assert make(tmp_path / "board", *words, "--family", "36h11", "--format", "png") == 0
-    assert (tmp_path / "board.png").exists()
-    made = read_marker_map(tmp_path / "board.yaml")
-    assert made.map_frame == "hall"
-    first, last = made.points[0], made.points[-1]
-    np.testing.assert_allclose(first, [-0.045, 0, 0.075], atol=1e-9)
-    np.testing.assert_allclose(last, [0.045, 0, -0.075], atol=1e-9)
-
-
-def test_large_markers_come_on_pages_of_their_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert make(tmp_path / "wall", "--size", "0.13", "--grid", "2x1", "--page", "letter") == 0
-    assert "2 pages of letter" in (said := capsys.readouterr().out)
-    assert "mount each where the map has it" in said
 
 
 def test_pages_of_others_are_not_overwritten(
@@ -85,14 +65,6 @@ def test_wrong_usage(
 ) -> None:
     assert make(tmp_path / "wall", *words) == 2
     assert text in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_does_not_fit_writes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert make(tmp_path / "wall", "--size", "0.5") == 1
-    assert "but a4 has room for" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

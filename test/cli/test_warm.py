@@ -35,13 +35,3 @@ def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path: Path) -> None:
     assert done.stderr.startswith(f"rs_localizer warm: cache of kernels in {tmp_path}/cache/")
     assert done.stderr.endswith("Not a directory\n")
     assert done.stderr.count("\n") == 1
-
-
-def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_home() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(Path, "home", no_home)
-    assert cache_directory() == Path("/nonexistent/rs_localizer")

@@ -81,6 +81,7 @@ def test_noise_is_dropped(held):
     assert all(result for _, result in found)
 
 
+@pytest.mark.bench
 def test_interruptions_lose_nothing(held):
     rng = np.random.default_rng(1)
 

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.honesty.estimating import believed
+from benchmarks.honesty.estimating import believed, truth_of
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
@@ -15,6 +15,7 @@ from benchmarks.inertial.recordings import record
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.sight import sight_of
 from rs_localizer.localizer import Localizer
+from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
 
 
@@ -81,3 +82,38 @@ def test_few_inliers_say_nothing():
     assert sight_of(camera, points, pixels, found, 0) is not None
     few = replace(found, inliers=found.inliers & (np.arange(len(points)) < 8))
     assert sight_of(camera, points, pixels, few, 0) is None
+
+
+@pytest.mark.parametrize("shaking", [(), ((0.2, 60.0),)])
+def test_a_step_of_the_stamps_is_found(shaking):
+    """Another clock from one sample on, by 20 ms: more than a period of the vibration."""
+    motion = partial(shaken_hand, shaking=shaking) if shaking else hand
+    recorded = record(Camera(), motion, Rich(), (1, 70), 5)
+    (samples,) = recorded.samples
+    step_ns, since_ns = 20_000_000, recorded.frames.middle_ns(25)
+    times_ns = samples.times_ns + step_ns * (samples.times_ns > since_ns)
+    stepped = replace(recorded, samples=(replace(samples, times_ns=times_ns),))
+    tracker = tracker_of(stepped)
+    _, before = followed(tracker, stepped, 25)
+    deviations, inside = [], []
+    for frame in range(25, 70):
+        middle_ns = stepped.frames.middle_ns(frame)
+        later = times_ns < middle_ns + 60_000_000  # samples come in time, with wrong stamps
+        imu = replace(
+            samples, times_ns=times_ns[later], angular_velocity=samples.angular_velocity[later]
+        )
+        found = tracker.localize(middle_ns, *stepped.frames.seen(frame, 1.0), None, imu)
+        deviations.append(tracker.inertial.time_offset_deviation)
+        if found:
+            inside.append(rate_error(stepped, frame, found) < 7.81)
+    after = tracker.inertial
+    assert max(deviations[:10]) > 5.0 * before.time_offset_deviation
+    assert abs(after.time_offset - before.time_offset + 0.02) < 1e-3
+    assert np.mean(inside[10:]) > 0.85
+
+
+def rate_error(recorded, frame, found):
+    """Squared error of the turn rate in deviations, of three numbers."""
+    twist = twist_at(found, 0.0, recorded.frames.camera.readout_time)
+    off = twist.angular - truth_of(recorded.frames.middle, frame).angular
+    return off @ np.linalg.solve(twist.covariance[3:, 3:], off)

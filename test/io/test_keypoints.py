@@ -102,19 +102,6 @@ def test_rows_that_are_not_finite_are_dropped_and_counted(name: str) -> None:
     assert len(read) == COUNT - 1
 
 
-@pytest.mark.parametrize("mark", [("id", "u2"), BITS, NUMBERS])
-def test_no_row_is_left(mark: Any) -> None:
-    message = cloud(*UV, mark)
-    data = message.data.copy()
-    data.reshape(COUNT, -1)[:, :4] = np.array([np.nan], "<f4").view(np.uint8)
-    message.data = data
-    read = read_keypoints(message)
-    assert (len(read), read.dropped) == (0, COUNT)
-    if mark[0] == "descriptor":
-        assert read.descriptors is not None
-        assert read.descriptors.shape == (0, mark[2][0])
-
-
 def test_landmarks_that_are_not_finite() -> None:
     message = cloud(("x", "f4"), ("y", "f4"), ("z", "f4"), ("id", "u4"))
     data = message.data.copy()
@@ -180,11 +167,3 @@ def test_other_bad_clouds() -> None:
     far["x"], far["id"] = 1e10, (1, 2)
     with pytest.raises(MessageError, match=r"within 1e\+09 m"):
         read_map(make_cloud(make_message, 0, "map", far[["x", "y", "z", "id"]].copy()))
-
-
-def test_a_descriptor_of_one_byte() -> None:
-    message = cloud(*UV, ("descriptor", "u1", (32,)))
-    message.fields[2].count = 0
-    read = read_keypoints(message).descriptors
-    assert read is not None
-    assert read.tolist() == BINARY[:, :1].tolist()

@@ -34,10 +34,6 @@ def localized(
     )
 
 
-def moving(linear: Any = (0.0, 0.0, 0.0), angular: Any = (0.0, 0.0, 0.0)) -> Twist:
-    return Twist(np.array(linear), np.array(angular), np.diag([1.0, 4.0, 9.0, 1.0, 1.0, 1.0]))
-
-
 def attitude(fields: dict[str, Any]) -> tuple[float, float, float]:
     """Roll (right side down), pitch (nose up), heading (clockwise from the first axis), degrees."""
     w, x, y, z = fields["q"].astype(float)
@@ -60,24 +56,6 @@ def test_a_map_without_north_only_turns_over() -> None:
     assert fields["pose_frame"] == FRD
     np.testing.assert_allclose(fields["position"], [1.0, -2.0, -3.0])
     assert attitude(fields) == pytest.approx((0.0, 0.0, -30.0), abs=1e-4)  # left is against it
-
-
-@pytest.mark.parametrize("world", ["frd", "ned"])
-def test_tilt_means_the_same_for_pilots(world: str) -> None:
-    # In ROS a positive pitch lowers the nose, a positive roll the right side.
-    fields = vehicle_odometry(localized(pitch=10.0), world, 0, 0)
-    assert attitude(fields)[:2] == pytest.approx((0.0, -10.0), abs=1e-4)
-    fields = vehicle_odometry(localized(roll=10.0), world, 0, 0)
-    assert attitude(fields)[:2] == pytest.approx((10.0, 0.0), abs=1e-4)
-
-
-def test_velocities_are_those_of_the_body() -> None:
-    frame = localized(twist=moving((1.0, 2.0, 3.0), (0.1, 0.2, 0.3)), yaw=77.0)
-    fields = vehicle_odometry(frame, "ned", 0, 0)
-    assert fields["velocity_frame"] == BODY_FRD
-    np.testing.assert_allclose(fields["velocity"], [1.0, -2.0, -3.0])
-    np.testing.assert_allclose(fields["angular_velocity"], [0.1, -0.2, -0.3], rtol=1e-6)
-    np.testing.assert_allclose(fields["velocity_variance"], [1.0, 4.0, 9.0])
 
 
 def test_what_is_not_known_is_nan() -> None:

@@ -30,19 +30,6 @@ def test_images_are_the_original_bytes() -> None:
     assert list(split_jpegs(b"head" + b"\0\xff\0".join(images) + b"tail")) == images
 
 
-def test_thumbnails_belong_to_their_image() -> None:
-    first, second = jpegs(2)
-    images = [with_segment(first, second), with_segment(second, b"\xff\xd9\xff\xd8")]
-    assert list(split_jpegs(b"".join(images))) == images
-
-
-def test_progressive_images_have_several_scans() -> None:
-    image = np.random.default_rng(1).integers(0, 255, (32, 32, 3), dtype=np.uint8)
-    progressive = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
-    assert progressive.count(b"\xff\xda") > 1
-    assert list(split_jpegs(progressive * 2)) == [progressive] * 2
-
-
 def test_broken_images_are_left_out() -> None:
     first, second = jpegs(2)
     for cut in (1, 3, 30, len(second) // 2, len(second) - 1):

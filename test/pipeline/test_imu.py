@@ -24,8 +24,8 @@ from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.tree import TransformTree
-from rs_localizer.offline.imu_first import imu_first
+from rs_localizer.io.transforms import TransformTree
+from rs_localizer.offline.replay import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
 from rs_localizer.pipeline.imu import ImuState
 
@@ -299,6 +299,7 @@ def test_no_covariance_is_no_fault(flight: Flight) -> None:
         assert np.array_equal(a.pose.rotation, b.pose.rotation)
 
 
+@pytest.mark.bench
 def test_two_hundred_interruptions(flight: Flight) -> None:
     rng = np.random.default_rng(0)
     starts = np.sort(rng.uniform(0.0, 3.0, 200))
@@ -327,13 +328,6 @@ def test_two_hundred_interruptions(flight: Flight) -> None:
             used += bool(np.diff(around).max() <= longest)
     assert flown.state.used == used > 0
     assert sum(frame.estimate.tracked for frame in flown.frames) >= count(flight) - 2
-
-
-def test_repetition_changes_nothing(flight: Flight) -> None:
-    twice = fly(flight, lambda message, time: (message, message))
-    for a, b in zip(twice.frames, fly(flight).frames, strict=True):
-        assert np.array_equal(a.pose.rotation, b.pose.rotation)
-        assert np.array_equal(a.pose.covariance, b.pose.covariance)
 
 
 def test_frames_that_stand_alone_use_it_too(flight: Flight) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,8 +14,7 @@ from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.keypoints import read_map
-from rs_localizer.io.maps.files import write_map_file
-from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.matching import Matcher
@@ -146,17 +143,6 @@ def test_a_map_that_is_missing_and_comes_late(
     assert notices == []
 
 
-def test_correspondences_need_no_map(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
-    node = localizer(make_camera_info)
-    assert refused(node.localize_keypoints(keypoints(frames[0], "id")))[0] == "no_map"
-    assert node.missing == ("map_points",)
-    rows = np.empty(len(frames[1].points), [(name, "<f8") for name in "xyzuv"])
-    for name, column in zip("xyzuv", [*frames[1].points.T, *frames[1].pixels.T], strict=True):
-        rows[name] = column
-    localized(node.localize(make_cloud(make_message, frames[1].stamp_ns, "map", rows)), frames[1])
-    assert node.missing == ()
-
-
 def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
     notices = Notices()
     node = localizer(make_camera_info, notices)
@@ -192,16 +178,6 @@ def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: 
         == "cellar"
     )
     assert len(notices) == 3
-
-
-def test_landmarks_that_are_left_out_are_said(make_camera_info: Any) -> None:
-    notices = Notices()
-    node = localizer(make_camera_info, notices)
-    rows = map_rows(LANDMARKS)
-    rows["y"][:7] = np.nan
-    node.use_map(read_map(make_cloud(make_message, 0, "map", rows)))
-    text = "7 landmarks are left out: they hold NaN or infinity, or no descriptor"
-    assert notices == [("map_incomplete", text)]
 
 
 def test_keypoints_that_give_no_pose(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
@@ -279,23 +255,6 @@ def test_settings_of_matching(frames: list[SimulatedFrame], make_camera_info: An
     localized(node.localize_keypoints(keypoints(frames[1], "id")), frames[1])
 
 
-def test_map_files(tmp_path: Path, frames: list[SimulatedFrame], make_camera_info: Any) -> None:
-    path = tmp_path / "map.npz"
-    write_map_file(path, LANDMARKS)
-    node = localizer(make_camera_info, map_file=str(path), map_frame="hall")
-    node.load_map()
-    found = localized(node.localize_keypoints(keypoints(frames[0], "descriptor")), frames[0])
-    assert found.map_frame == "hall"
-    write_map_file(path, Map(POINTS, None, None, "map"))
-    with pytest.raises(MapError, match="neither ids nor descriptors"):
-        node.load_map()
-    with pytest.raises(MapError, match=r"map_file: .* No such file"):
-        localizer(make_camera_info, map_file=str(tmp_path / "none.ply")).load_map()
-    localizer(make_camera_info).load_map()
-    with pytest.raises(ValueError, match="map_frame must not be empty"):
-        NodeConfig(map_frame="")
-
-
 def test_coordinates_far_from_the_origin_keep_their_digits(
     frames: list[SimulatedFrame], make_camera_info: Any
 ) -> None:
@@ -307,10 +266,3 @@ def test_coordinates_far_from_the_origin_keep_their_digits(
         assert result, result
         assert np.allclose(result.pose.position - away, frame.first_row.positions[0], atol=0.02)
         assert result.inliers["x"].dtype == np.float64
-
-
-def test_any_message_is_answered(make_camera_info: Any) -> None:
-    node = localizer(make_camera_info)
-    node.use_map(read_map(map_cloud(LANDMARKS)))
-    empty = SimpleNamespace(**vars(map_cloud(LANDMARKS)) | {"fields": []})
-    assert refused(node.localize_keypoints(empty))[0] == "bad_keypoints"

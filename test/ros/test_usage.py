@@ -31,11 +31,6 @@ def test_help_names_every_parameter_with_its_default(name: str, kind: type) -> N
     assert "\n  autostart: True\n" in text
 
 
-@pytest.mark.parametrize("words", [[], ["--ros-args", "-p", "x:=--help"], ["-p", "seed:=1"]])
-def test_otherwise_a_node_starts(words: list[str]) -> None:
-    assert answer("localizer", words) is None
-
-
 @pytest.mark.parametrize(("function", "word"), [("main", "--version"), ("marker_detector", "-h")])
 def test_the_executables(function: str, word: str) -> None:
     code = f"import sys; from rs_localizer.ros.main import {function} as f; sys.exit(f([{word!r}]))"

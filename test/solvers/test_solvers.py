@@ -209,7 +209,7 @@ def test_no_sample_breaks_a_solver(name):
 
 
 def test_an_unknown_solver_is_refused():
-    with pytest.raises(ValueError, match="unknown solver 'epnp'; choose one of p3p, r6p"):
+    with pytest.raises(ValueError, match="unknown solver 'epnp'; choose one of "):
         find_solver("epnp")
 
 

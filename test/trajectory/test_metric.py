@@ -94,6 +94,7 @@ def noisy_means(felt: Felt, seed: int, noise: float = 3e-3) -> list[Means]:
     return mean_accelerations(moved, samples, felt.camera_from_imu.as_matrix(), 0.15)
 
 
+@pytest.mark.bench
 def test_deviations_are_honest() -> None:
     scales, tilts = [], []
     for seed in range(8):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import projector
 import pytest
@@ -100,6 +102,41 @@ def test_hard_accelerations_are_not_smoothed_away() -> None:
                              (states.linear_acceleration, linear, 20.0)):  # fmt: skip
         assert np.abs(true).max() > 0.95 * most
         assert np.sum(seen * true) / np.sum(true * true) == pytest.approx(1.0, abs=0.03)
+
+
+def test_frames_that_shake_faster_than_the_motion_are_said_to() -> None:
+    """60 Hz, which a gyroscope knows: a spline averages it away and would be sure of it."""
+    rng = np.random.default_rng(14)
+    calm = projector.Motion.random(rng)
+    tone = np.zeros((6, 1))
+    tone[:3] = np.radians(0.3)
+    shaking = projector.Motion(
+        np.hstack([calm.amplitudes, tone]),
+        np.hstack([calm.frequencies, np.full((6, 1), 2.0 * np.pi * 61.0)]),
+        np.hstack([calm.phases, np.arange(6.0)[:, None]]),
+    )
+    scene = projector.room(rng, 1500)
+    for motion, share in ((calm, 0.0), (shaking, 1.0)):
+        recorded = projector.record(rng, motion, scene, readout=READOUT, seconds=1.2)
+        images, estimates = [], []
+        for frame in recorded:
+            middle = frame.stamp + 0.5 * READOUT
+            (rotation,), (position,) = motion.pose(np.array([middle]))
+            one = Localizer(CAMERA).localize(frame.points, frame.pixels)
+            assert one
+            # As with the gyroscope's turn: the pose is right, and the noise is all that is left.
+            known = replace(
+                one, rotation=rotation.T, translation=-rotation.T @ position,
+                inliers=np.ones(len(frame.points), np.bool_),
+                residuals=np.full(len(frame.points), 0.3 * np.sqrt(2.0)),
+            )  # fmt: skip
+            images.append(Observed(round(1e9 * frame.stamp), frame.points, frame.pixels))
+            estimates.append(known)
+        found = smooth(CAMERA, images, estimates)
+        assert np.mean(found.shaken) == share
+        if share:
+            stamps = np.array([image.stamp_ns for image in images])
+            assert not np.any(found.sample(stamps + round(0.5e9 * READOUT)).determined)
 
 
 def test_gaps_are_bridged_only_where_the_neighbours_determine_them() -> None:

@@ -28,7 +28,7 @@ from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import stamp_ns as stamp_of
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.rigid import (
+from rs_localizer.io.transforms import (
     NotYetError,
     Transform,
     TransformError,
@@ -70,7 +70,7 @@ def import_tf2_ros(what: str) -> ModuleType:
 
 
 class Tf:
-    """Transforms from TF (see :class:`rs_localizer.io.transforms.rigid.Transforms`).
+    """Transforms from TF (see :class:`rs_localizer.io.transforms.Transforms`).
 
     :meth:`lookup` and :meth:`moves` may be called from any thread, all else belongs to the
     executor's.

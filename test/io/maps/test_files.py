@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.io.maps.files import read_map_file, write_map_file
-from rs_localizer.io.maps.landmarks import Map, MapError, make_map
+from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.maps.ply import write_ply
 
 COLMAP = Path(__file__).parent / "colmap"
@@ -134,20 +134,6 @@ def test_a_model_without_a_database(tmp_path: Path) -> None:
     assert given.descriptors.shape == (14, 128)
 
 
-def test_a_database_of_any_name(tmp_path: Path) -> None:
-    model = tmp_path / "sparse" / "0"
-    shutil.copytree(COLMAP / "binary", model)
-    shutil.copy(COLMAP / "database.db", tmp_path / "office.db")
-    sqlite3.connect(tmp_path / "thumbs.db").close()  # another program's
-    (tmp_path / "notes.db").write_text("no database")
-    found = read_map_file(model, "map")
-    assert found.equals(read_map_file(COLMAP / "binary", "map", COLMAP / "database.db"))
-    assert found.descriptors is not None
-    shutil.copy(COLMAP / "database.db", tmp_path / "attic.db")
-    with pytest.raises(MapError, match=r"several databases of COLMAP, attic.db, office.db: name"):
-        read_map_file(model, "map")
-
-
 def database(path: Path, *changes: str) -> Path:
     shutil.copy(COLMAP / "database.db", path / "database.db")
     with sqlite3.connect(path / "database.db") as tables:
@@ -204,23 +190,6 @@ def test_a_bad_database(tmp_path: Path, change: str, text: str) -> None:
     file.write_bytes(b"no database at all, but long enough to look like one" * 30)
     with pytest.raises(MapError, match="cannot be read as a database"):
         read_map_file(COLMAP / "binary", "map", file)
-
-
-def test_long_tracks(tmp_path: Path) -> None:
-    """The medoid of a point that 1000 images see is that of an even choice of them."""
-    rng = np.random.default_rng(0)
-    with (tmp_path / "points3D.txt").open("w") as file:
-        file.write("5 1 2 3 0 0 0 0.5 " + " ".join(f"{image} 0" for image in range(1, 1001)))
-    tables = sqlite3.connect(tmp_path / "database.db")
-    tables.execute("CREATE TABLE descriptors (image_id, rows, cols, data)")  # as before 3.12
-    for image in range(1, 1001):
-        data = np.clip(rng.normal(100, 10, 128), 0, 255).astype(np.uint8)
-        tables.execute("INSERT INTO descriptors VALUES (?, 1, 128, ?)", (image, data.tobytes()))
-    tables.commit()
-    tables.close()
-    found = read_map_file(tmp_path, "map").descriptors
-    assert found is not None
-    assert np.abs(found - 100).mean() < 11
 
 
 def npy(shape: tuple[int, ...], kind: str, data: bytes = b"") -> bytes:
@@ -431,17 +400,3 @@ def test_other_files(tmp_path: Path) -> None:
     write_map_file(tmp_path / "map.npz", landmarks("signed", None))
     with pytest.raises(MapError, match="has no name"):
         read_map_file(tmp_path / "map.npz", "")
-
-
-def test_what_is_not_finite_is_dropped_and_counted() -> None:
-    points, floats = np.zeros((4, 3)), np.zeros((4, 2))
-    points[1, 2], floats[3, 0] = np.nan, np.inf
-    found = make_map(points, np.arange(4), floats, "map")
-    assert found.ids is not None
-    assert (found.ids.tolist(), found.dropped) == ([0, 2], 2)
-
-
-def test_a_long_descriptor_does_not_fit_into_ply(tmp_path: Path) -> None:
-    wide = Map(np.zeros((1, 3)), None, np.zeros((1, 2**16), np.uint8), "map")
-    with pytest.raises(MapError, match="65536 values does not fit"):
-        write_map_file(tmp_path / "map.ply", wide)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from rs_localizer.io.transforms.rigid import TransformError, from_numbers
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import TransformError, TransformTree, from_numbers
 
 Numbers = tuple[float, ...]
 HALF_TURN = (0.0, 0.0, 1.0, 0.0)
@@ -143,12 +142,6 @@ def test_what_cannot_be_answered(
     tree.add(tf("island", "palm", (0.0, 0.0, 3.0), NO_TURN, 5 * 10**9), static=False)
     with pytest.raises(TransformError, match=text):
         tree.lookup(target, source, stamp_ns)
-
-
-def test_an_unknown_time_above_does_no_harm_below(tree: TransformTree) -> None:
-    assert tree.lookup("base", "camera", 99 * 10**9).translation[2] == pytest.approx(
-        1.1316, abs=1e-4
-    )
 
 
 def test_a_frame_that_changes_its_parent(tree: TransformTree) -> None:

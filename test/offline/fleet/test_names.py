@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.offline.fleet.names import folder_names
+from rs_localizer.offline.fleet.identity import folder_names
 
 
 @pytest.mark.parametrize(
@@ -28,11 +28,6 @@ def test_what_is_there_besides_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "summary.csv").mkdir()
     name = f"{tmp_path.name}_summary.csv"
     assert folder_names([tmp_path / "summary.csv"], {"summary.csv"}) == [name]
-
-
-def test_a_folder_keeps_its_point(tmp_path: Path) -> None:
-    (tmp_path / "flight.2").mkdir()
-    assert folder_names([tmp_path / "flight.2"]) == ["flight.2"]
 
 
 def test_all_names_differ_and_are_names() -> None:

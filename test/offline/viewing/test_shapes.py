@@ -12,12 +12,9 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Localized, Pose
 from rs_localizer.offline.viewing.shapes import (
     ellipsoid,
-    enlargement,
     eye,
-    others,
     readout_path,
     reproject,
-    row_colours,
 )
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
@@ -79,34 +76,10 @@ def test_reprojections_are_of_the_row_that_sees_the_point() -> None:
     assert found.colours[0, 0] < found.colours[1, 0] < found.colours[2, 0]
 
 
-def test_points_behind_the_camera_are_left_out() -> None:
-    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -3.0]])
-    assert len(reproject(localized(points, np.zeros((2, 2))), CAMERA).predicted) == 1
-
-
 def test_the_way_within_the_readout_is_that_of_the_camera() -> None:
     way = readout_path(localized(np.zeros((0, 3)), np.zeros((0, 2))))
     np.testing.assert_allclose(way[4], [0.0, 0.0, -1.0], atol=1e-12)
     assert np.linalg.norm(way[-1] - way[0]) == pytest.approx(0.2)
-
-
-def test_others_are_what_is_no_inlier() -> None:
-    pixels = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
-    frame = localized(np.ones((2, 3)), pixels[[0, 2]])
-    assert others(pixels, frame).tolist() == [[3.0, 4.0]]
-    assert others(pixels, None).tolist() == pixels.tolist()
-
-
-def test_colours_stay_within_their_ends() -> None:
-    found = row_colours(np.array([-9.0, -0.5, 0.5, 9.0])).tolist()
-    assert found[0] == found[1] == [0, 114, 255]
-    assert found[2] == found[3] == [255, 220, 0]
-
-
-@pytest.mark.parametrize(("residual", "factor"), [(0.1, 100), (1.0, 10), (40.0, 1), (1e-9, 500)])
-def test_residuals_are_drawn_so_that_one_sees_them(residual: float, factor: int) -> None:
-    points = np.ones((4, 3))
-    assert enlargement([localized(points, np.ones((4, 2)), residual)]) == factor
 
 
 def test_the_eye_sees_camera_and_points() -> None:

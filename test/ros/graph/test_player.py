@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -140,35 +139,6 @@ def test_images_are_played_for_a_detector(tmp_path: Path, peer: Any) -> None:
     peer.spin_until(lambda: len(images) == FRAMES, 1.0)
     assert [bytes(image.data) for image in images] == [bytes([k]) * 100 for k in range(FRAMES)]
     assert len(infos) == FRAMES
-
-
-def test_ctrl_c_ends_it_in_one_line(recording: Path, peer: Any) -> None:
-    heard: list[PointCloud2] = []
-    for kind, topic in ((PointCloud2, "/correspondences"), (CameraInfo, "/camera_info")):
-        peer.node.create_subscription(kind, topic, heard.append, qos_profile_sensor_data)
-    player = play(recording, "--rate", "0.01")
-    assert peer.spin_until(lambda: len(heard) > 1)
-    time.sleep(0.2)
-    player.send_signal(signal.SIGINT)
-    player.send_signal(signal.SIGINT)
-    output, errors = player.communicate(timeout=30)
-    assert (player.returncode, output, errors) == (130, "", "rs_localizer replay: interrupted\n")
-
-
-def test_without_ros_it_says_what_is_missing(recording: Path, tmp_path: Path) -> None:
-    (tmp_path / "rclpy.py").write_text("raise ImportError(\"No module named 'rclpy'\")")
-    done = subprocess.run(
-        [sys.executable, "-m", "rs_localizer", "replay", str(recording), "--ros"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 1
-    text = "rs_localizer replay: --ros needs ROS 2 (No module named 'rclpy')"
-    assert done.stderr.startswith(text)
-    assert done.stderr.count("\n") == 1
 
 
 def test_transforms_are_left_out_where_their_type_is_missing(

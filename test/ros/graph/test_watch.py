@@ -18,7 +18,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli.main import main
 from rs_localizer.ros.graph.watch import Status, Values, Watched, euler, line, table
 
 WATCH = [sys.executable, "-m", "rs_localizer", "watch"]
@@ -50,13 +49,6 @@ def test_a_table_has_a_line_for_each_quantity() -> None:
     assert [text.split()[0] for text in lines[1:5]] == ["position", "roll", "linear", "angular"]
     assert "+90.00" in lines[4]
     assert lines[5:] == ["warning: 3 frames were refused", "refused: residual 3"]
-
-
-def test_silence_is_said() -> None:
-    watched = seen()
-    assert "no pose for 2.5 s" in watched.heading(103.0)
-    assert "0.0 Hz, no pose for 99.5 s" in watched.heading(200.0)
-    assert Watched("/n", waiting="nobody publishes it").heading(0.0) == "nobody publishes it"
 
 
 def test_angles_are_those_of_rep_103() -> None:
@@ -158,26 +150,3 @@ def test_without_a_node_it_says_what_is_missing_and_who_is_there(peer: Any) -> N
     assert watching.stderr is not None
     assert watching.stderr.read() == ""
     watching.stderr.close()
-
-
-def test_without_ros_it_says_what_is_missing(tmp_path: Path) -> None:
-    (tmp_path / "rclpy.py").write_text("raise ImportError(\"No module named 'rclpy'\")")
-    done = subprocess.run(
-        WATCH,
-        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 1
-    assert done.stderr.startswith("rs_localizer watch: watch needs ROS 2 (No module named 'rclpy')")
-    assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize("name", ["a b", "", "/", "1x", "~", "a//b", "front/1"])
-def test_what_is_no_name_of_a_node_is_wrong_usage(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["watch", name]) == 2
-    assert "must be a node's name, such as /front/rs_localizer, got" in capsys.readouterr().err

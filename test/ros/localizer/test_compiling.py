@@ -80,14 +80,3 @@ def test_two_clients_configure_at_once(start_node: Callable[..., Any], peer: Any
     assert sorted(answer.result().success for answer in answers) == [False, True]
     assert "is refused: the node is inactive" in node.log
     assert node.stop() == 0
-
-
-def test_a_cache_that_cannot_be_written_is_a_warning(
-    start_node: Callable[..., Any], tmp_path: Path
-) -> None:
-    (tmp_path / "cache").write_text("a file in its place")
-    node = start_node(XDG_CACHE_HOME=str(tmp_path / "cache"))
-    node.wait_for_log("kernels are compiled again at the next start: Not a directory")
-    assert "[WARN]" in node.log
-    assert node.log.count("at the next start") == 1
-    assert node.stop() == 0

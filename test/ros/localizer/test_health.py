@@ -110,19 +110,6 @@ def test_numbers_of_a_working_node(world: World) -> None:
     assert values["Poses published"] == "100"
 
 
-def test_stamps_of_another_clock_have_no_delay(world: World) -> None:
-    for stamp in (0.0, world.now + 5.0, world.now - 60.0):
-        world.statistics.answered(frame(stamp), world.now)
-    values = world.diagnose().values
-    assert "Latency p50 (ms)" in values
-    assert "Delay of the stamp p50 (ms)" not in values
-
-
-def test_tracking_is_said(world: World) -> None:
-    world.statistics.answered(frame(tracked=True), world.now)
-    assert world.diagnose().state == "tracking"
-
-
 def test_lost_after_some_frames_and_found_by_one(world: World) -> None:
     world.pass_frames(10, rate=50.0)
     world.refuse(4)
@@ -135,18 +122,6 @@ def test_lost_after_some_frames_and_found_by_one(world: World) -> None:
     assert health.values["Refused: too_few_inliers"] == "5"
     world.pass_frames(1, rate=50.0)
     assert world.diagnose().state == "localized"
-
-
-def test_a_few_refused_frames_are_normal(world: World) -> None:
-    world.pass_frames(100, rate=50.0)
-    world.refuse(4)
-    world.pass_frames(1, rate=50.0)
-    assert world.diagnose().level == Level.OK
-    for _ in range(20):
-        world.statistics.replaced()
-    assert world.diagnose().level == Level.WARN
-    assert world.diagnose().message.startswith("20 frames came while another was localized")
-    assert world.diagnose().values["Frames replaced"] == "20"
 
 
 def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
@@ -221,45 +220,6 @@ def test_an_imu_that_is_late_is_not_waited_for(
     assert robot.peer.spin_until(lambda: "IMU not used: imu_late" in robot.values)
     assert "older than the last row" in robot.values["IMU"]
     assert "imu.wait" in robot.values["Odd: imu"]
-
-
-def test_random_interruptions_lose_nothing(
-    recording: Path, items: list[Item], start_node: Any, robot: Robot
-) -> None:
-    """Readings are lost, late and stop in between: every frame has its pose."""
-    start_node(*SHUTTER, *RELIABLE, **ENVIRONMENT)
-    robot.connect()
-    robot.mount(recording)
-    robot.greet(items)
-    rng = np.random.default_rng(0)
-    begin, end = items[0][1], items[-1][1]
-    starts = np.sort(rng.uniform(begin, end, 200))
-    lengths = rng.choice([2e6, 1e7, 3e7], 200, p=[0.8, 0.15, 0.05])
-    delays = rng.choice([0.0, 0.005, 0.05], 200, p=[0.8, 0.15, 0.05])
-
-    def lost(item: Item) -> bool:
-        return item[0] == "/imu" and bool(np.any((starts < item[1]) & (item[1] < starts + lengths)))
-
-    def delay(item: Item) -> float:
-        return float(delays[np.searchsorted(starts, item[1]) % 200]) if item[0] == "/imu" else 0.0
-
-    robot.play([item for item in items if not lost(item)], delay)
-    assert robot.peer.spin_until(lambda: robot.values.get("Poses published") == str(FRAMES))
-    assert robot.values["Frames replaced"] == "0"
-    assert robot.values["Frames refused"] == "0"
-    truth = true_positions(recording)
-    for data in robot.answers["pose_with_covariance"]:
-        message = typestore().deserialize_cdr(data, TYPES["pose_with_covariance"])
-        place = message.pose.pose.position
-        error = np.array([place.x, place.y, place.z]) - truth[stamp_ns(message)]
-        deviation = np.sqrt(message.pose.covariance.reshape(6, 6).diagonal()[:3].max())
-        assert np.linalg.norm(error) < max(0.03, 5.0 * deviation)
-
-
-def true_positions(recording: Path) -> dict[int, Any]:
-    with open_bag(recording) as bag:
-        poses = [(stamp_ns(m), m.pose.position) for _, _, m in bag.messages(["/truth/pose"])]
-    return {stamp: np.array([place.x, place.y, place.z]) for stamp, place in poses}
 
 
 def test_without_tf2_ros_the_camera_goes_alone(

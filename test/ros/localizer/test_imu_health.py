@@ -44,10 +44,6 @@ def test_an_imu_that_is_not_used() -> None:
     assert "a larger imu.wait" in said  # what to do
 
 
-def test_without_one_nothing_is_said() -> None:
-    assert imu_oddity(None) == {}
-
-
 def test_the_most_frequent_reason_is_said_and_not_the_last_one() -> None:
     slow = Unused(ImuReason.TOO_SLOW, "a reading comes every 20.0 ms")
     state = replace(UNUSED, mostly=slow)

@@ -158,21 +158,6 @@ def test_maps_that_are_late_replaced_and_bad(
     assert node.stop() == 0
 
 
-def test_a_latched_map_and_a_map_file(
-    tmp_path: Path,
-    start_node: Callable[..., Any],
-    peer: Any,
-    flight: tuple[Any, list[SimulatedFrame]],
-) -> None:
-    info, frames = flight
-    talk = Talk(peer, info)
-    talk.send_map(LANDMARKS)  # before there is anybody to hear it
-    start_node("-p", f"readout_time:={READOUT_TIME}")
-    talk.connect()
-    talk.localize(frames[0])
-    assert peer.spin_until(lambda: talk.status.get("State") in ("tracking", "localized"))
-
-
 def test_a_map_that_is_not_latched(
     start_node: Callable[..., Any], peer: Any, flight: tuple[Any, list[SimulatedFrame]]
 ) -> None:

@@ -17,7 +17,7 @@ from geometry_msgs.msg import TransformStamped
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.io.transforms.rigid import NotYetError, TransformError
+from rs_localizer.io.transforms import NotYetError, TransformError
 from rs_localizer.ros.localizer.transforms import Broadcaster, check
 
 STAND_IN = Path(__file__).parents[1] / "stand_in"
@@ -143,19 +143,6 @@ def test_what_is_not_known_yet_is_said_at_once(made: Any, robot: Any, peer: Any)
         node.tf.lookup("base_link", "camera", 7 * second)
 
 
-def test_a_recording_that_starts_over(made: Any, robot: Any, peer: Any) -> None:
-    node = made(base_frame="base_link", transform_tolerance=0.0)
-    for stamp in (50, 51):
-        robot.send("base_link", "camera", 1.0, stamp * 10**9)
-    known(node, peer, "base_link", "camera", 50_500_000_000)
-    # tf2 ignores what is older than ten seconds, until a frame shows that time went back.
-    with pytest.raises(TransformError, match="past"):
-        node.tf.lookup("base_link", "camera", 5 * 10**9)
-    for stamp in (5, 6):
-        robot.send("base_link", "camera", 2.0, stamp * 10**9)
-    assert known(node, peer, "base_link", "camera", 5_500_000_000).translation[0] == 2.0
-
-
 def heard(robot: Any, peer: Any, parent: str, child: str, stamp_ns: int | None) -> Any:
     """What another node makes of what was sent."""
     rclpy_time = importlib.import_module("rclpy.time")
@@ -257,18 +244,6 @@ def test_a_frame_has_one_parent(made: Any, robot: Any, peer: Any) -> None:
     assert node.broadcaster.fault() == {"not_broadcast": text}  # for the diagnostics
     peer.spin_until(lambda: False, 0.1)
     assert not robot_knows(robot, "map")
-
-
-def test_another_map_is_no_other_parent(made: Any, robot: Any, peer: Any) -> None:
-    node = made(publish_tf="map_to_camera")
-    node.publish(frame(5 * 10**9), node.config)
-    heard(robot, peer, "map", "base_link", None)
-    known(node, peer, "map", "base_link", None)  # it has come back to us
-    cellar = frame(6 * 10**9)
-    object.__setattr__(cellar, "map_frame", "cellar")
-    node.publish(cellar, node.config)
-    heard(robot, peer, "cellar", "base_link", None)
-    assert not node.notes
 
 
 def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

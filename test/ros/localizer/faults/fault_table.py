@@ -119,12 +119,12 @@ FAULTS = [
     Fault("a frame that takes long", stuck, "worked on for"),
     Fault("a bug in the node", bug, r"internal_error: TypeError\('a bug'\) in fail"),
     # Parameters
-    Fault("unknown solver", setting(solver="p4p"), "solver must be one of p3p"),
+    Fault("unknown solver", setting(solver="epnp"), "solver must be one of "),
     Fault("inlier_threshold -1", setting(inlier_threshold=-1.0), "out of range"),
     Fault("seed as text", setting(seed="zero"), "type"),
     Fault("autostart while running", setting(autostart=False), "read-only"),
     Fault("no such parameter", setting(min_inlier=9), "undeclared"),
-    Fault("one good, one bad", setting(min_inliers=20, solver="p4p"), "solver must be one of"),
+    Fault("one good, one bad", setting(min_inliers=20, solver="epnp"), "solver must be one of"),
     # Life cycle and services
     Fault("activate twice", impossible(Transition.TRANSITION_ACTIVATE), "false"),
     Fault("transition 99", impossible(99), "false"),
