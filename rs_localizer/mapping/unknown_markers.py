@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.io.transforms import Transform
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.families import Family
 from rs_localizer.markers.map_check import whole_markers

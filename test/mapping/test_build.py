@@ -172,7 +172,7 @@ def test_without_calibration_lens_and_shutter_are_found(views: list[View], folde
     assert built.camera.K[0, 0] == pytest.approx(260.0, rel=0.02)
     assert built.shutter.noise < 0.7 * built.shutter.global_noise
     assert not built.placement.scaled
-    assert "top_to_bottom (estimated)" in written(built, len(views), views)
+    assert "top_to_bottom (estimated" in written(built, len(views), views)
     shutil.rmtree(alone)
 
 

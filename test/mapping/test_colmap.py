@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera, Roi
-from rs_localizer.io.calibration.colmap import colmap_camera, colmap_parameters
+from rs_localizer.io.calibration import colmap_camera, colmap_parameters
 from rs_localizer.mapping import MappingError, colmap
 from rs_localizer.mapping.colmap import Effort, build_structure, image_name, pairs_of
 from rs_localizer.simulation.walls import collage

@@ -9,7 +9,7 @@ import pytest
 from scenes import READOUT, camera, ring, spot
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.io.transforms import Transform
 from rs_localizer.mapping.survey import Survey, survey
 from rs_localizer.mapping.unknown_markers import Chained, Spotted, chain, every_marker
 from rs_localizer.markers.consistency import problems

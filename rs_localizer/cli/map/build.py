@@ -15,16 +15,21 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
-from rs_localizer.cli.image_source import add_source_arguments, tell_left_out, time_faults
-from rs_localizer.cli.shots import opened
+from rs_localizer.cli import UsageError, add_overwrite, replaced
+from rs_localizer.cli.image_input import (
+    add_source_arguments,
+    opened,
+    shutter_values,
+    tell_left_out,
+    time_faults,
+)
 from rs_localizer.config import FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
-from rs_localizer.io.calibration.files import write_calibration
+from rs_localizer.io.calibration import write_calibration
 from rs_localizer.io.images import Image
 from rs_localizer.io.imu_files import read_imu_csv
 from rs_localizer.io.maps.npz import write_npz
@@ -76,13 +81,12 @@ class Shutter:
 
 def shutter_of(args: argparse.Namespace) -> Shutter:
     """As given, or as it stands beside the images of a recording."""
-    if args.readout_time is not None:
-        return Shutter(args.readout_time, args.scan_direction)
-    beside = args.images / PARAMETERS
-    if is_bag(args.images) and beside.exists():
-        known = build(load_params_file(beside))
-        return Shutter(known.readout_time or None, args.scan_direction or known.scan_direction)
-    return Shutter(None, args.scan_direction)
+    values = shutter_values(args)
+    known = build(values)
+    readout_time = known.readout_time
+    if args.readout_time is None:
+        readout_time = readout_time or None
+    return Shutter(readout_time, known.scan_direction if "scan_direction" in values else None)
 
 
 def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
@@ -238,6 +242,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_imu_arguments(scale)
     add_source_arguments(parser)
+    add_overwrite(parser)
     work = parser.add_argument_group("the work")
     work.add_argument(
         "--images-per-second",
@@ -269,7 +274,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else _marker_map(args.markers)
     shutter, imu = shutter_of(args), imu_of(args)
-    with atomic_directory(args.out) as out:
+    with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
         with TemporaryDirectory(dir=out) as images:
             looked = look_at_images(args, Looker(args.max_keypoints, Path(images), markers))
@@ -313,10 +318,13 @@ def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
 
 def _write(out: Path, built: Built, looked: Looked) -> None:
     write_npz(out / MAP, built.landmarks)
-    write_parameters(
-        out / PARAMETERS, built.camera.readout_time, str(built.camera.scan_direction),
-        built.place.time_offset,
-    )  # fmt: skip
+    shutter = {
+        "readout_time": built.camera.readout_time,
+        "scan_direction": str(built.camera.scan_direction),
+        "imu.time_offset": built.place.time_offset,
+    }
+    known = {name: value for name, value in shutter.items() if value is not None}
+    write_parameters(out / PARAMETERS, known)
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
