@@ -178,23 +178,6 @@ def disagreement(values: Array, deviations: Array) -> float:
     return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
 
 
-def excess(values: Array, deviations: Array) -> float:
-    """By how much the deviation of the weighted mean of values (b,) is too small, as they scatter
-    more than by their deviations (b,); 1 if that may be chance.
-
-    Blocks may be known very differently well; all are taken to differ by the same on top
-    (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 1986).
-    """
-    weights = deviations**-2.0
-    total, squares = float(np.sum(weights)), float(np.sum(weights**2))
-    mean = np.sum(weights * values) / total
-    squared, freedoms = float(np.sum(weights * (values - mean) ** 2)), len(values) - 1
-    if freedoms < 1 or chi2.sf(squared, freedoms) > _DISAGREEMENT:
-        return 1.0
-    own = max(squared - freedoms, 0.0) / (total - squares / total)
-    return math.sqrt(1.0 + own * squares / total)
-
-
 _LEAST_IMAGES = 20
 # A board: few landmarks, seen often. Each is where it should be to about this part of its size (a
 # quarter of a millimetre of an A4 sheet), beside what bends all of it.

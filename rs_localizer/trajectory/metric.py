@@ -31,6 +31,7 @@ camera's axes in the map and ``C`` the IMU's in the camera:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -38,10 +39,10 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cholesky, solve_triangular, toeplitz
+from scipy.stats import chi2
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
-from rs_localizer.trajectory.calibration import excess
 from rs_localizer.trajectory.spline import Layout, Spline
 
 DEGREE = 5
@@ -242,6 +243,8 @@ _EXACT, _NOTHING = 1e-12, 1e-30
 _RESTING = 7.0
 # So much of the accelerations that images show must be the accelerometer's.
 _LEAST_EXPLAINED = 0.5
+# Parts that would differ this much by chance once in a hundred recordings disagree.
+_CHANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -419,3 +422,20 @@ def _part(part: Means, kept: BoolArray, fit: _Fitted) -> tuple[float, float]:
     others = others - np.outer(across, across) / fit.covariance[INVERSE, INVERSE]
     variance = fit.variance / weight + float(slope @ others @ slope) / weight**2
     return float(whole @ alone.right) / weight, float(np.sqrt(variance))
+
+
+def excess(values: Array, deviations: Array) -> float:
+    """By how much the deviation of the weighted mean of values (b,) is too small, as they scatter
+    more than by their deviations (b,); 1 if that may be chance.
+
+    Blocks may be known very differently well; all are taken to differ by the same on top
+    (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 1986).
+    """
+    weights = deviations**-2.0
+    total, squares = float(np.sum(weights)), float(np.sum(weights**2))
+    mean = np.sum(weights * values) / total
+    squared, freedoms = float(np.sum(weights * (values - mean) ** 2)), len(values) - 1
+    if freedoms < 1 or chi2.sf(squared, freedoms) > _CHANCE:
+        return 1.0
+    own = max(squared - freedoms, 0.0) / (total - squares / total)
+    return math.sqrt(1.0 + own * squares / total)
