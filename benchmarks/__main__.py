@@ -73,8 +73,11 @@ EXPERIMENTS: dict[str, Callable[[Context], Result]] = {
 _TRIALS = 2000
 _TOOLS = """more, each with its own --help, as python -m benchmarks.NAME:
   frames                           regions, errors and times of frames; two versions compared
-  honesty, mapping                 single benches, and single conditions of them
-  mapped_room, room_by_imu         maps of rendered rooms, by markers and by an IMU
+  real                             videos of real cameras
+  honesty                          against P3P, a real global shutter, rendered walls
+  mapping                          refined maps and surveyed markers
+  experiments.mapped_room          a map of a rendered room by markers, and poses in it
+  experiments.room_by_imu          the same by an IMU
   fuzzing                          wrong input for everything that reads
   profiling, frame_times           where the time of a frame goes
   load, load.signals               a live node under load, and stopped at random moments

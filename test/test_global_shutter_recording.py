@@ -61,7 +61,14 @@ def test_p3p_is_what_it_was(p3p) -> None:
     assert p3p == pytest.approx((0.22, 0.73), abs=0.01)
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "20 ms, tracked",
+        pytest.param("default", marks=pytest.mark.bench),
+        pytest.param("20 ms, single", marks=pytest.mark.bench),
+    ],
+)
 def test_a_global_shutter_stays_one(messages, p3p, name: str) -> None:
     frames, notices = replayed(messages, **SETTINGS[name])
     assert any("as of a global shutter" in text for text in notices) == ("20 ms" in name)

@@ -190,12 +190,13 @@ def test_corners_lie_where_those_of_other_rows_say(recording):
     assert 1.0 < np.mean(squared) < 2.4  # 2 are expected
 
 
-@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "p3p"])
+@pytest.mark.parametrize("solver", [name for name, row in SOLVERS.items() if row.rolling_shutter])
 def test_every_solver_localizes_every_frame_at_least_as_well_as_a_global_shutter(
     recording, still, solver
 ):
     calibration, clouds = recording
     localizer = rsl.Localizer(calibration.camera(READOUT, "top_to_bottom"), solver=solver)
-    results = [localizer.localize(cloud.points, cloud.pixels) for cloud in clouds]
+    some = slice(None, None, 3)
+    results = [localizer.localize(cloud.points, cloud.pixels) for cloud in clouds[some]]
     assert all(results)
-    assert np.median([r.residual_rms for r in results]) < np.median(still[1])
+    assert np.median([r.residual_rms for r in results]) < np.median(still[1][some])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import benchmarks
 from benchmarks.__main__ import main
 
 
@@ -69,3 +70,17 @@ def test_an_output_that_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "file").write_text("")
     assert main(["translation", "--out", str(tmp_path / "file")]) == 1
     assert "file" in capsys.readouterr().err
+
+
+def test_the_help_names_every_tool_and_none_besides(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    table = capsys.readouterr().out.split("as python -m benchmarks.NAME:\n")[1]
+    named = {name for line in table.splitlines() for name in line[2:33].strip().split(", ")} - {""}
+    folder = Path(benchmarks.__file__).parent
+    programs = {
+        ".".join(path.relative_to(folder).with_suffix("").parts).removesuffix(".__main__")
+        for path in folder.rglob("*.py")
+        if 'if __name__ == "__main__"' in path.read_text()
+    }
+    assert named == programs - {"__main__", "load.camera"}  # the latter is started by load
