@@ -26,7 +26,7 @@ from benchmarks.independent.motions import Motions, States, hand
 from benchmarks.independent.scenes import Rich
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Pose, Twist
-from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.io.transforms import Transform
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.body import Mounting, base_pose, base_twist
 from rs_localizer.pipeline.moments import pose_at, twist_at

@@ -23,7 +23,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Pose, Twist
-from rs_localizer.io.transforms.rigid import Transform, Transforms
+from rs_localizer.io.transforms import Transform, Transforms
 
 _LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
 

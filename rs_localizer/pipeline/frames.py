@@ -23,8 +23,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
-from rs_localizer.io.transforms.rigid import Transforms
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import Transforms, TransformTree
 from rs_localizer.pipeline.imu import ImuInput
 from rs_localizer.pipeline.landmarks import Landmarks
 from rs_localizer.pipeline.maps import read_landmarks

@@ -23,7 +23,7 @@ from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.io.imu import ImuReading
-from rs_localizer.io.transforms.rigid import TransformError, Transforms
+from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.pipeline.imu_axes import in_camera_axes
 from rs_localizer.pipeline.reasons import IMU_REASONS
 from rs_localizer.pipeline.refusal import Notify

@@ -13,7 +13,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.inertial.buffer import Readings
 from rs_localizer.inertial.samples import ImuSamples
-from rs_localizer.io.transforms.rigid import Transforms
+from rs_localizer.io.transforms import Transforms
 
 
 def in_camera_axes(

@@ -10,7 +10,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.rigid import NotYetError, TransformError, Transforms
+from rs_localizer.io.transforms import NotYetError, TransformError, Transforms
 from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.clock import published_moment
 from rs_localizer.pipeline.moments import backwards, either, pose_at, twist_at, with_timing

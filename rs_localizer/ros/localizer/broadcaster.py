@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.rigid import NotYetError, TransformError, make_transform
+from rs_localizer.io.transforms import NotYetError, TransformError, make_transform
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.ros.localizer.transforms import Tf, import_tf2_ros, needed
 from rs_localizer.ros.node.conversion import make_message

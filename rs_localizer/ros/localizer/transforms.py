@@ -21,7 +21,7 @@ from rclpy.time import Time
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.messages import stamp_ns as stamp_of
-from rs_localizer.io.transforms.rigid import NotYetError, Transform, TransformError, read_transform
+from rs_localizer.io.transforms import NotYetError, Transform, TransformError, read_transform
 from rs_localizer.ros.node.intake import Intake, NotByExecutor
 
 # For how long tf2's buffer remembers, in ns: its default.
@@ -53,7 +53,7 @@ def import_tf2_ros(what: str) -> ModuleType:
 
 
 class Tf:
-    """Transforms from TF (see :class:`rs_localizer.io.transforms.rigid.Transforms`).
+    """Transforms from TF (see :class:`rs_localizer.io.transforms.Transforms`).
 
     :meth:`lookup` and :meth:`moves` may be called from any thread, all else belongs to the
     executor's.
