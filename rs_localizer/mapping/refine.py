@@ -37,11 +37,10 @@ from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over, steepness
 from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, Observations, start_state
-from rs_localizer.trajectory.online import REVERSED
+from rs_localizer.trajectory.online_readout import REVERSED
 from rs_localizer.trajectory.problem import LIMIT, Problem
-from rs_localizer.trajectory.spline import Spline
+from rs_localizer.trajectory.spline import LONGEST_GAP, Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
-from rs_localizer.trajectory.start import LONGEST_GAP
 
 # Beyond so many unknowns of the motion its matrix takes more than 2 GB.
 _MOST_UNKNOWNS = 15000

@@ -52,7 +52,7 @@ from rs_localizer.offline.recordings import RecordingError
 from rs_localizer.offline.replay import imu_topics
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.process.arguments import integer, number
-from rs_localizer.settings import build, load_params_file, write_parameters
+from rs_localizer.settings import build, write_parameters
 from rs_localizer.trajectory.imu import ImuRecording
 
 # After so many, images without features are refused: two seconds of a usual video.
