@@ -83,9 +83,9 @@ def shutter_of(args: argparse.Namespace) -> Shutter:
     """As given, or as it stands beside the images of a recording."""
     values = shutter_values(args)
     known = build(values)
-    readout_time = known.readout_time
-    if args.readout_time is None:
-        readout_time = readout_time or None
+    # 0 is a global shutter where the user says so, and unknown in a file.
+    unknown = args.readout_time is None and not known.readout_time
+    readout_time = None if unknown else known.readout_time
     return Shutter(readout_time, known.scan_direction if "scan_direction" in values else None)
 
 
