@@ -25,7 +25,7 @@ from rs_localizer.io.hloc import (
     result_name,
 )
 from rs_localizer.offline.hloc import Answer, Reference, localize_queries
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.solvers.table import find_solver
 
 _ABOUT = {

@@ -25,9 +25,8 @@ from rs_localizer.io.nerfstudio import View, middle_of_image, transforms
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.offline.image_sources import IMAGE_TYPES
-from rs_localizer.pipeline.clock import middle_row_ns
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 
 TRANSFORMS, IMAGES = "transforms.json", "images"
 _ROW_FILES = "poses_{}.txt"

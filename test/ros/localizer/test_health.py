@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.localizer.answers import tell
-from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest
+from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest, tell
 from rs_localizer.ros.node.health import Level
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
-from rs_localizer.trajectory.measured_readout import MeasuredReadout
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")
