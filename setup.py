@@ -71,6 +71,7 @@ setup(
             "ros-jazzy-rmw-fastrtps-cpp",
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
+        "completion": ["argcomplete"],
         "evo": ["evo"],
         "fleet": ["dask", "distributed"],
         "hloc": ["h5py"],

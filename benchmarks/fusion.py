@@ -26,11 +26,10 @@ from benchmarks.independent.motions import Motions, States, hand
 from benchmarks.independent.scenes import Rich
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Pose, Twist
-from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.io.transforms import Transform
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.body import Mounting, base_pose, base_twist
-from rs_localizer.pipeline.moments import pose_at, twist_at
-from rs_localizer.pipeline.roll_pitch_yaw import about_angles
+from rs_localizer.pipeline.body import Mounting, about_angles, base_pose, base_twist
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.tracking import Tracker
 
 NOISE = 1.0  # px

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rs_localizer.core.types import Estimate, Failure
     from rs_localizer.core.units import CameraState, camera_state
     from rs_localizer.estimation.prior import Prior
-    from rs_localizer.io.calibration.files import read_calibration
+    from rs_localizer.io.calibration import read_calibration
     from rs_localizer.localizer import Localizer
     from rs_localizer.solvers.minimal import solve_minimal
     from rs_localizer.tracking import Tracker
@@ -55,7 +55,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.types": ("Estimate", "Failure"),
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
-        "io.calibration.files": ("read_calibration",),
+        "io.calibration": ("read_calibration",),
         "localizer": ("Localizer",),
         "solvers.minimal": ("solve_minimal",),
         "tracking": ("Tracker",),

@@ -1,5 +1,6 @@
 """``python -m rs_localizer`` and the executable: takes signals in hand, then imports the rest."""
 
+# PYTHON_ARGCOMPLETE_OK
 from __future__ import annotations
 
 import os
@@ -28,7 +29,9 @@ def run() -> int:
         code = 0
         try:
             with importing(_PROGRAM):
-                from rs_localizer.cli.main import main
+                from rs_localizer.cli.main import complete, main
+
+                complete()
             code = main(importing=importing)
         except KeyboardInterrupt:  # before a command runs
             sys.stderr.write(f"{_PROGRAM}: interrupted\n")

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import json
 from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -186,17 +188,14 @@ def _checked(name: str, value: Any, where: str, kind: Kind) -> Any:
     return value
 
 
-def write_parameters(
-    path: Path, readout_time: float, scan_direction: str, time_offset: float | None = None
-) -> None:
-    """The shutter of a recording, and ``imu.time_offset`` (s) where it is known, as a params file,
-    for ``replay --params``.
-    """
-    config = NodeConfig(readout_time=readout_time, scan_direction=scan_direction)
+def write_parameters(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values by dotted name as a params file, for ``replay --params`` and nodes."""
+    config = build(values)  # refuses wrong ones
+    lines = [
+        f"    {name}: {json.dumps(value.value if isinstance(value, Enum) else value)}\n"
+        for name, value in values.items()
+    ]
     path.write_text(
-        f"/**/{NODE_NAME}:\n  ros__parameters:\n"  # in whatever namespace
-        f"    readout_time: {config.readout_time!r}\n"
-        f"    scan_direction: {config.scan_direction}\n"
-        + ("" if time_offset is None else f"    imu.time_offset: {time_offset!r}\n"),
+        f"/**/{NODES[type(config)]}:\n  ros__parameters:\n{''.join(lines)}",  # in any namespace
         encoding="utf-8",
     )

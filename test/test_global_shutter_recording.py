@@ -13,7 +13,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.moments import twist_at
+from rs_localizer.pipeline.pose_at_time import twist_at
 
 # Of 6 dimensions: what 95 % of a chi-squared variable lie below.
 REGION = 12.59

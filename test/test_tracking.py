@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import rs_localizer as rsl
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.state import step_between
-from rs_localizer.pipeline.moments import twist_at
+from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
 
 READOUT = 0.03

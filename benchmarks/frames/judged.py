@@ -17,7 +17,7 @@ import rs_localizer as rsl
 from benchmarks.frames.conditions import EXACT, Condition
 from benchmarks.frames.generated import Frame, Gyroscope, calibrated, generate
 from benchmarks.independent.rotations import Array, logarithm
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 
 REGION = float(chi2.ppf(0.95, 6))
 # As unlikely as five standard deviations are of one variable (6 in 10 million).

@@ -14,7 +14,7 @@ from typing import Any
 from benchmarks.fuzzing import calibrations, seeds
 from benchmarks.fuzzing.mutations import damaged, damaged_message
 from rs_localizer.config import NodeConfig
-from rs_localizer.io.calibration.files import CalibrationError, read_calibration
+from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.images import read_compressed_image, read_image

@@ -15,7 +15,7 @@ from benchmarks.independent.rotations import logarithm
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.outputs import Pose, Twist
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 
 
 @dataclass(frozen=True, slots=True, eq=False)

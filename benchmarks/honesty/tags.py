@@ -20,7 +20,7 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.moments import twist_at
+from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.solvers.table import find_solver
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
-from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.settings_args import add_settings, given_settings
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt

@@ -20,7 +20,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.experienced import ExperiencedFrames
+from rs_localizer.pipeline.single_frames import SingleFrames
 from rs_localizer.tracking import Tracker
 from rs_localizer.trajectory.observe import Observed
 from rs_localizer.trajectory.online import REVERSED
@@ -65,8 +65,9 @@ def localized(
     tracked: with it, one after the other.
     """
     if name == "default":
-        frames = ExperiencedFrames(Localizer(replace(camera, readout_time=0.0), config))
-        return [frames.localize(image.points, image.pixels) for image in images]
+        localizer = Localizer(replace(camera, readout_time=0.0), config)
+        frames = SingleFrames(localizer, remembers=True)
+        return [frames.localize(image.stamp_ns, image.points, image.pixels) for image in images]
     if name == "tracked":
         tracker = Tracker(Localizer(camera, config))
         return [tracker.localize(image.stamp_ns, image.points, image.pixels) for image in images]

@@ -12,20 +12,26 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, many
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.batch import (
+    Plan,
+    add_batch_arguments,
+    folder_name,
+    inputs,
+    is_batch,
+    run_batch,
+)
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
 from rs_localizer.cli.calibrate_table import tell, tell_lens
-from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
-from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.image_input import clock_of, of_bag, of_files, tell_times
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
-from rs_localizer.cli.shots import clock_of, of_bag, of_files, tell_times
-from rs_localizer.cli.topics import add_topics, given_topics
+from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.evaluation.calibration_plots import save_plots
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
-from rs_localizer.io.calibration.files import read_calibration, write_calibration
+from rs_localizer.io.calibration import read_calibration, write_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.images import Image
 from rs_localizer.io.maps.files import read_map_file
@@ -33,6 +39,7 @@ from rs_localizer.io.topics import IMU
 from rs_localizer.markers.boards import BoardSizes
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.offline.image_sources import (
     Carried,
     Shot,
@@ -47,6 +54,9 @@ from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.observe import Observed, in_order
+
+# Of each result of many.
+_SHUTTER = "shutter.yaml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write the files although the result is refused (the exit code stays 1)",
     )
-    add_fleet_arguments(parser)
+    add_batch_arguments(parser)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,12 +126,14 @@ class _Source:
     own_stamps: bool = True
 
 
-def run(args: argparse.Namespace) -> None:
-    if is_fleet(args):
+def run(args: argparse.Namespace) -> Figures | None:
+    if is_batch(args):
         given_settings(args)  # refuses wrong ones before there are workers
-        many.calibrate(args)
+        _calibrate_batch(args)
     else:
-        calibrate_one(argparse.Namespace(**vars(args), recording=args.recordings[0]))
+        alone = argparse.Namespace(**vars(args), recording=args.recordings[0])
+        return _figures(calibrate_one(alone))
+    return None
 
 
 def calibrate_one(args: argparse.Namespace) -> Calibration:
@@ -281,3 +293,43 @@ def _next(args: argparse.Namespace, out: Path, lens: Path | None, shape: Path | 
     replay[1] = str(seen)
     detect = ["rs_localizer", "detect", str(recording), *given, "--out", str(seen)]
     return f"{shlex.join(detect)} && {shlex.join(['rs_localizer', *replay])}"
+
+
+def _calibrate_batch(args: argparse.Namespace) -> None:
+    """``calibrate`` with each of many recordings."""
+    plots = folder_name("--plots", args.plots)
+    options = ("intrinsics", "imu", "board", "map")
+    given = [name for name in options if getattr(args, name) not in (None, False)]
+    files = inputs(args.map, args.calibration, args.params)
+    kind = Kind("calibrate", _calibrate_of_many, " ".join(["calibrate", *given]), _calibrate_warm)
+    run_batch(argparse.Namespace(**vars(args) | {"plots": plots}), Plan(kind, lambda _: files))
+
+
+def _calibrate_warm(_: argparse.Namespace) -> None:
+    """Compile what images of any kind, and many at once, need."""
+    from rs_localizer.markers.detection import warm_up as warm_up_markers
+    from rs_localizer.pipeline.frames import FrameLocalizer
+    from rs_localizer.trajectory.warm_up import warm_up
+
+    warm_up_markers()
+    FrameLocalizer(NodeConfig()).warm_up()
+    warm_up()
+
+
+def _calibrate_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
+    """One of them: its result in ``out``, and figures for the summary."""
+    out.mkdir(parents=True)
+    plots = None if args.plots is None else out / args.plots
+    own = {"recording": recording, "out": out / _SHUTTER, "plots": plots}
+    return _figures(calibrate_one(argparse.Namespace(**vars(args) | own)))
+
+
+def _figures(found: Calibration) -> Figures:
+    return {
+        "readout time (ms)": 1e3 * verdict.readout_time(found),
+        "deviation (ms)": 1e3 * found.deviation,
+        "scan direction": str(verdict.scan_direction(found)),
+        "images": found.images,
+        "with a pose": len(found.posed.times),
+        "noise (px)": float(found.fit.deviation),
+    }

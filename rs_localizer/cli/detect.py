@@ -10,24 +10,31 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, detect_features, many
-from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
-from rs_localizer.cli.image_source import (
+from rs_localizer.cli import UsageError, add_overwrite, replaced
+from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
+from rs_localizer.cli.image_input import (
+    Source,
     add_source_arguments,
+    opened,
+    shutter_values,
     tell_left_out,
     tell_next,
     time_faults,
     write_shutter,
 )
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
-from rs_localizer.cli.shots import Source, opened
-from rs_localizer.config import DetectorConfig
-from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.config import DetectorConfig, FeatureConfig, FeatureKind
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES
-from rs_localizer.offline.detect import Options, Recorded, record
+from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
+from rs_localizer.offline.fleet.task import Figures, Kind
+from rs_localizer.pipeline.features import FrameExtractor
 from rs_localizer.pipeline.images import FrameDetector
-from rs_localizer.process.arguments import number
+from rs_localizer.process.arguments import integer, number
+from rs_localizer.settings import build, settings
+
+# Options of markers and boards.
+_OF_MARKERS = ("map", "board", "pattern", "square", "min_side")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,9 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help=f"markers with a shorter side are left out (default: {DetectorConfig().min_side:g})",
     )
-    detect_features.add_feature_arguments(wanted)
+    _add_feature_arguments(wanted)
     add_source_arguments(parser)
     parser.add_argument("--out", type=Path, required=True, help="bag directory to create")
+    add_overwrite(parser)
     parser.add_argument(
         "--images", dest="with_images", action="store_true", help="copy compressed images, too"
     )
@@ -58,25 +66,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timing", action="store_true", help="say how long it took, and how much of it OpenCV did"
     )
-    add_fleet_arguments(parser)
+    add_batch_arguments(parser)
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> Figures | None:
     if args.features is None and args.max_keypoints is not None:
         raise UsageError("--max-keypoints goes with --features")
     if args.features is None and args.map is None and args.board is None:
         raise UsageError("give --map, --board or --features")
-    if not is_fleet(args):
+    if not is_batch(args):
         alone = argparse.Namespace(**vars(args), images=args.recordings[0])
         if args.features is None:
-            detect_one(alone)
-        else:
-            detect_features.run(alone)
-        return
+            return _figures(detect_one(alone))
+        _detect_features(alone)
+        return None
     if args.features is not None:
         raise UsageError("--features takes one recording")
     find_map(args)  # refuses wrong ones before there are workers
-    many.detect(args)
+    _detect_batch(args)
+    return None
 
 
 def detect_one(args: argparse.Namespace) -> Recorded:
@@ -86,7 +94,10 @@ def detect_one(args: argparse.Namespace) -> Recorded:
     config = DetectorConfig() if args.min_side is None else DetectorConfig(min_side=args.min_side)
     detector = FrameDetector(config, lambda _, text: notices.update((text,)), marker_map)
     detector.warm_up()
-    with opened(args, args.images, args.start) as source, atomic_directory(args.out) as out:
+    with (
+        opened(args, args.images, args.start) as source,
+        atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
+    ):
         recorded = _record(args, source, detector, out)
         write_shutter(args, out)
     _tell(args, recorded, notices)
@@ -113,11 +124,7 @@ def _record(
             source.shots,
             detector,
             out,
-            Options(
-                args.storage,
-                args.with_images,
-                args.scan_direction or ScanDirection.TOP_TO_BOTTOM,
-            ),
+            _options(args),
             done=progress.update,
             tell=lambda text: progress.write(f"note: {text}", file=sys.stderr),
         )
@@ -136,3 +143,94 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
     tell_left_out(recorded.refused, recorded.carried)
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
+
+
+def _options(args: argparse.Namespace) -> Options:
+    direction = build(shutter_values(args)).scan_direction
+    return Options(args.storage, args.with_images, direction)
+
+
+def _add_feature_arguments(parser: argparse._ActionsContainer) -> None:
+    """For :func:`_detect_features`."""
+    parser.add_argument(
+        "--features",
+        choices=[kind.value for kind in FeatureKind],
+        help="instead: keypoints with descriptors, to be matched with a map; sift: as COLMAP's",
+    )
+    setting = settings(FeatureConfig)["max_keypoints"]
+    parser.add_argument(
+        "--max-keypoints",
+        type=integer(int(setting.minimum or 1)),
+        metavar="N",
+        help=f"of an image, the best of all its parts (default: {setting.default})",
+    )
+
+
+def _detect_features(args: argparse.Namespace) -> None:
+    """Find the keypoints of all images."""
+    for name in _OF_MARKERS:
+        if getattr(args, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} is for markers; give it or --features")
+    config = FeatureConfig(features=args.features)
+    if args.max_keypoints is not None:
+        config = FeatureConfig(features=args.features, max_keypoints=args.max_keypoints)
+    extractor = FrameExtractor(config)
+    options = _options(args)
+    with (
+        opened(args, args.images, args.start) as source,
+        atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
+        tqdm(total=source.total, unit="image", desc="detect", disable=None) as progress,
+    ):
+        extraction = record_features(source.shots, extractor, out, options, progress.update)
+        write_shutter(args, out)
+    _tell_features(args, extraction)
+    for fault in time_faults(args, source.clock, extraction.period):
+        print(f"warning: {fault}")
+    tell_next(args, " --map MAP")
+    if args.timing:
+        milliseconds = 1e3 * extractor.seconds / len(extraction.stamps_ns)
+        print(f"time per image: {milliseconds:.1f} ms, {1e3 / milliseconds:.0f} images/s")
+
+
+def _tell_features(args: argparse.Namespace, extraction: Extraction) -> None:
+    with_any = len(extraction.counts)
+    print(
+        f"{args.out}: {with_any} of {extraction.images} images, "
+        f"{np.median(extraction.counts):.0f} keypoints ({args.features}) each (median)"
+    )
+    if bare := len(extraction.stamps_ns) - with_any:
+        print(f"{bare} images have no keypoint")
+    tell_left_out(extraction.refused, extraction.carried)
+
+
+def _detect_batch(args: argparse.Namespace) -> None:
+    """``detect`` in many recordings."""
+    if args.timing:
+        raise UsageError("--timing is of one recording: beside others it would tell little")
+    files = inputs(args.map, args.calibration, args.params)
+    kind = Kind("detect", _detect_of_many, "detect", _detect_warm)
+    run_batch(args, Plan(kind, lambda _: files, args.overwrite))
+
+
+def _detect_warm(_: argparse.Namespace) -> None:
+    """Compile what the search needs."""
+    from rs_localizer.markers.detection import warm_up
+
+    warm_up()
+
+
+def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
+    """One of them: its result in ``out``, and figures for the summary."""
+    return _figures(
+        detect_one(argparse.Namespace(**vars(args), images=recording, out=out, overwrite=False))
+    )
+
+
+def _figures(found: Recorded) -> Figures:
+    return {
+        "images": found.images,
+        "with corners": found.with_corners,
+        "corners": found.corners,
+        "residual of a still pose (px)": found.residual,
+        "warnings": "; ".join(found.faults),
+    }

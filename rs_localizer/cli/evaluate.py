@@ -6,9 +6,10 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from rs_localizer.cli import UsageError, many
-from rs_localizer.cli.fleet import add_fleet_arguments
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.batch import Plan, add_batch_arguments, folder_name, run_batch
 from rs_localizer.core.arrays import Array
 from rs_localizer.evaluation.metrics import (
     Errors,
@@ -29,9 +30,12 @@ from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.estimates import Motions, read_motions
 from rs_localizer.io.recording import CORRESPONDENCES_TOPIC
 from rs_localizer.io.trajectories import Trajectory, Twists, read_twists
+from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.process.arguments import number
 
 _AUTO = "auto"
+# Deg: less is an error, not another frame. And what is left once a rotation explains the rest.
+_ANOTHER_FRAME, _EXPLAINED = 10.0, 0.2
 # An offset is worth a warning when errors without it are larger by this factor.
 _WORSE = 1.5
 
@@ -92,19 +96,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="draw trajectories and errors; of many estimates, its name in the folder of each",
     )
-    add_fleet_arguments(parser)
+    add_batch_arguments(parser)
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> Figures | None:
     if args.truths is not None:
-        many.evaluate(args)
-        return
+        _evaluate_batch(args)
+        return None
     if len(args.recordings) != 2:
         raise UsageError("give EST and TRUTH, or estimates and --truths DIR")
     if args.out is not None or args.workers is not None or args.scheduler is not None:
         raise UsageError("--out, --workers and --scheduler go with --truths")
     estimate, truth = args.recordings
-    evaluate_one(argparse.Namespace(**vars(args), estimate=estimate, truth=truth))
+    alone = argparse.Namespace(**vars(args), estimate=estimate, truth=truth)
+    return _figures(*evaluate_one(alone))
 
 
 def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
@@ -132,6 +137,8 @@ def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
     if args.offset is None:
         print(_coverage(args.truth, estimate.poses, truth.poses, tolerance_ns))
         _print_offset(found)
+    if text := _other_frames(estimate.poses, truth.poses, tolerance_ns):
+        print(f"warning: {text}")
     print()
     _print_table(poses, twists)
     if args.ate:
@@ -187,6 +194,33 @@ def _print_offset(found: TimeOffset | None) -> None:
             f"warning: with this offset the median orientation error is {after:.3f} deg, without "
             f"it {before:.3f} deg: the clocks differ; apply it with --offset {_AUTO}"
         )
+
+
+def _other_frames(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> str:
+    """What to say of orientations that all differ by one rotation; empty: nothing."""
+    rows, true_rows = associate(estimate.stamps_ns, truth.stamps_ns, tolerance_ns)
+    if len(rows) < 2:
+        return ""
+    estimated = Rotation.from_quat(estimate.quaternions[rows])
+    true = Rotation.from_quat(truth.quaternions[true_rows])
+    before = float(np.degrees(np.median((true.inv() * estimated).magnitude())))
+    for whose, between in (
+        ("body (base_frame, optical axes)", true.inv() * estimated),
+        ("map", estimated * true.inv()),
+    ):
+        turn = between.mean()
+        after = float(np.degrees(np.median((turn.inv() * between).magnitude())))
+        if before > _ANOTHER_FRAME and after < _EXPLAINED * before:
+            angle = float(np.degrees(turn.magnitude()))
+            axis = turn.as_rotvec() / turn.magnitude()
+            x, y, z, w = turn.as_quat(canonical=True)
+            return (
+                f"the poses are given in different frames of the {whose}: a turn of {angle:.2f} "
+                f"deg about ({axis[0]:.3f}, {axis[1]:.3f}, {axis[2]:.3f}) (quaternion x y z w "
+                f"{x:.4f} {y:.4f} {z:.4f} {w:.4f}) explains all but {after:.3f} deg of "
+                f"{before:.3f} deg"
+            )
+    return ""
 
 
 def _plot(
@@ -279,3 +313,40 @@ def _print_ate(estimate: Trajectory, truth: Trajectory, tolerance_ns: int) -> No
 def _span(poses: Trajectory) -> str:
     first, last = poses.stamps_ns[[0, -1]] * 1e-9
     return f"{first:.3f} to {last:.3f} s"
+
+
+def _evaluate_batch(args: argparse.Namespace) -> None:
+    """``evaluate`` of many estimates, each with the truth of its name."""
+    if args.twists or args.truth_twists:
+        raise UsageError("--twists and --truth-twists are of one recording")
+    truths = args.truths.absolute()
+    own = {"truths": truths, "plot": folder_name("--plot", args.plot)}
+    kind = Kind("evaluate", _evaluate_of_many, "evaluate")
+    plan = Plan(kind, lambda estimate: [_truth_of(estimate, truths)])
+    run_batch(argparse.Namespace(**vars(args) | own), plan)
+
+
+def _evaluate_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
+    """One of them: its result in ``out``, and figures for the summary."""
+    truth = _truth_of(recording, args.truths)
+    if not truth.exists():
+        raise ValueError(f"there is no truth of {recording}: no {truth}, with or without a suffix")
+    out.mkdir(parents=True)
+    plot = None if args.plot is None else out / args.plot
+    own = {"estimate": recording, "truth": truth, "plot": plot}
+    return _figures(*evaluate_one(argparse.Namespace(**vars(args) | own)))
+
+
+def _figures(poses: Errors, twists: Errors | None) -> Figures:
+    figures: Figures = {"poses": len(poses.stamps_ns)}
+    for name, errors in named_errors(poses, twists):
+        summary = summarize(errors)
+        figures |= {f"{name} median": summary.median, f"{name} 95 %": summary.p95}
+    return figures
+
+
+def _truth_of(estimate: Path, truths: Path) -> Path:
+    """The truth of an estimate: of the same name in another directory, whatever the suffix."""
+    name = estimate.name if estimate.is_dir() else estimate.stem
+    found = [truths / name] if (truths / name).exists() else sorted(truths.glob(f"{name}.*"))
+    return found[0] if len(found) == 1 else truths / name

@@ -10,7 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from rs_localizer.cli.given import add_settings, given_settings, row_time
+from rs_localizer.cli import add_overwrite
+from rs_localizer.cli.settings_args import add_settings, given_settings, row_time
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.types import Estimate
@@ -24,7 +25,7 @@ from rs_localizer.io.hloc import (
     result_name,
 )
 from rs_localizer.offline.hloc import Answer, Reference, localize_queries
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.solvers.table import find_solver
 
 _ABOUT = {
@@ -59,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="whose pose is written: first, middle, last, or a row time from -0.5 to 0.5 "
         "(default: middle)",
     )
+    add_overwrite(parser)
     add_settings(parser.add_argument_group("settings, as of replay; readout_time among them"))
 
 
@@ -66,8 +68,8 @@ def run(args: argparse.Namespace) -> None:
     config = given_settings(args)
     motion = args.results.with_name(f"{args.results.stem}_motion.json")
     for path in (args.results, motion):
-        if path.exists():
-            raise OutputError(f"{path} exists already; it is not overwritten")
+        if path.exists() and not args.overwrite:
+            raise OutputError(f"{path} exists already; it is replaced with --overwrite")
     reference = Reference(args.reference_sfm)
     queries, pairs = read_queries(args.queries), read_pairs(args.retrieval)
     paired = {image for images in pairs.values() for image in images}

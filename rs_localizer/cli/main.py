@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import importlib
+import io
+import json
+import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import traceback
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import rs_localizer
 from rs_localizer.cli import UsageError
@@ -29,12 +35,20 @@ _STEERING = {
 }
 
 
+# Of every command, wherever they stand behind its name.
+_COMMON = (
+    ("--json", "print the result as JSON"),
+    ("--quiet", "print nothing but faults"),
+    ("--verbose", "of a fault, say where in the program it was found"),
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Command:
     """A command: what it does, and a line that a user can try.
 
     Its module, imported only when it is chosen, offers ``add_arguments(parser)`` and
-    ``run(arguments)``.
+    ``run(arguments)``, which prints, and returns what ``--json`` prints instead, or None.
     """
 
     module: str
@@ -66,13 +80,13 @@ COMMANDS = {
     "detect": Command(
         "rs_localizer.cli.detect",
         "find markers or a board in a video, a bag or a folder of images; writes a recording",
-        "rs_localizer detect video.mp4 --map wall.yaml --calibration camera.yaml --rate 30 "
-        "--out seen",
+        "rs_localizer detect video.mp4 --map wall.yaml --calibration camera.yaml --params "
+        "shutter.yaml --out seen",
     ),
     "calibrate": Command(
         "rs_localizer.cli.calibrate",
         "readout time, scan direction and lens of a camera, from a recording in which it moves",
-        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --rate 30 --out shutter.yaml",
+        "rs_localizer calibrate video.mp4 --board 9x6 --square 0.025 --out shutter.yaml",
     ),
     "readout": Command(
         "rs_localizer.cli.readout",
@@ -87,7 +101,7 @@ COMMANDS = {
     "map": Command(
         "rs_localizer.cli.map",
         "make a map of a room or of markers, refine, align and convert it, say what it holds",
-        "rs_localizer map build walk.mp4 --calibration lens.yaml --rate 30 --out room",
+        "rs_localizer map build walk.mp4 --calibration lens.yaml --params shutter.yaml --out room",
     ),
     "watch": Command(
         "rs_localizer.cli.watch",
@@ -123,18 +137,13 @@ def main(
         the exit code.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    common, words = _common_options(words)
     try:
         name = _parser().parse_args(words[:1]).command
         command = COMMANDS[name]
         with importing(f"rs_localizer {name}"):
             module = importlib.import_module(command.module)
-        parser = argparse.ArgumentParser(
-            prog=f"rs_localizer {name}",
-            description=_sentence(command.summary),
-            epilog=f"example:\n  {command.example}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
+        parser = _command_parser(name)
         module.add_arguments(parser)
         arguments = parser.parse_args(words[1:])
     except SystemExit as end:  # argparse has said all there is to say
@@ -143,22 +152,114 @@ def main(
         return _fail(name, explain(error), 1)
     StopRequest.clean_up.append(remove_unfinished)
     try:
-        with _plain_output() if name != "watch" else nullcontext():
-            module.run(arguments)
+        with _output(name, common):
+            result = module.run(arguments)
+            printed = sys.stdout
+        if "--json" in common and isinstance(printed, io.StringIO):
+            _print_json(name, result, printed.getvalue())
         sys.stdout.flush()
-    except BrokenPipeError:
-        return _unheard()
-    except UsageError as error:
-        return _fail(name, str(error), 2)
-    except (ValueError, OSError) as error:
-        return _fail(name, str(error), 1)
-    except ImportError as error:  # of what only some of its work needs
-        return _fail(name, explain(error), 1)
-    except MemoryError as error:
-        return _fail(name, f"the memory does not suffice: {error}", 1)
+    except Exception as error:
+        if "--verbose" in common:
+            traceback.print_exc()
+        code = _said(name, error)
+        if code is None:
+            raise
+        return code
     except KeyboardInterrupt:
         return _fail(name, "interrupted", INTERRUPTED)
     return 0
+
+
+def _said(name: str, error: Exception) -> int | None:
+    """Say what went wrong; the exit code, None for a fault in the program."""
+    match error:
+        case BrokenPipeError():
+            return _unheard()
+        case UsageError():
+            return _fail(name, str(error), 2)
+        case ValueError() | OSError():
+            return _fail(name, str(error), 1)
+        case ImportError():  # of what only some of its work needs
+            return _fail(name, explain(error), 1)
+        case MemoryError():
+            return _fail(name, f"the memory does not suffice: {error}", 1)
+    return None
+
+
+def _common_options(words: Sequence[str]) -> tuple[set[str], list[str]]:
+    """Options of all commands that are among the words, and the other words."""
+    names = {"-q": "--quiet", "-v": "--verbose"} | {name: name for name, _ in _COMMON}
+    end = words.index("--") if "--" in words else len(words)
+    first, rest = list(words[1:end]), list(words[end:])
+    common = {names[word] for word in first if word in names}
+    return common, [*words[:1], *(word for word in first if word not in names), *rest]
+
+
+def _command_parser(name: str) -> argparse.ArgumentParser:
+    command = COMMANDS[name]
+    return _with_common(
+        argparse.ArgumentParser(
+            prog=f"rs_localizer {name}",
+            description=_sentence(command.summary),
+            epilog=f"example:\n  {command.example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+    )
+
+
+def _with_common(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    group = parser.add_argument_group("of all commands")
+    for name, text in _COMMON:
+        short = (name[1:3],) if name != "--json" else ()
+        group.add_argument(*short, name, action="store_true", help=text, dest=f"common{name}")
+    return parser
+
+
+@contextlib.contextmanager
+def _output(name: str, common: Collection[str]) -> Iterator[None]:
+    """Within ``with``, what is printed cannot steer the terminal, and goes where options say."""
+    if name == "watch":
+        yield
+    elif "--json" in common or "--quiet" in common:
+        # No bar either, which is for a person who waits.
+        sys.stderr.isatty = lambda: False  # type: ignore[method-assign]
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    else:
+        with _plain_output():
+            yield
+
+
+def _print_json(name: str, result: Any, printed: str) -> None:
+    """The figures of a command, or the lines that it has printed."""
+    found = {"text": printed.splitlines()} if result is None else {"result": result}
+    print(json.dumps({"command": name, **_as_json(found)}, indent=1))
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(name): _as_json(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_as_json(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, (bool, int, type(None))) else str(value)
+
+
+def complete() -> None:
+    """Answer a shell that asks how to complete a line, if one does (argcomplete)."""
+    if "_ARGCOMPLETE" not in os.environ:
+        return
+    import argcomplete
+
+    parser = argparse.ArgumentParser(prog="rs_localizer", allow_abbrev=False)
+    commands = parser.add_subparsers()
+    for name, command in COMMANDS.items():
+        own = _with_common(commands.add_parser(name, help=command.summary))
+        if name in os.environ["COMP_LINE"].split()[1:2]:
+            importlib.import_module(command.module).add_arguments(own)
+    argcomplete.autocomplete(parser)
 
 
 def _fail(name: str, text: str, code: int) -> int:
@@ -204,9 +305,17 @@ def _parser() -> argparse.ArgumentParser:
         "--version", action="version", version=f"rs_localizer {rs_localizer.__version__}"
     )
     parser.add_argument(
-        "command", metavar="COMMAND", choices=COMMANDS, help=f"one of {', '.join(COMMANDS)}"
+        "command", metavar="COMMAND", type=_command, help=f"one of {', '.join(COMMANDS)}"
     )
     return parser
+
+
+def _command(name: str) -> str:
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
+        raise argparse.ArgumentTypeError(f"invalid choice: {name!r}; {hint}")
+    return name
 
 
 def _sentence(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 
 from rs_localizer.readout import find_readout
 
@@ -14,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> list[dict[str, object]]:
     found = find_readout(args.name, args.mode)
     width = max(len(entry.name) for entry in found)
     modes = max(len(entry.mode) for entry in found)
@@ -27,3 +28,4 @@ def run(args: argparse.Namespace) -> None:
             f"{entry.number:6}  {entry.source}{note if entry.upper_bound else ''}"
         )
     print("What others say, of modes that may not be yours: rs_localizer calibrate measures it.")
+    return [asdict(entry) for entry in found]

@@ -3,48 +3,57 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import importlib.util
 import json
 import shlex
 import time
-from collections import Counter
 from pathlib import Path
 
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, many
-from rs_localizer.cli.fleet import add_fleet_arguments, is_fleet
-from rs_localizer.cli.given import add_settings, given_settings
-from rs_localizer.cli.replay_exports import add_export_arguments, write_exports
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
+from rs_localizer.cli.replay_exports import POSES, TWISTS, Exports, add_export_arguments
 from rs_localizer.cli.replay_result import (
     BRIDGED,
-    POSES,
     RESULT,
-    TWISTS,
+    VIEW,
+    Tally,
+    figures,
     fresh,
+    print_summary,
     write_bridged,
     write_frame,
-    write_texts,
 )
-from rs_localizer.cli.replay_ros import play
-from rs_localizer.cli.replay_summary import Tally, print_summary
-from rs_localizer.cli.replay_view import add_view_arguments, check_view, open_viewer, write_file
-from rs_localizer.cli.topics import add_topics, given_topics
+from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.config import ImuUse, NodeConfig
-from rs_localizer.io.bags import STORAGES, BagReader, BagWriter, is_bag, open_bag
+from rs_localizer.io.bags import STORAGES, BagError, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import IMU
-from rs_localizer.offline.image_sources import holds_images, image_topics
+from rs_localizer.offline.fleet.task import Figures, Kind
+from rs_localizer.offline.image_sources import INFO_TYPE, holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
+    TF_TYPE,
     Topics,
     find_topics,
     find_transforms,
     has_frames,
     imu_topics,
     replay,
+    tf_topics,
 )
 from rs_localizer.offline.smoothed import smooth_frames
+from rs_localizer.offline.viewing.stream import check_screen, write_view
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.settings import NODE_NAME
+from rs_localizer.trajectory.warm_up import warm_up
+
+_SUFFIX = ".rrd"
+# Known by being this very object: a user's view.rrd is in the current directory, as any other name.
+_BESIDE_POSES = Path(VIEW)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -99,29 +108,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="times real time, with --ros (default: 1); with --smooth: samples of the motion, Hz "
         "(default: one for each image)",
     )
-    add_view_arguments(parser)
-    add_fleet_arguments(parser)
+    _add_view_arguments(parser)
+    add_batch_arguments(parser)
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> Figures | None:
     _check_usage(args)
-    check_view(args)
-    if is_fleet(args):
-        many.replay(args, settings_of(args))
-        return
+    _check_view(args)
+    if is_batch(args):
+        _replay_batch(args, _settings(args))
+        return None
     recording: Path = args.recordings[0]
     if args.ros:
         _refuse_images(recording)
         with open_bag(recording) as bag:
             only_images = not has_frames(bag) and not (args.correspondences or args.keypoints)
             topics = None if only_images else find_topics(bag, given_topics(args))
-            play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
-        return
+            _play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
+        return None
     out = args.out or Path(f"{recording.resolve().with_suffix('').name}_replay")
-    replay_one(args, recording, out)
+    return {"out": str(out)} | figures(_replay_one(args, recording, out))
 
 
-def settings_of(args: argparse.Namespace) -> NodeConfig:
+def _settings(args: argparse.Namespace) -> NodeConfig:
     """The settings that the arguments give; refuses those that cannot be."""
     given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
     return given_settings(args, given, FrameLocalizer)  # refuses what it cannot do
@@ -132,11 +141,15 @@ def _refuse_images(recording: Path) -> None:
         raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
 
 
-def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool = True) -> Tally:
+def _replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool = True) -> Tally:
     """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
     _refuse_images(recording)
-    config = settings_of(args)
-    notices: Counter[str] = Counter()
+    config = _settings(args)
+    notices: dict[str, tuple[int, str]] = {}
+
+    def notice(name: str, text: str) -> None:
+        notices[name] = notices.get(name, (0, ""))[0] + 1, text
+
     with open_bag(recording) as bag:
         if image_topics(bag) and not has_frames(bag):
             raise ValueError(
@@ -150,19 +163,23 @@ def replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool
         if topics.lacks_map and not config.map_file:
             raise ValueError(f"{recording} has {topics.frames} and no map; give one with --map")
         transforms = find_transforms(bag, topics, config)
-        localizer = FrameLocalizer(config, lambda name, _: notices.update((name,)), transforms)
+        localizer = FrameLocalizer(config, notice, transforms)
         localizer.load_map()
         if args.smooth and config.readout_time == 0.0:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
+        localizer.warm_up()
+        tally = Tally(bag.count([topics.frames]), notices)
         with fresh(out, args.overwrite) as built:
             _hint(recording, args.params)
-            tally = _replay(bag, topics, localizer, notices, built, args)
-            view = write_file(args, bag, topics, localizer, tally, built)
+            frames = _replay(bag, topics, localizer, tally, built, args)
+            view = _write_view(args, bag, topics, localizer, frames, built)
         if view is not None:
             print(f"to look at: rerun {out / view.name if view.parent == built else view}")
         _tell(tally, config, out, timed)
-        open_viewer(args, bag, topics, localizer, tally)
-        if not tally.frames:
+        # The result is there, whether the viewer starts or not.
+        if args.view and frames:
+            write_view(bag, topics, localizer, frames, None)
+        if not tally.localized:
             raise ValueError(
                 f"no frame of {bag.path} was localized; of the last one, {tally.last_refusal}"
             )
@@ -203,7 +220,7 @@ def _check_usage(args: argparse.Namespace) -> None:
                 "--rate goes with --ros or --smooth; offline replay runs at full speed"
             )
         return
-    if is_fleet(args):
+    if is_batch(args):
         raise UsageError("--ros plays one recording, and needs no workers")
     given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
     if any((*given, args.rows, args.nerfstudio)):
@@ -223,50 +240,199 @@ def _replay(
     bag: BagReader,
     topics: Topics,
     localizer: FrameLocalizer,
-    notices: Counter[str],
+    tally: Tally,
     out: Path,
     args: argparse.Namespace,
-) -> Tally:
-    localizer.warm_up()
-    tally = Tally(total=bag.count([topics.frames]), notices=notices)
+) -> list[Localized]:
+    """Replay into ``out``; the frames of the result, where something needs all of them at once."""
+    exports = Exports(args, localizer, out)
+    whole: list[Localized] = []
+    keep = args.smooth or args.rerun is not None or args.view
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
         BagWriter(out / RESULT, args.storage) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
+
+        def write(frame: Localized, recorded_ns: int) -> None:
+            tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
+            tally.track.add(frame)
+            exports.add(frame)
+
         for recorded_ns, result in replay(bag, topics, localizer):
             if result:
-                tally.frames.append(result)
+                tally.add(result)
+                if keep:
+                    whole.append(result)
                 if not args.smooth:
-                    tally.not_sent += not write_frame(writer, result, localizer, recorded_ns)
+                    write(result, recorded_ns)
             else:
-                tally.refused[result.reason] += 1
-                tally.last_refusal = f"{result.reason}: {result.detail}"
+                tally.refuse(result)
             bar.update(1 if result or result.reason not in NO_FRAMES else 0)
-        if args.smooth and tally.frames:
+        if args.smooth and whole:
             stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            tally.smoothed = smooth_frames(localizer, tally.frames, stamps, args.rate)
-            for frame in tally.written:
-                tally.not_sent += not write_frame(writer, frame, localizer, frame.input_stamp_ns)
+            tally.smoothed = smooth_frames(localizer, whole, stamps, args.rate)
+            whole = tally.smoothed.frames
+            for frame in whole:
+                write(frame, frame.input_stamp_ns)
             write_bridged(out, tally.smoothed.bridged)
     tally.seconds = time.perf_counter() - start
     tally.imu = localizer.imu.state
-    tally.repeated = write_texts(out, tally.written, localizer.config)
-    write_exports(args, bag, localizer, tally.written, out)
-    return tally
+    if (measured := localizer.readout_watch.measured) is not None:
+        tally.readout = measured.readout_time, measured.deviation
+    tally.repeated, tally.moving = tally.track.write(out, localizer.config.pose_time)
+    exports.write(bag)
+    return whole
 
 
 def _tell(tally: Tally, config: NodeConfig, out: Path, timed: bool) -> None:
     print_summary(tally, config, timed)
-    moving = any(frame.twist for frame in tally.written)
-    if tally.frames and not moving:
+    if tally.localized and not tally.moving:
         print(f"no twists: {_why_no_twists(config)}")
     bridged = f", {BRIDGED}" if tally.smoothed else ""
-    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if moving else ''}{RESULT}{bridged}")
+    print(f"written to {out}: {POSES}, {f'{TWISTS}, ' if tally.moving else ''}{RESULT}{bridged}")
 
 
 def _why_no_twists(config: NodeConfig) -> str:
     if config.readout_time == 0.0:
         return "readout_time is 0 (unknown); give it with -p readout_time:=SECONDS"
     return f"solver {config.solver} estimates no velocities"
+
+
+def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
+    """Where to look at the result."""
+    group = parser.add_argument_group(
+        "to look at, with Rerun (pip install 'rs_localizer[view]')",
+        "Path, covariance, landmarks, inliers, images, residuals and velocities on one time line.",
+    )
+    group.add_argument(
+        "--rerun",
+        nargs="?",
+        type=Path,
+        const=_BESIDE_POSES,
+        metavar="FILE.rrd",
+        help=f"write a file for the viewer (default: {VIEW} beside the poses)",
+    )
+    group.add_argument("--view", action="store_true", help="open the viewer")
+
+
+def _check_view(args: argparse.Namespace) -> None:
+    """Refuse what cannot be shown before there is anything to show.
+
+    Raises:
+        UsageError: for options that do not go together.
+        ValueError: without the Rerun SDK or, for the viewer, a screen.
+    """
+    if args.rerun is None and not args.view:
+        return
+    if is_batch(args) or args.ros:
+        raise UsageError("--rerun and --view show one recording, replayed offline")
+    if args.rerun is not None and args.rerun.suffix != _SUFFIX:
+        raise UsageError(
+            f"--rerun FILE must end in {_SUFFIX}, got {args.rerun} (a recording stands before it)"
+        )
+    if importlib.util.find_spec("rerun") is None:
+        raise ValueError(
+            "--rerun and --view need the Rerun SDK, which is not installed: "
+            "pip install 'rs_localizer[view]'"
+        )
+    if args.view:
+        check_screen()
+
+
+def _write_view(
+    args: argparse.Namespace,
+    bag: BagReader,
+    topics: Topics,
+    localizer: FrameLocalizer,
+    frames: list[Localized],
+    out: Path,
+) -> Path | None:
+    """Write what ``--rerun`` asks for; of no pose there is nothing to be seen."""
+    if args.rerun is None or not frames:
+        return None
+    file: Path = out / VIEW if args.rerun is _BESIDE_POSES else args.rerun
+    write_view(bag, topics, localizer, frames, file)
+    return file
+
+
+def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -> None:
+    """Publish the inputs of the nodes: matches or keypoints, images, their camera_info, and TF.
+
+    Args:
+        bag: the recording.
+        topics: of the localizer's inputs; None: it has none, only images.
+        rate: times real time.
+        imus: topics of inertial measurements.
+
+    Raises:
+        ValueError: without ROS, without anything to play, or when nobody listens.
+    """
+    try:  # by name: whoever has no ROS replays offline
+        player = importlib.import_module("rs_localizer.ros.graph.player")
+    except ImportError as error:
+        raise ValueError(
+            f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
+            "(docs/install.md)"
+        ) from error
+    images = image_topics(bag)
+    inputs = images + (_of_type(bag, INFO_TYPE) if topics is None else list(topics.names))
+    if not images and topics is None:
+        raise BagError(f"{bag.path} has nothing to play: no matches, keypoints or images")
+    names = tuple(dict.fromkeys((*_transforms(bag), *imus, *inputs)))
+    total = bag.count(names)
+    latched = [] if topics is None else [t for t, item in topics.inputs.items() if item.lasting]
+    played = player.play(
+        tqdm(bag.messages(names), total=total, unit="message", desc="play", disable=None),
+        {name: bag.topics[name] for name in names},
+        rate,
+        latched=latched,
+    )
+    if topics is not None:
+        print(f"{bag.count([topics.frames])} frames published in {played.seconds:.1f} s")
+    if images:
+        print(f"{bag.count(images)} images published in {played.seconds:.1f} s")
+    for topic, count in played.poses.items():
+        print(f"{count} poses heard on {topic}")
+    if not played.poses:
+        print(f"no node {NODE_NAME} was there to publish poses")
+
+
+def _of_type(bag: BagReader, type_name: str) -> list[str]:
+    return sorted(topic for topic, kind in bag.topics.items() if kind == type_name)
+
+
+def _transforms(bag: BagReader) -> list[str]:
+    topics = tf_topics(bag, TF_TYPE)
+    try:
+        importlib.import_module("tf2_msgs.msg")
+    except ImportError:
+        if topics:
+            missing = "tf2_msgs is not installed (ros-jazzy-tf2-msgs)"
+            print(f"not played: {' and '.join(topics)}, {missing}")
+        return []
+    return topics
+
+
+def _replay_batch(args: argparse.Namespace, config: NodeConfig) -> None:
+    """``replay`` of many recordings."""
+    kernels = f"replay {config.solver}{' smooth' if args.smooth else ''}"
+    if config.map_file:  # where it is from here, whatever directory a worker is in
+        args = argparse.Namespace(**vars(args) | {"map": Path(config.map_file)})
+    files = inputs(args.params, args.map)
+    kind = Kind("replay", _replay_of_many, kernels, _replay_warm)
+    run_batch(args, Plan(kind, lambda _: files, args.overwrite))
+
+
+def _replay_warm(args: argparse.Namespace) -> None:
+    """Compile what the settings need."""
+    FrameLocalizer(_settings(args)).warm_up()
+    if args.smooth:
+        warm_up()
+
+
+def _replay_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
+    """One of them: its result in ``out``, and figures for the summary."""
+    alone = argparse.Namespace(**vars(args), overwrite=False)
+    return figures(_replay_one(alone, recording, out, timed=False))

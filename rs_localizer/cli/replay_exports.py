@@ -1,36 +1,40 @@
-"""What replay writes for other programs: poses at any row, and nerfstudio's ``transforms.json``."""
+"""What replay writes for other programs: poses and twists as text, at any row, and nerfstudio's
+``transforms.json``.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable
+from array import array
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli.given import row_time
+from rs_localizer.cli.settings_args import row_time
+from rs_localizer.config import PoseTime
 from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.nerfstudio import View, middle_of_image, transforms
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.trajectories import Trajectory, write_tum
+from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.offline.image_sources import IMAGE_TYPES
-from rs_localizer.pipeline.clock import middle_row_ns
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.moments import pose_at, twist_at
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 
 TRANSFORMS, IMAGES = "transforms.json", "images"
 _ROW_FILES = "poses_{}.txt"
 _PNG = b"\x89PNG"
+POSES, TWISTS = "poses.txt", "twists.txt"
+_UNKNOWN_TWIST = (np.nan,) * 6
 
 
 def add_export_arguments(parser: argparse._ActionsContainer) -> None:
-    """For :func:`write_exports`."""
+    """For :class:`Exports`."""
     parser.add_argument(
         "--row",
         dest="rows",
@@ -54,49 +58,117 @@ def written_names(out: Path) -> list[Path]:
     return [*out.glob(_ROW_FILES.format("*")), *out.glob(TRANSFORMS), *out.glob(f"{IMAGES}/*")]
 
 
-def write_exports(
-    args: argparse.Namespace,
-    bag: BagReader,
-    localizer: FrameLocalizer,
-    frames: list[Localized],
-    out: Path,
-) -> None:
-    """Write what was asked for.
+class Track:
+    """Poses and twists by their stamps."""
+
+    def __init__(self) -> None:
+        self._stamps_ns, self._rows = array("q"), array("d")
+        self._bodies: set[str] = set()
+        self._maps: set[str] = set()
+
+    def add(self, frame: Localized) -> None:
+        twist = frame.twist
+        rotation = np.ascontiguousarray(frame.pose.rotation)
+        self._stamps_ns.append(frame.stamp_ns)
+        self._rows.extend(frame.pose.position)
+        self._rows.extend(so3.quaternion(rotation))
+        self._rows.extend(_UNKNOWN_TWIST if twist is None else (*twist.angular, *twist.linear))
+        self._bodies.add(repr(frame.body_frame))
+        self._maps.add(repr(frame.map_frame))
+
+    def once(self) -> tuple[IntArray, Array]:
+        """Stamps in order, and the first pose and twist of each (n,13)."""
+        stamps, first = np.unique(np.array(self._stamps_ns, np.int64), return_index=True)
+        return stamps, np.array(self._rows).reshape(-1, 13)[first]
+
+    def write(self, out: Path, pose_time: str) -> tuple[int, bool]:
+        """Write :data:`POSES` and :data:`TWISTS`; how many stamps came repeatedly, and whether
+        there are twists.
+        """
+        bodies = " or ".join(sorted(self._bodies)) or "the camera"
+        maps = " or ".join(sorted(self._maps)) or "the map"
+        when = {
+            PoseTime.STAMP.value: "the stamp of the image (pose_time: stamp)",
+            PoseTime.MID_FRAME.value: "the exposure of its middle row (pose_time: mid_frame)",
+        }[pose_time]
+        stamps, rows = self.once()
+        write_tum(
+            out / POSES,
+            Trajectory(stamps, rows[:, :3], rows[:, 3:7]),
+            [
+                f"pose of {bodies} in {maps}, map_from_body; t: s, {when}",
+                "x y z: m, its origin; qx qy qz qw: unit quaternion from its axes to the map's",
+            ],
+        )
+        moving = np.isfinite(rows[:, 7])
+        if moving.any():
+            write_twists(
+                out / TWISTS,
+                Twists(stamps[moving], rows[moving, 7:10], rows[moving, 10:]),
+                [
+                    f"velocity of {bodies} with respect to {maps}, in its own axes; t: s, {when}",
+                    "wx wy wz: rad/s; vx vy vz: m/s, of its origin",
+                ],
+            )
+        return len(self._stamps_ns) - len(stamps), bool(moving.any())
+
+
+class Exports:
+    """What other programs want of each frame, as it comes.
 
     Args:
         args: of :func:`add_export_arguments`; ``smooth`` among them.
-        bag: the recording.
-        localizer: that made the frames; it has their camera.
-        frames: those with a pose.
+        localizer: that makes the frames; it has their camera.
         out: directory of the result.
     """
-    calibration = localizer.calibration
-    if calibration is None or not frames or not (args.rows or args.nerfstudio):
-        return
-    config = localizer.config
-    camera = calibration.camera(config.readout_time, config.scan_direction)
-    once = {frame.input_stamp_ns: frame for frame in frames}
-    moments = _Moments(localizer, camera, calibration.frame, args.smooth)
-    ordered = [once[stamp] for stamp in sorted(once)]
-    for name, tau in args.rows:
-        _write_row(out / _ROW_FILES.format(name), name, [moments.at(f, tau) for f in ordered])
-    if args.nerfstudio:
-        _write_transforms(bag, camera, moments, ordered, out)
 
+    def __init__(self, args: argparse.Namespace, localizer: FrameLocalizer, out: Path) -> None:
+        self._localizer, self._out = localizer, out
+        self._named: dict[str, float] = dict(args.rows)
+        self._wants_views: bool = args.nerfstudio
+        self._smoothed: bool = args.smooth
+        self._rows = {name: Track() for name in self._named}
+        self._views: dict[int, View] = {}
 
-class _Moments:
-    """Pose and twist of frames at rows of their images."""
+    def add(self, frame: Localized) -> None:
+        """Take a frame."""
+        if not (self._named or self._wants_views):
+            return
+        for name, tau in self._named.items():
+            then = self._localizer.mounted(self._of_camera(frame, tau))
+            if isinstance(then, Localized):
+                self._rows[name].add(then)
+        if self._wants_views:
+            then = self._of_camera(frame, middle_of_image(self._camera))
+            self._views[frame.input_stamp_ns] = View(
+                f"{IMAGES}/{frame.input_stamp_ns}.jpg",
+                then.pose.rotation,
+                then.pose.position,
+                None if then.twist is None else then.twist.linear,
+                None if then.twist is None else then.twist.angular,
+            )
 
-    def __init__(
-        self, localizer: FrameLocalizer, camera: Camera, body: str, smoothed: bool
-    ) -> None:
-        self._localizer = localizer
-        self._camera = camera
-        self._body = body
-        self._smoothed = smoothed
+    def write(self, bag: BagReader) -> None:
+        """Write the files, with images of the recording."""
+        for name, track in self._rows.items():
+            stamps, rows = track.once()
+            if len(stamps):
+                write_tum(
+                    self._out / _ROW_FILES.format(name),
+                    Trajectory(stamps, rows[:, :3], rows[:, 3:7]),
+                    [f"map_from_body; t: s, the exposure of the row {name} (-0.5 first, 0.5 last)"],
+                )
+        if self._views:
+            self._write_transforms(bag)
 
-    def of_camera(self, frame: Localized, tau: float) -> Localized:
-        """The frame at the exposure of a row."""
+    @property
+    def _camera(self) -> Camera:
+        calibration, config = self._localizer.calibration, self._localizer.config
+        assert calibration is not None  # without one there is no frame
+        return calibration.camera(config.readout_time, config.scan_direction)
+
+    def _of_camera(self, frame: Localized, tau: float) -> Localized:
+        """The frame of the camera at the exposure of a row."""
         config = self._localizer.config
         middle = middle_row_ns(config, self._camera, frame.input_stamp_ns)
         stamp = middle + round(1e9 * config.readout_time * tau)
@@ -109,59 +181,28 @@ class _Moments:
         return replace(
             frame,
             stamp_ns=stamp,
-            body_frame=self._body,
+            body_frame=self._localizer.camera_frame,
             pose=pose_at(frame.estimate, tau),
             twist=twist,
         )
 
-    def at(self, frame: Localized, tau: float) -> Localized | Refusal:
-        """The same of ``base_frame``."""
-        return self._localizer.mounted(self.of_camera(frame, tau))
+    def _write_transforms(self, bag: BagReader) -> None:
+        files = _write_images(bag, set(self._views), self._out)
+        views = [
+            replace(view, file=files.get(stamp, view.file))
+            for stamp, view in sorted(self._views.items())
+        ]
+        text = json.dumps(transforms(self._camera, views), indent=1)
+        (self._out / TRANSFORMS).write_text(text, encoding="utf-8")
+        if missing := len(views) - len(files):
+            print(
+                f"{missing} images of {TRANSFORMS} are not in the recording (detect --images keeps "
+                f"them): put them to {IMAGES}/STAMP_IN_NS.jpg"
+            )
 
 
 def _named_row(text: str) -> tuple[str, float]:
     return text, row_time(text)
-
-
-def _write_row(path: Path, name: str, frames: Iterable[Localized | Refusal]) -> None:
-    known = [frame for frame in frames if isinstance(frame, Localized)]
-    write_tum(
-        path,
-        Trajectory(
-            stamps_ns=np.array([frame.stamp_ns for frame in known], np.int64),
-            positions=np.array([frame.pose.position for frame in known]).reshape(-1, 3),
-            quaternions=np.array(
-                [so3.quaternion(np.ascontiguousarray(frame.pose.rotation)) for frame in known]
-            ).reshape(-1, 4),
-        ),
-        [f"map_from_body; t: s, the exposure of the row {name} (-0.5 first, 0.5 last)"],
-    )
-
-
-def _write_transforms(
-    bag: BagReader, camera: Camera, moments: _Moments, frames: list[Localized], out: Path
-) -> None:
-    files = _write_images(bag, {frame.input_stamp_ns for frame in frames}, out)
-    middle = middle_of_image(camera)
-    views = []
-    for frame in frames:
-        then = moments.of_camera(frame, middle)
-        views.append(
-            View(
-                files.get(frame.input_stamp_ns, f"{IMAGES}/{frame.input_stamp_ns}.jpg"),
-                then.pose.rotation,
-                then.pose.position,
-                None if then.twist is None else then.twist.linear,
-                None if then.twist is None else then.twist.angular,
-            )
-        )
-    text = json.dumps(transforms(camera, views), indent=1)
-    (out / TRANSFORMS).write_text(text, encoding="utf-8")
-    if missing := len(frames) - len(files):
-        print(
-            f"{missing} images of {TRANSFORMS} are not in the recording (detect --images keeps "
-            f"them): put them to {IMAGES}/STAMP_IN_NS.jpg"
-        )
 
 
 def _write_images(bag: BagReader, stamps: set[int], out: Path) -> dict[int, str]:

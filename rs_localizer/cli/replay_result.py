@@ -1,35 +1,49 @@
-"""The directory that replay writes: poses and twists as text, and a bag with the node's topics."""
+"""What replay makes of a recording: poses, twists, a bag, and a summary.
+
+Frames are written as they come; of each, some numbers stay (250 bytes).
+"""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
+import textwrap
+from array import array
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from rs_localizer.cli.replay_exports import written_names
-from rs_localizer.config import NodeConfig, PoseTime
-from rs_localizer.core import so3
+from rs_localizer.cli.replay_exports import POSES, TWISTS, Track, written_names
+from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.image_clock import readout_fault
 from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.topics import TF
-from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
-from rs_localizer.io.transforms.rigid import TransformError, make_transform
+from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.offline.fleet.identity import MARKER
-from rs_localizer.offline.fleet.task import LOG
+from rs_localizer.offline.fleet.task import LOG, Figures
 from rs_localizer.offline.replay import TF_TYPE
+from rs_localizer.offline.smoothed import SmoothedFrames
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.imu import ImuState
+from rs_localizer.pipeline.reasons import explained
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import NODE_NAME
+from rs_localizer.solvers.table import find_solver
 
-POSES, TWISTS, RESULT, BRIDGED = "poses.txt", "twists.txt", "result", "bridged.txt"
+RESULT, BRIDGED = "result", "bridged.txt"
 VIEW = "view.rrd"
 """What replay writes into its output directory."""
+
+# Notices of a frame that could not follow the one before.
+_RESTARTS = ("time_went_back", "map_changed")
+_WIDTH = 96
 
 
 @contextlib.contextmanager
@@ -86,64 +100,163 @@ def _write_transform(
     return True
 
 
-def write_texts(out: Path, frames: list[Localized], config: NodeConfig) -> int:
-    """Write poses and twists in the order of their stamps; how many stamps came repeatedly."""
-    stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
-    first = np.unique(stamps, return_index=True)[1]
-    once = [frames[i] for i in first]
-    about = _about(once, config)
-    write_tum(
-        out / POSES,
-        Trajectory(
-            stamps_ns=stamps[first],
-            positions=np.array([f.pose.position for f in once]).reshape(-1, 3),
-            quaternions=np.array([_quaternion(f) for f in once]).reshape(-1, 4),
-        ),
-        about.poses,
-    )
-    moving = [(f.stamp_ns, f.twist) for f in once if f.twist is not None]
-    if moving:
-        twists = Twists(
-            stamps_ns=np.array([stamp for stamp, _ in moving], dtype=np.int64),
-            angular=np.array([twist.angular for _, twist in moving]),
-            linear=np.array([twist.linear for _, twist in moving]),
-        )
-        write_twists(out / TWISTS, twists, about.twists)
-    return len(frames) - len(once)
-
-
 def write_bridged(out: Path, stamps_ns: IntArray) -> None:
     """Write the stamps (b,) of poses without an image of their own, in s, one a line."""
     text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps_ns.tolist())
     (out / BRIDGED).write_text(text, encoding="utf-8")
 
 
-class _About(NamedTuple):
-    """What the text files say of themselves."""
-
-    poses: list[str]
-    twists: list[str]
-
-
-def _about(frames: list[Localized], config: NodeConfig) -> _About:
-    bodies = " or ".join(sorted({repr(frame.body_frame) for frame in frames})) or "the camera"
-    maps = " or ".join(sorted({repr(frame.map_frame) for frame in frames})) or "the map"
-    when = {
-        PoseTime.STAMP.value: "the stamp of the image (pose_time: stamp)",
-        PoseTime.MID_FRAME.value: "the exposure of its middle row (pose_time: mid_frame)",
-    }[config.pose_time]
-    time = f"t: s, {when}"
-    return _About(
-        [
-            f"pose of {bodies} in {maps}, map_from_body; {time}",
-            "x y z: m, its origin; qx qy qz qw: unit quaternion that turns its axes into the map's",
-        ],
-        [
-            f"velocity of {bodies} with respect to {maps}, in its own axes; {time}",
-            "wx wy wz: rad/s; vx vy vz: m/s, of its origin",
-        ],
-    )
+# Of each frame with a pose.
+_COLUMNS = (
+    *("residual", "model_error", "inliers", "global_shutter_inliers", "points", "tracked"),
+    *("dropped", "twist"),
+)
 
 
-def _quaternion(frame: Localized) -> Array:
-    return so3.quaternion(np.ascontiguousarray(frame.pose.rotation))
+@dataclass(slots=True)
+class Tally:
+    """What became of the frames of a recording."""
+
+    total: int
+    notices: dict[str, tuple[int, str]]  # by name: how often, and the latest sentence
+    track: Track = field(default_factory=Track)
+    refused: Counter[str] = field(default_factory=Counter)
+    last_refusal: str = "nothing came"
+    not_sent: int = 0
+    repeated: int = 0
+    seconds: float = 0.0
+    moving: bool = False  # whether there are twists
+    smoothed: SmoothedFrames | None = None
+    imu: ImuState | None = None
+    readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
+    _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
+    _numbers: array[float] = field(default_factory=lambda: array("d"))
+
+    def add(self, frame: Localized) -> None:
+        """Count a frame with a pose."""
+        estimate = frame.estimate
+        self._stamps_ns.append(frame.input_stamp_ns)
+        self._numbers.extend((
+            estimate.residual_rms, estimate.model_error, int(np.count_nonzero(estimate.inliers)),
+            estimate.global_shutter_inliers, len(estimate.inliers), estimate.tracked,
+            frame.dropped, frame.twist is not None,
+        ))  # fmt: skip
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Count a message without one."""
+        self.refused[refusal.reason] += 1
+        self.last_refusal = f"{refusal.reason}: {refusal.detail}"
+
+    @property
+    def localized(self) -> int:
+        """How many frames have a pose."""
+        return len(self._stamps_ns)
+
+    def column(self, name: str) -> Array:
+        """A number of each of these frames (n,), one of :data:`_COLUMNS`."""
+        table = np.array(self._numbers).reshape(-1, len(_COLUMNS))
+        return table[:, _COLUMNS.index(name)].copy()
+
+    @property
+    def period(self) -> float:
+        """Seconds from frame to frame, median; NaN for less than two."""
+        stamps = np.unique(np.array(self._stamps_ns, np.int64))
+        if len(stamps) < 2:
+            return np.nan
+        steps = np.diff(stamps) * 1e-9
+        # Between those with a pose others may have been refused.
+        return float(np.median(steps / np.round(steps / steps.min())))
+
+
+def figures(tally: Tally) -> Figures:
+    """What the summary of many recordings says of this one."""
+    seen, deviation = tally.readout or (np.nan, np.nan)
+    return {
+        "frames": tally.total,
+        "localized": tally.localized,
+        "residual (px)": float(np.median(tally.column("residual"))),
+        "inliers": float(np.median(tally.column("inliers"))),
+        "with twist": int(np.count_nonzero(tally.column("twist"))),
+        "mostly refused for": next((reason for reason, _ in tally.refused.most_common(1)), ""),
+        "noticed": ", ".join(f"{name} {count}" for name, (count, _) in tally.notices.items()),
+        "readout time seen (ms)": 1e3 * seen,
+        "its deviation (ms)": 1e3 * deviation,
+    }
+
+
+def print_summary(tally: Tally, config: NodeConfig, timed: bool = True) -> None:
+    """Print it as a table, the reasons of refusals explained below.
+
+    Args:
+        tally: what became of the frames.
+        config: the settings.
+        timed: whether to say how fast, which is never the same twice.
+    """
+    rows = [("frames", str(tally.total)), ("localized", str(tally.localized))]
+    rows += [(f"  refused: {reason}", str(n)) for reason, n in tally.refused.most_common()]
+    for name, (count, _) in sorted(tally.notices.items(), key=lambda item: -item[1][0]):
+        kind = "started afresh" if name in _RESTARTS else "noticed"
+        rows.append((f"{kind}: {name}", str(count)))
+    dropped = int(tally.column("dropped").sum())
+    for name, count in (
+        ("rows dropped (not finite)", dropped),
+        ("stamps repeated, not in the text files", tally.repeated),
+        ("without a transform on /tf", tally.not_sent),
+    ):
+        rows += [(name, str(count))] if count else []
+    rows += _quality(tally, config) + _inertial(tally.imu)
+    if timed:
+        rows.append(("frames per second", f"{tally.total / tally.seconds:.0f}"))
+    if tally.smoothed:
+        rows += _smoothing(tally.smoothed)
+    for name, text in rows:
+        print(f"{name:40} {text:>8}")
+    for reason in (*tally.refused, *(tally.imu.reasons if tally.imu else ())):
+        if text := explained(reason):
+            print(textwrap.fill(f"{reason}: {text}", _WIDTH, subsequent_indent="    "))
+    for name, (_, text) in tally.notices.items():
+        print(textwrap.fill(f"{name}: {text}", _WIDTH, subsequent_indent="    "))
+    fault = readout_fault(config.readout_time, tally.period)
+    if fault is not None:
+        print(f"warning: {fault}")
+
+
+def _inertial(imu: ImuState | None) -> list[tuple[str, str]]:
+    if imu is None:
+        return []
+    rows = [("localized with the IMU", f"{imu.used / imu.frames:.1%}")]
+    rows += [(f"  without: {reason}", str(count)) for reason, count in imu.reasons.items()]
+    if imu.used and imu.status is not None and np.isfinite(imu.time_offset):
+        bias, offset = np.degrees(imu.status.bias), 1e3 * imu.time_offset
+        rows += [
+            ("  bias of the gyroscope (deg/s)", f"{np.linalg.norm(bias):.2f}"),
+            ("  time offset of the IMU (ms)", f"{offset:.2f}"),
+        ]
+    return rows
+
+
+def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:
+    return [
+        ("samples of the smoothed motion", str(len(smoothed.frames))),
+        (f"  bridged, listed in {BRIDGED}", str(len(smoothed.bridged))),
+        ("  left out, not determined", str(smoothed.undetermined)),
+        ("  shaken faster than it follows, left as they were", str(smoothed.shaken)),
+    ]
+
+
+def _quality(tally: Tally, config: NodeConfig) -> list[tuple[str, str]]:
+    if not tally.localized:
+        return []
+    rows = [
+        (name, f"{np.median(tally.column(column)):{form}}")
+        for name, column, form in (
+            ("residual of the inliers (px rms, median)", "residual", ".3f"),
+            ("error of map and lens (px rms, median)", "model_error", ".3f"),
+            ("points of a frame (median)", "points", ".0f"),
+            ("  inliers with a rolling shutter", "inliers", ".0f"),
+            ("  inliers with a global shutter", "global_shutter_inliers", ".0f"),
+        )
+    ]
+    if not find_solver(config.solver).rolling_shutter:
+        return [*rows[:3], ("  inliers", rows[3][1])]
+    return [*rows, ("tracked from the frame before", f"{np.mean(tally.column('tracked')):.1%}")]

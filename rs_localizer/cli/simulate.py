@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, add_overwrite, replaced
 from rs_localizer.cli.simulated_camera import (
     add_camera_arguments,
     add_motion_arguments,
@@ -43,6 +43,7 @@ _OF_IMAGES = ("walls", "exposure", "grey_noise", "vignetting", "format", "qualit
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="bag directory to create")
+    add_overwrite(parser)
     add_motion_arguments(parser.add_argument_group("motion"))
     add_camera_arguments(parser.add_argument_group("camera"))
     add_imu_arguments(parser.add_argument_group("IMU"))
@@ -114,7 +115,7 @@ def _write_points(args: argparse.Namespace) -> None:
     rng = np.random.default_rng(args.seed)
     landmarks = described(room(_way(motion), rng), MAP_FRAME, rng)
     counts: list[int] = []
-    with atomic_directory(args.out) as built:
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with bag_of(args, built, motion) as bag:
             frames = simulate_frames(
                 camera, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
@@ -130,7 +131,7 @@ def _write_points(args: argparse.Namespace) -> None:
             raise ValueError(
                 f"none of the {len(stamps)} frames sees any point; nothing is written to {args.out}"
             )
-        write_parameters(built / PARAMETERS, args.readout_time, args.scan_direction)
+        write_parameters(built / PARAMETERS, _shutter(args))
         if args.keypoints:
             write_map_file(built / MAP, landmarks)
     print(
@@ -152,12 +153,12 @@ def _write_images(args: argparse.Namespace) -> None:
     settings = ImageSettings(args.exposure, args.grey_noise, args.vignetting)
     renderer = Renderer(camera, scene.planes, settings)
     encoding = Encoding(args.format, round(args.quality))
-    with atomic_directory(args.out) as built:
+    with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with bag_of(args, built, motion) as bag:
             frames = rendered_frames(renderer, motion, stamps, encoding, seed=args.seed)
             for frame in tqdm(frames, total=len(stamps), unit="frame", desc="render", disable=None):
                 write_rendered(bag, camera, frame)
-        write_parameters(built / PARAMETERS, args.readout_time, args.scan_direction)
+        write_parameters(built / PARAMETERS, _shutter(args))
         if scene.marker_map is not None:
             write_marker_map(built / MARKER_MAP, scene.marker_map)
     said = f"{args.out}: {len(stamps)} images in {(stamps[-1] - stamps[0]) * 1e-9:.1f} s"
@@ -168,6 +169,10 @@ def _write_images(args: argparse.Namespace) -> None:
     out = shlex.quote(str(args.out))
     found = shlex.quote(f"{args.out}_markers")
     print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {found}")
+
+
+def _shutter(args: argparse.Namespace) -> dict[str, object]:
+    return {"readout_time": args.readout_time, "scan_direction": args.scan_direction}
 
 
 def _fewer(counts: list[int], wanted: int) -> str:

@@ -1,5 +1,5 @@
 """Pose and twist at one row time, with their covariances: the formulas of
-:mod:`rs_localizer.pipeline.moments`, all in one call."""
+:mod:`rs_localizer.pipeline.pose_at_time`, all in one call."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration.colmap import colmap_camera
+from rs_localizer.io.calibration import colmap_camera
 
 _KEYPOINTS, _MATCHES = "keypoints", "matches0"
 # Between the names of a pair: now, in a group of the first one, and in older files.

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.io.transforms import Transform
 from rs_localizer.mapping.spotting import Spotted
 from rs_localizer.markers.prints import Marker
 

@@ -13,8 +13,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.hloc import H5File, HlocError
-from rs_localizer.io.maps.colmap_images import read_images
-from rs_localizer.io.maps.colmap_model import read_model
+from rs_localizer.io.maps.colmap import read_images, read_model
 from rs_localizer.localizer import Localizer
 
 NO_PAIRS = "no image of the model is paired with it"

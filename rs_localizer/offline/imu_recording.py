@@ -9,8 +9,7 @@ import numpy as np
 from rs_localizer.io.bags import BagReader
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.transforms.rigid import Transform, TransformError
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import Transform, TransformError, TransformTree
 from rs_localizer.offline.image_sources import IMAGE_TYPES, INFO_TYPE, SourceError, find_topic
 from rs_localizer.offline.recordings import RecordingError
 from rs_localizer.offline.replay import TF_TYPE, as_tf2, tf_topics

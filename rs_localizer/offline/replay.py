@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,12 +12,40 @@ from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, IMU, MAP_POINTS, TF, TF_STATIC
-from rs_localizer.io.transforms.rigid import TransformError
-from rs_localizer.io.transforms.tree import TransformTree
-from rs_localizer.offline.imu_first import LOOK_AHEAD, imu_first
+from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import IMU_TYPE, INPUTS, Input, Role, with_role
 from rs_localizer.pipeline.refusal import Refusal
+
+Item = tuple[str, int, Any]
+"""Topic, time of recording in ns, message."""
+
+LOOK_AHEAD = 1.0
+"""How far the recording is read before a frame goes without its readings, in s."""
+
+
+def imu_first(
+    messages: Iterable[Item], imu: str | None, awaits: Callable[[Item], bool]
+) -> Iterator[Item]:
+    """The messages in their order, but for those of ``imu``, which do not wait for the others.
+
+    Args:
+        messages: by their times of recording.
+        imu: topic; None: there is none.
+        awaits: whether a message that is next still needs readings. It is asked when all before it
+            have been dealt with.
+    """
+    waiting: deque[Item] = deque()
+    for item in messages:
+        if item[0] == imu:
+            yield item
+        else:
+            waiting.append(item)
+        latest_ns = item[1] - round(LOOK_AHEAD * 1e9)
+        while waiting and (waiting[0][1] <= latest_ns or imu is None or not awaits(waiting[0])):
+            yield waiting.popleft()
+    yield from waiting
+
 
 # Reasons of messages that are no frames.
 NO_FRAMES = tuple(item.refused for item in INPUTS.values() if item.role != Role.FRAMES)

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from rs_localizer.core.arrays import IntArray
 from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.clock import published_moment
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_at
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.trajectory.observe import Observed
 from rs_localizer.trajectory.smoothing import smooth

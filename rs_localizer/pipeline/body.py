@@ -16,14 +16,14 @@ mounting counts as exact.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Pose, Twist
-from rs_localizer.io.transforms.rigid import Transform, Transforms
+from rs_localizer.io.transforms import Transform, Transforms
 
 _LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
 
@@ -96,3 +96,32 @@ def base_twist(camera: Twist, mounting: Mounting) -> Twist:
 def _propagate(jacobian: Array, covariance: Array) -> Array:
     result: Array = jacobian @ covariance @ jacobian.T
     return 0.5 * (result + result.T)  # rounding must not cost the symmetry
+
+
+_ROTATION = slice(3, 6)
+# A body that looks straight up or down has no yaw.
+_LEAST_COSINE = 0.02
+
+
+def about_angles(pose: Pose) -> Pose:
+    """The pose with the covariance of x, y, z, roll, pitch and yaw.
+
+    REP-103 means small rotations about the fixed axes of the map; an extended Kalman filter whose
+    state has roll, pitch and yaw (robot_localization) takes the numbers for errors of these angles.
+    With ``R = Rz(yaw) Ry(pitch) Rx(roll)`` a small rotation about the fixed axes is
+
+        theta = E (d_roll, d_pitch, d_yaw),   E = [Rz Ry x, Rz y, z]
+
+    Within a degree of looking straight up or down, where the angles do not say how a body is
+    turned, it is the pose as it came.
+    """
+    x_axis = pose.rotation[:, 0]  # Rz Ry x
+    level = float(np.hypot(x_axis[0], x_axis[1]))  # cosine of the pitch
+    if level < _LEAST_COSINE:
+        return pose
+    left = np.array([-x_axis[1], x_axis[0], 0.0]) / level  # Rz y
+    axes = np.column_stack([x_axis, left, [0.0, 0.0, 1.0]])
+    jacobian: Array = np.eye(6)
+    jacobian[_ROTATION, _ROTATION] = np.linalg.inv(axes)
+    covariance = jacobian @ pose.covariance @ jacobian.T
+    return replace(pose, covariance=0.5 * (covariance + covariance.T))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from rs_localizer.config import NodeConfig, PublishTf
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.rigid import Transform, TransformError, Transforms
+from rs_localizer.io.transforms import Transform, TransformError, Transforms
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,17 +23,14 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
-from rs_localizer.io.transforms.rigid import Transforms
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import Transforms, TransformTree
 from rs_localizer.pipeline.imu import ImuInput
-from rs_localizer.pipeline.landmarks import Landmarks
-from rs_localizer.pipeline.maps import read_landmarks
+from rs_localizer.pipeline.input_checks import StreamResets, lens_is_off, oddities
+from rs_localizer.pipeline.landmarks import Landmarks, read_landmarks
 from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
-from rs_localizer.pipeline.oddities import lens_is_off, oddities
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
-from rs_localizer.pipeline.succession import Succession
 
 
 class FrameLocalizer:
@@ -64,7 +61,7 @@ class FrameLocalizer:
         self.imu = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
-        self._succession = Succession()
+        self._resets = StreamResets()
         self._calibration: Calibration | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
         self._given = config  # the readout time may be found on the way
@@ -107,12 +104,12 @@ class FrameLocalizer:
 
     def reset(self) -> None:
         """Forget the previous frames."""
-        self._succession.forget()
+        self._resets.forget()
         self._forget_motion()
 
     def _forget_motion(self) -> None:
         self.readout_watch.reset()
-        self._method.forget()
+        self._method.frames.reset()
 
     def warm_up(self) -> None:
         """Compile all that the present settings need, from points to messages."""
@@ -141,11 +138,8 @@ class FrameLocalizer:
         """Whether readings of the frame with this stamp are missing that may come within so many
         seconds.
         """
-        follower = self._method.follower
-        if follower is None:
-            return False
         time_ns = self._method.middle_row_ns(stamp_ns)
-        return self.imu.awaits(follower, self.config, time_ns, patience)
+        return self.imu.awaits(self._method.frames, self.config, time_ns, patience)
 
     def load_map(self) -> None:
         """Use the map of the setting ``map_file``, if there is one.
@@ -213,28 +207,17 @@ class FrameLocalizer:
             self._notice(name, text)
         cloud = self._thinned(cloud)
         given = (cloud.points, cloud.pixels, cloud.scores)
-        deviation = max(method.config.readout_time_deviation, self.readout_watch.error)
-        if method.follower is None:
-            self.imu.without_tracker(method.config)
-            still = Prior(of_rest=self.readout_watch.of_rest)
-            result = (
-                method.localizer.localize(*given, still)
-                if method.experienced is None
-                else method.experienced.localize(*given)
-            )
-        else:
-            time_ns = method.middle_row_ns(cloud.stamp_ns)
-            if method.tracker is not None:
-                method.tracker.trusts_readout_time = self.readout_watch.trusted
-                method.tracker.readout_time_deviation = deviation
-            method.follower.of_rest = self.readout_watch.of_rest
-            result = self.imu.track(
-                method.follower, method.config, time_ns, frame, self.transforms, given
-            )
         watch = self.readout_watch
-        config = watch.add(
-            method.config, method.camera, method.middle_row_ns(cloud.stamp_ns), result, cloud
+        deviation = max(method.config.readout_time_deviation, watch.error)
+        time_ns = method.middle_row_ns(cloud.stamp_ns)
+        method.frames.of_rest = watch.of_rest
+        if method.tracker is not None:
+            method.tracker.trusts_readout_time = watch.trusted
+            method.tracker.readout_time_deviation = deviation
+        result = self.imu.track(
+            method.frames, method.config, time_ns, frame, self.transforms, given
         )
+        config = watch.add(method.config, method.camera, time_ns, result, cloud)
         wrong_axis = watch.wrong_axis
         if config is not method.config:
             self._use(method.calibration, config)
@@ -264,6 +247,6 @@ class FrameLocalizer:
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""
-        for name, text in self._succession.breaks(stamp_ns, frame).items():
+        for name, text in self._resets.breaks(stamp_ns, frame).items():
             self._forget_motion()
             self._notice(name, text)

@@ -16,15 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rs_localizer.config import ImuUse, NodeConfig
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, Lack, Lacking, ReadingBuffer
+from rs_localizer.inertial.buffer import LONGEST_PERIOD_NS, Lack, Lacking, ReadingBuffer, Readings
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.io.imu import ImuReading
-from rs_localizer.io.transforms.rigid import TransformError, Transforms
-from rs_localizer.pipeline.imu_axes import in_camera_axes
+from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.pipeline.reasons import IMU_REASONS
 from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.pipeline.single_frames import SingleFrames
@@ -157,7 +158,7 @@ class ImuInput:
 
     def awaits(self, tracker: Follower, config: NodeConfig, time_ns: int, patience: float) -> bool:
         """Whether readings of this exposure are missing that may come within so many seconds."""
-        if not self._wanted(config):
+        if not self._wanted(config) or tracker.inertial is None:
             return False
         _, end_ns = _exposure(config, time_ns, tracker)
         missing_ns = self._buffer.lag(end_ns + _AROUND_NS)
@@ -183,6 +184,11 @@ class ImuInput:
             given: points, pixels and scores, as :meth:`Tracker.localize` takes them.
         """
         if not self._wanted(config):
+            return tracker.localize(time_ns, *given)
+        if tracker.inertial is None:
+            unknown = config.readout_time == 0.0
+            reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
+            self._count(config, None, Unused(reason))
             return tracker.localize(time_ns, *given)
         found = self._samples(tracker, config, time_ns, camera_frame, transforms)
         if isinstance(found, Unused):
@@ -210,13 +216,6 @@ class ImuInput:
             up, down = self._force_in_map, np.asarray(config.gravity_in_map, float)
             cosine = -(up @ down) / max(float(np.linalg.norm(up) * np.linalg.norm(down)), 1e-12)
             self._gravity = math.acos(min(max(cosine, -1.0), 1.0))
-
-    def without_tracker(self, config: NodeConfig) -> None:
-        """Count a frame that no gyroscope could help."""
-        if self._wanted(config):
-            unknown = config.readout_time == 0.0
-            reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
-            self._count(config, None, Unused(reason))
 
     def _wanted(self, config: NodeConfig) -> bool:
         return config.imu.use != ImuUse.NONE and self.frame != ""
@@ -302,3 +301,51 @@ def _why(status: InertialStatus | None) -> Unused | None:
     angle = math.degrees(status.extrinsic_angle)
     detail = f"by {angle:.0f} degrees" if status.alone == Alone.TURNED else ""
     return Unused(_OF_ALONE[status.alone], detail)
+
+
+def in_camera_axes(
+    readings: Readings,
+    times_ns: IntArray,
+    transforms: Transforms,
+    frames: tuple[str, str],
+    exposure_ns: tuple[int, int],
+    around_ns: int,
+) -> ImuSamples:
+    """The readings as samples: from the axes of the IMU to those of the camera.
+
+    With ``C = camera_from_imu``, a reading's rate ``w`` and force ``f`` are ``C w + u`` and
+    ``C f``; ``u`` is the turn of the camera with respect to the IMU: of a camera on a head that
+    moves, else zero. Lever arms do not matter to a rate; what they do to a force is left out.
+
+    Args:
+        readings: n of them, in the IMU's axes.
+        times_ns: (n,) when they were taken, by the camera's clock.
+        transforms: where the two frames are.
+        frames: of the camera, and of the IMU.
+        exposure_ns: from the first row to the last. A mounting that moves turns evenly from the
+            one to the other,
+        around_ns: and as long before and after: earlier and later readings are left out then.
+
+    Raises:
+        TransformError: when the transform is not known for that time.
+    """
+    camera, imu = frames
+    rates, forces = readings.angular_velocities, readings.specific_forces
+    if camera == imu:
+        return ImuSamples(times_ns, rates, forces)
+    start_ns, end_ns = exposure_ns
+    if end_ns <= start_ns or start_ns <= 0 or not transforms.moves(camera, imu):
+        turn = transforms.lookup(camera, imu, None).rotation.T
+        return ImuSamples(times_ns, rates @ turn, None if forces is None else forces @ turn)
+    first, last = (transforms.lookup(camera, imu, stamp).rotation for stamp in exposure_ns)
+    # C(t) = exp(-u t) C(0)
+    turned = so3.log(np.ascontiguousarray(last @ first.T))
+    own = -turned / ((end_ns - start_ns) * 1e-9)
+    near = (times_ns >= start_ns - around_ns) & (times_ns <= end_ns + around_ns)
+    since = (times_ns[near] - start_ns) / (end_ns - start_ns)
+    mountings = so3.exp_many(since[:, None] * turned) @ first
+    return ImuSamples(
+        times_ns[near],
+        np.einsum("nij,nj->ni", mountings, rates[near]) + own,
+        None if forces is None else np.einsum("nij,nj->ni", mountings, forces[near]),
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from rs_localizer import matching
 from rs_localizer.config import MatchBy, Matching
 from rs_localizer.core.camera import Camera
@@ -9,9 +11,9 @@ from rs_localizer.core.reasons import Notice, Reason
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.io.keypoints import Keypoints
-from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.matching import Matcher, MatchError
-from rs_localizer.pipeline.maps import oddities_of_map
 from rs_localizer.pipeline.refusal import Notify, Refusal
 
 
@@ -75,3 +77,44 @@ class Landmarks:
                 f"landmarks by {matches.by}",
             )
         return matching.correspondences(matches, keypoints, self._matcher.map)
+
+
+def read_landmarks(file: str, frame: str) -> Map:
+    """The map of a file, to match keypoints with.
+
+    Args:
+        file: its path; ``~`` is the user's home.
+        frame: of its points.
+
+    Raises:
+        MapError: for a file that cannot be read or holds no such map.
+    """
+    path = Path(file).expanduser()
+    try:
+        landmarks = read_map_file(path, frame)
+    except MapError as error:
+        raise MapError(f"map_file: {error}") from error
+    except OSError as error:
+        raise MapError(f"map_file: {path} cannot be read: {error.strerror or error}") from error
+    if landmarks.ids is None and landmarks.descriptors is None:
+        raise MapError(
+            f"map_file: {path}: keypoints cannot be matched with a map that has neither ids "
+            "nor descriptors"
+        )
+    return landmarks
+
+
+def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
+    """What is worth telling of a map that takes the place of another, or of none."""
+    found: dict[Notice, str] = {}
+    if landmarks.dropped:
+        found[Notice.MAP_INCOMPLETE] = (
+            f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
+            "descriptor"
+        )
+    if previous is not None:
+        found[Notice.MAP_REPLACED] = (
+            f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
+            f"one of {len(previous)} in frame {previous.frame!r}"
+        )
+    return found

@@ -14,10 +14,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.clock import middle_row_ns
-from rs_localizer.pipeline.experienced import ExperiencedFrames
 from rs_localizer.pipeline.imu import inertial_settings
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.single_frames import SingleFrames
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Tracker
@@ -43,15 +41,13 @@ _STILL = Estimate(
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """Camera, localizer and tracker that belong together."""
+    """Camera, localizer and what leads it from frame to frame, which belong together."""
 
     calibration: Calibration
     config: NodeConfig
     camera: Camera
     localizer: Localizer
-    tracker: Tracker | None  # None: every frame stands alone
-    single: SingleFrames | None = None  # without a tracker, but with an IMU
-    experienced: ExperiencedFrames | None = None  # what would track, but for the readout time
+    frames: Tracker | SingleFrames
 
     @classmethod
     def of(cls, calibration: Calibration, config: NodeConfig) -> Self:
@@ -62,27 +58,22 @@ class Method:
         """
         camera = calibration.camera(config.readout_time, config.scan_direction)
         localizer = Localizer(camera, config)
-        finds_motion = find_solver(config.solver).rolling_shutter
-        rolling = config.readout_time > 0.0 and finds_motion
-        tracks = config.tracking and rolling
-        inertial = inertial_settings(config)
-        if tracks:
-            return cls(calibration, config, camera, localizer, Tracker(localizer, inertial))
-        single = SingleFrames(localizer, inertial) if rolling and inertial is not None else None
-        learns = config.tracking and finds_motion
-        experienced = ExperiencedFrames(localizer) if learns else None
-        return cls(calibration, config, camera, localizer, None, single, experienced)
-
-    def forget(self) -> None:
-        """Forget the previous frames."""
-        for remembers in (self.tracker, self.experienced):
-            if remembers is not None:
-                remembers.reset()
+        estimates_motion = find_solver(config.solver).rolling_shutter
+        timed = config.readout_time > 0.0 and estimates_motion
+        inertial = inertial_settings(config) if timed else None
+        frames: Tracker | SingleFrames
+        if timed and config.tracking:
+            frames = Tracker(localizer, inertial)
+        else:
+            # Without a readout time frames cannot predict each other; map and lens stay the same.
+            remembers = config.tracking and estimates_motion
+            frames = SingleFrames(localizer, inertial, remembers)
+        return cls(calibration, config, camera, localizer, frames)
 
     @property
-    def follower(self) -> Tracker | SingleFrames | None:
-        """What takes the IMU's samples; None: nothing does."""
-        return self.tracker or self.single
+    def tracker(self) -> Tracker | None:
+        """None: no frame predicts the next."""
+        return self.frames if isinstance(self.frames, Tracker) else None
 
     def middle_row_ns(self, stamp_ns: int) -> int:
         """When the middle row of the image with this stamp was exposed."""

@@ -10,12 +10,17 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.rigid import NotYetError, TransformError, Transforms
-from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
-from rs_localizer.pipeline.clock import published_moment
-from rs_localizer.pipeline.moments import backwards, either, pose_at, twist_at, with_timing
+from rs_localizer.io.transforms import NotYetError, TransformError, Transforms
+from rs_localizer.pipeline.body import about_angles, base_pose, base_twist, find_mounting
+from rs_localizer.pipeline.pose_at_time import (
+    backwards,
+    either,
+    pose_at,
+    published_moment,
+    twist_at,
+    with_timing,
+)
 from rs_localizer.pipeline.refusal import Refusal, Waiting
-from rs_localizer.pipeline.roll_pitch_yaw import about_angles
 from rs_localizer.solvers.table import find_solver
 
 

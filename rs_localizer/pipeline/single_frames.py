@@ -1,4 +1,4 @@
-"""Frames that stand alone each, with what a gyroscope knows of the turn within them."""
+"""Frames of which none predicts the next: with a gyroscope, or with memory of map and lens."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from numpy.typing import ArrayLike
 
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.inertial.aiding import Foreseen, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
@@ -16,28 +17,42 @@ from rs_localizer.localizer import Localizer
 
 
 class SingleFrames:
-    """Localizes frames as :class:`rs_localizer.tracking.Tracker` does, but remembers none.
-
-    The gyroscope's bias is what a gyroscope's may be, and the offset of its stamps the given one:
-    only frame by frame either could be found.
+    """Localizes frames as :class:`rs_localizer.tracking.Tracker` does, each from its image alone.
 
     Args:
-        localizer: its camera must have a readout time.
-        inertial: of the gyroscope.
+        localizer: with a gyroscope, its camera must have a readout time.
+        inertial: of the gyroscope; None: there is none. Its bias is what a gyroscope's may be, and
+            the offset of its stamps the given one: only frame by frame either could be found.
+        remembers: whether the frames tell the next ones how far map and lens are off. A slightly
+            wrong map looks like motion within a frame, now and then like much; many frames tell
+            which it is.
     """
 
-    def __init__(self, localizer: Localizer, inertial: InertialSettings) -> None:
+    def __init__(
+        self,
+        localizer: Localizer,
+        inertial: InertialSettings | None = None,
+        remembers: bool = False,
+    ) -> None:
         self._localizer = localizer
         # Logarithm of the odds for a global shutter, beside those of any.
         self.of_rest = 0.0
-        given = replace(inertial, estimate_time_offset=False)
-        self._aid = GyroscopeAid(given, localizer.camera.readout_time)
-        self._aid.warm_up()
+        self.remembers = remembers
+        self._experience: Experience | None = None
+        self._aid: GyroscopeAid | None = None
+        if inertial is not None:
+            fixed = replace(inertial, estimate_time_offset=False)
+            self._aid = GyroscopeAid(fixed, localizer.camera.readout_time)
+            self._aid.warm_up()
 
     @property
-    def inertial(self) -> InertialStatus:
-        """What became of the gyroscope."""
-        return self._aid.status
+    def inertial(self) -> InertialStatus | None:
+        """What became of the gyroscope; None without one."""
+        return None if self._aid is None else self._aid.status
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self._experience = None
 
     def localize(
         self,
@@ -54,6 +69,8 @@ class SingleFrames:
         Args:
             imu: samples around the exposure; None: the camera goes alone.
         """
+        if self._aid is None:
+            return self._without_imu(points, pixels, scores)
 
         def localized(foreseen: Foreseen | None) -> tuple[Estimate | Failure, Prior | None]:
             prior = None if foreseen is None else foreseen.prior
@@ -65,3 +82,15 @@ class SingleFrames:
 
         self._aid.reset()
         return self._aid.localize(imu, time_ns, lambda: None, localized)[0]
+
+    def _without_imu(
+        self, points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None
+    ) -> Estimate | Failure:
+        if not self.remembers:
+            return self._localizer.localize(points, pixels, scores, Prior(of_rest=self.of_rest))
+        before = self._experience
+        prior = None if before is None else before.prior
+        result = self._localizer.localize(points, pixels, scores, prior)
+        if result:
+            self._experience = Experience.of(result) if before is None else before.and_of(result)
+        return result

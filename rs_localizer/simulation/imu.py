@@ -20,7 +20,7 @@ from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.messages import make_header
 from rs_localizer.io.recording import CAMERA_FRAME
-from rs_localizer.io.transforms.rigid import Transform, make_transform
+from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.simulation.true_motion import BODY_FROM_CAMERA, TrueMotion
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, in a map with z up

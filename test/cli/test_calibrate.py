@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer import data
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
-from rs_localizer.io.calibration.files import read_calibration
+from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
 from rs_localizer.simulation.true_motion import RecordedMotion

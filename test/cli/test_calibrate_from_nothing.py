@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
-from rs_localizer.io.calibration.files import read_calibration
+from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
 

@@ -278,3 +278,33 @@ def test_wrong_usage(
     assert detect(files, files.video, *words) == (1 if "--image" in words else 2)
     assert text in capsys.readouterr().err
     assert not files.out.exists()
+
+
+def test_settings_are_passed_on(files: Any, tmp_path: Path) -> None:
+    """The scan direction, and what else calibrate found, not the readout time alone."""
+    file = tmp_path / "shutter.yaml"
+    file.write_text(
+        "/**:\n  ros__parameters:\n    readout_time: 0.011\n    readout_time_deviation: 0.0002\n"
+        "    scan_direction: bottom_to_top\n    imu.time_offset: 0.004\n"
+    )
+    words = [*files.calibration, *files.board, "--rate", "20", "--params", str(file)]
+    assert detect(files, files.video, *words, "-p", "stamp_offset:=0.002") == 0
+    config = build(load_params_file(files.out / "parameters.yaml"))
+    assert (config.readout_time, config.readout_time_deviation) == (0.011, 0.0002)
+    assert (config.scan_direction, config.stamp_offset) == ("bottom_to_top", 0.002)
+    assert config.imu.time_offset == 0.004
+    # An option of its own counts more; an earlier result is replaced if that is wanted.
+    again = [*words, "--scan-direction", "top_to_bottom"]
+    assert detect(files, files.video, *again) == 1
+    assert detect(files, files.video, *again, "--overwrite") == 0
+    config = build(load_params_file(files.out / "parameters.yaml"))
+    assert (config.readout_time, config.scan_direction) == (0.011, "top_to_bottom")
+
+
+def test_only_recordings_are_overwritten(files: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    files.out.mkdir()
+    (files.out / "thesis.tex").write_text("mine")
+    words = [*files.calibration, *files.board, "--rate", "20", "--overwrite"]
+    assert detect(files, files.video, *words) == 1
+    assert "it is no earlier result, and stays as it is" in capsys.readouterr().err
+    assert (files.out / "thesis.tex").read_text() == "mine"

@@ -137,3 +137,20 @@ def test_clocks_that_differ_are_told_and_mended(
     assert "the motions agree when -1000.0000 s are added to its times: --offset auto" in (
         capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("whose", ["body", "map"])
+def test_frames_that_differ_are_named_with_their_turn(
+    files: Path, capsys: pytest.CaptureFixture[str], whose: str
+) -> None:
+    """A camera's optical axes are no body's with x forward: 120 deg about (-1, 1, -1)."""
+    optical = Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
+    other = TURNS * optical if whose == "body" else optical * TURNS
+    write_tum(files / "other.txt", Trajectory(STAMPS, TRUTH.positions, other.as_quat()))
+    assert evaluate(files, estimate="other.txt") == 0
+    said = capsys.readouterr().out
+    assert f"warning: the poses are given in different frames of the {whose}" in said
+    assert "a turn of 120.00 deg about (-0.577, 0.577, -0.577)" in said
+    assert "explains all but 0.000 deg of 120.000 deg" in said
+    assert evaluate(files) == 0
+    assert "different frames" not in capsys.readouterr().out

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from rs_localizer import data
-from rs_localizer.cli import fleet
+from rs_localizer.cli import batch as fleet
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.offline.fleet.task import Outcome, Task, perform

@@ -16,7 +16,7 @@ from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import write_frame
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import TransformTree
 from rs_localizer.offline.replay import find_topics
 from rs_localizer.simulation.imu import ImuSettings, make_imu
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
+import math
 import os
 import signal
 import subprocess
@@ -69,7 +71,8 @@ def test_help_imports_no_command() -> None:
     ("words", "text"),
     [
         ([], "the following arguments are required: COMMAND"),
-        (["fly"], "invalid choice: 'fly'"),
+        (["fly"], "invalid choice: 'fly'; choose from demo, replay"),
+        (["repaly"], "invalid choice: 'repaly'; did you mean replay?"),
         (["--nonsense"], "COMMAND"),
         (["replay"], "the following arguments are required: RECORDING"),
         (["replay", "bag", "--nonsense"], "unrecognized arguments: --nonsense"),
@@ -106,6 +109,70 @@ def test_faults_are_one_line_and_an_exit_code(
     monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
     assert main(["replay"]) == code
     assert capsys.readouterr().err.endswith(text)
+
+
+def test_results_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["readout", "--json", "imx219"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["command"] == "readout"
+    assert all(0.0 < entry["median"] < 0.2 for entry in found["result"])
+
+
+def test_what_a_command_prints_as_json(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results: list[object] = [{"residual (px)": math.nan, "poses": 3}, None]
+
+    def run(arguments: argparse.Namespace) -> object:
+        sys.stdout.write("a line\n")
+        return results.pop(0)
+
+    command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
+    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
+    expected = {"command": "replay", "result": {"residual (px)": None, "poses": 3}}
+    assert main(["replay", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == expected
+    assert main(["replay", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"command": "replay", "text": ["a line"]}
+
+
+def test_quiet_and_verbose(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(arguments: argparse.Namespace) -> None:
+        sys.stdout.write("a line\n")
+        raise ValueError("a fault")
+
+    command = SimpleNamespace(add_arguments=lambda parser: None, run=run)
+    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
+    assert main(["replay", "-q"]) == 1
+    assert capsys.readouterr() == ("", "rs_localizer replay: a fault\n")
+    assert main(["replay", "-v"]) == 1
+    said = capsys.readouterr()
+    assert said.out == "a line\n"
+    assert "Traceback" in said.err
+    assert said.err.endswith("rs_localizer replay: a fault\n")
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("rs_localizer rep", {"replay"}),
+        ("rs_localizer evaluate --pl", {"--plot"}),
+        ("rs_localizer simulate out --scan-direction l", {"left_to_right"}),
+    ],
+)
+def test_shells_complete(tmp_path: Path, line: str, expected: set[str]) -> None:
+    pytest.importorskip("argcomplete")
+    asked = {
+        "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": " ", "COMP_LINE": line,
+        "COMP_POINT": str(len(line)), "_ARGCOMPLETE_SUPPRESS_SPACE": "1", "COMP_TYPE": "9",
+        "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "answer"),
+    }  # fmt: skip
+    subprocess.run(
+        [sys.executable, "-m", "rs_localizer"], env={**os.environ, **asked}, timeout=120, check=True
+    )
+    assert {word.strip() for word in (tmp_path / "answer").read_text().split()} == expected
 
 
 def test_names_cannot_steer_the_terminal(

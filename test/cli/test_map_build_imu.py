@@ -89,7 +89,8 @@ def test_a_video_may_have_a_file_beside_it(tmp_path: Path) -> None:
 
 def test_the_offset_of_stamps_is_a_parameter(tmp_path: Path) -> None:
     path = tmp_path / "parameters.yaml"
-    write_parameters(path, 0.03, "bottom_to_top", 0.005)
+    shutter = {"readout_time": 0.03, "scan_direction": "bottom_to_top", "imu.time_offset": 0.005}
+    write_parameters(path, shutter)
     config = build(load_params_file(path))
     assert config.imu.time_offset == 0.005
     assert config.readout_time == 0.03

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration.files import write_calibration
+from rs_localizer.io.calibration import write_calibration
 from rs_localizer.markers.map_files import read_marker_map
 
 WIDTH, HEIGHT, FOCAL, SIZE, CELL = 320, 240, 260.0, 0.12, 12

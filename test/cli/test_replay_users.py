@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +12,11 @@ import pytest
 
 import rs_localizer.cli.replay as replay_command
 from rs_localizer.cli.main import main
+from rs_localizer.cli.replay_result import Tally, figures, print_summary
 from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.outputs import Localized
 from rs_localizer.io.recording import write_image
+from rs_localizer.trajectory.measured_readout import MeasuredReadout
 
 FRAMES = 8
 SHUTTER = ["-p", "readout_time:=0.03"]
@@ -97,11 +103,70 @@ def test_an_interrupted_replay_leaves_nothing_in_the_way(
 
     monkeypatch.setattr(replay_command, "replay", interrupted)
     assert main(words) == 130
-    assert not out.exists()
+    assert list(tmp_path.glob("out/*")) == []
     monkeypatch.setattr(replay_command, "replay", real)
     assert main(words) == 0
-    # Of an earlier result, too: half of a new one is worse than none.
+    # An earlier result stays until a new one is whole.
     (out / "notes.txt").write_text("mine")
+    files = sorted(out.rglob("*"))
     monkeypatch.setattr(replay_command, "replay", interrupted)
     assert main([*words, "--overwrite"]) == 130
-    assert [file.name for file in out.iterdir()] == ["notes.txt"]
+    assert sorted(out.rglob("*")) == files
+
+
+def test_frames_are_written_as_they_come_and_let_go(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An hour of them would take gigabytes."""
+    real = replay_command.replay
+    alive, most = weakref.WeakSet[Localized](), 0
+
+    class Watched(Localized):
+        """That a weak reference can be to."""
+
+    def many(*arguments: Any) -> Any:
+        nonlocal most
+        recorded_ns, first = next(iter(real(*arguments)))
+        values = {item.name: getattr(first, item.name) for item in dataclasses.fields(first)}
+        for k in range(300):
+            frame = Watched(**values | {"stamp_ns": first.stamp_ns + k})
+            alive.add(frame)
+            most = max(most, len(alive))
+            yield recorded_ns, frame
+
+    monkeypatch.setattr(replay_command, "replay", many)
+    assert main(["replay", str(flight), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
+    poses = (tmp_path / "out" / "poses.txt").read_text().splitlines()
+    assert len([line for line in poses if not line.startswith("#")]) == 300
+    assert most < 10
+
+
+def test_notices_are_said_in_full_and_stand_in_the_summary(
+    flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    real = replay_command.replay
+    tallies: list[Tally] = []
+
+    def odd(bag: Any, topics: Any, localizer: Any) -> Any:
+        for k, item in enumerate(real(bag, topics, localizer)):
+            localizer._notice("readout_time", f"estimated readout time {k} ms differs")
+            yield item
+        localizer.readout_watch.measured = MeasuredReadout(0.0211, 0.0002, 50, 50.0)
+
+    monkeypatch.setattr(replay_command, "replay", odd)
+    monkeypatch.setattr(replay_command, "print_summary", both(tallies, print_summary))
+    assert main(["replay", str(flight), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
+    said = capsys.readouterr().out
+    assert re.search(rf"noticed: readout_time +{FRAMES}\n", said)
+    assert f"readout_time: estimated readout time {FRAMES - 1} ms differs" in said
+    columns = figures(tallies[0])
+    assert columns["noticed"] == f"readout_time {FRAMES}"
+    assert columns["readout time seen (ms)"] == pytest.approx(21.1)
+    assert columns["its deviation (ms)"] == pytest.approx(0.2)
+
+
+def both(kept: list[Tally], function: Any) -> Any:
+    return lambda tally, *rest: (kept.append(tally), function(tally, *rest))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.cli import replay_view
+from rs_localizer.cli import replay
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.estimates import read_motions
@@ -129,7 +129,7 @@ def test_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
 def test_without_the_sdk_one_sentence_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(replay_view.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(replay.importlib.util, "find_spec", lambda name: None)
     assert main(["replay", str(flight), "--view"]) == 1
     assert capsys.readouterr().err == (
         "rs_localizer replay: --rerun and --view need the Rerun SDK, which is not installed: "

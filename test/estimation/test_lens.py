@@ -25,7 +25,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.lens import joined, odds_of
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.moments import pose_at
+from rs_localizer.pipeline.pose_at_time import pose_at
 from rs_localizer.tracking import Tracker
 
 

@@ -11,7 +11,7 @@ from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import Alone
 from rs_localizer.inertial.turning import GyroscopeErrors, turn_between, turn_within
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.moments import pose_at, twist_at
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
 from rs_localizer.tracking import Tracker
 
 from .conftest import MIDDLE_NS, READOUT_TIME, Shaken

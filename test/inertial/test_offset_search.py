@@ -15,7 +15,7 @@ from benchmarks.inertial.recordings import record
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.sight import sight_of
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.moments import twist_at
+from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
 
 

@@ -17,9 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rs_localizer.io import bags
 from rs_localizer.io.bags import BagError, BagWriter, make_message, open_bag
-from rs_localizer.io.calibration.files import CalibrationError, read_calibration
+from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.hloc import HlocError, open_h5, read_queries
-from rs_localizer.io.maps.colmap_images import read_images
+from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.trajectories import TrajectoryError, read_tum

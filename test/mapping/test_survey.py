@@ -9,7 +9,7 @@ import pytest
 from scenes import READOUT, camera, ring, spot
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.io.transforms.rigid import Transform
+from rs_localizer.io.transforms import Transform
 from rs_localizer.mapping.chaining import Chained, chain
 from rs_localizer.mapping.spotting import Spotted, every_marker
 from rs_localizer.mapping.survey import Survey, survey

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rs_localizer.offline.imu_first import Item, imu_first
+from rs_localizer.offline.replay import Item, imu_first
 
 MS = 1_000_000
 

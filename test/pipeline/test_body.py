@@ -26,8 +26,7 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, Pose, Twist, messages
-from rs_localizer.io.transforms.rigid import Transform, TransformError, read_transform
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import Transform, TransformError, TransformTree, read_transform
 from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer

@@ -24,8 +24,8 @@ from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.tree import TransformTree
-from rs_localizer.offline.imu_first import imu_first
+from rs_localizer.io.transforms import TransformTree
+from rs_localizer.offline.replay import imu_first
 from rs_localizer.pipeline.frames import FrameLocalizer, Refusal
 from rs_localizer.pipeline.imu import ImuState
 

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rs_localizer.inertial.buffer import Readings
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.transforms.rigid import Transform, TransformError, make_transform
-from rs_localizer.io.transforms.tree import TransformTree
-from rs_localizer.pipeline.imu_axes import in_camera_axes
+from rs_localizer.io.transforms import Transform, TransformError, TransformTree, make_transform
+from rs_localizer.pipeline.imu import in_camera_axes
 
 NOW = 10**18
 MS = 1_000_000

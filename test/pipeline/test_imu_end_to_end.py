@@ -19,8 +19,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms.rigid import Transform, make_transform
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import Transform, TransformTree, make_transform
 from rs_localizer.pipeline.frames import FrameLocalizer
 
 Array = NDArray[np.float64]

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import TransformTree
+from rs_localizer.pipeline.body import about_angles
 from rs_localizer.pipeline.published import of_body
-from rs_localizer.pipeline.roll_pitch_yaw import about_angles
 
 
 def pose(roll: float, pitch: float, yaw: float, root: Any) -> Pose:

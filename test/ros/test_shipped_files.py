@@ -322,7 +322,8 @@ def test_two_cameras_pass_on_what_one_camera_takes(describe: Describe) -> None:
 def test_the_parameters_of_a_recording_hold_in_every_namespace(
     tmp_path: Path, namespace: str
 ) -> None:
-    write_parameters(tmp_path / "parameters.yaml", 0.021, "bottom_to_top")
+    shutter = {"readout_time": 0.021, "scan_direction": "bottom_to_top"}
+    write_parameters(tmp_path / "parameters.yaml", shutter)
     context = Context()
     rclpy.init(args=["--ros-args", "--params-file", str(tmp_path / PARAMETERS)], context=context)
     made = rclpy.create_node(NODE_NAME, namespace=namespace, context=context)

@@ -9,7 +9,7 @@ import pytest
 
 import rs_localizer
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
-from rs_localizer.ros.usage import answer
+from rs_localizer.ros.main import answer
 from rs_localizer.settings import settings
 
 

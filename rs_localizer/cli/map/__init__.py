@@ -25,8 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         _module(name).add_arguments(action)
 
 
-def run(args: argparse.Namespace) -> None:
-    _module(args.action).run(args)
+def run(args: argparse.Namespace) -> object:
+    return _module(args.action).run(args)
 
 
 def _module(action: str) -> ModuleType:

@@ -13,8 +13,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
-from rs_localizer.cli.image_source import add_source_arguments
+from rs_localizer.cli import UsageError, add_overwrite, replaced
+from rs_localizer.cli.image_input import add_source_arguments
 from rs_localizer.cli.map.build_images import Looked, Shutter, look_at_images, shutter_of
 from rs_localizer.cli.map.build_imu import add_imu_arguments, imu_of
 from rs_localizer.config import FeatureConfig
@@ -71,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_imu_arguments(scale)
     add_source_arguments(parser)
+    add_overwrite(parser)
     work = parser.add_argument_group("the work")
     work.add_argument(
         "--images-per-second",
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else _marker_map(args.markers)
     shutter, imu = shutter_of(args), imu_of(args)
-    with atomic_directory(args.out) as out:
+    with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
         looker = Looker(args.max_keypoints, markers)
         looked = look_at_images(args, looker, shutter.scan_direction)
@@ -159,10 +160,13 @@ def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
 
 def _write(out: Path, built: Built, looked: Looked) -> None:
     write_npz(out / MAP, built.landmarks)
-    write_parameters(
-        out / PARAMETERS, built.camera.readout_time, str(built.camera.scan_direction),
-        built.place.time_offset,
-    )  # fmt: skip
+    shutter = {
+        "readout_time": built.camera.readout_time,
+        "scan_direction": str(built.camera.scan_direction),
+        "imu.time_offset": built.place.time_offset,
+    }
+    known = {name: value for name, value in shutter.items() if value is not None}
+    write_parameters(out / PARAMETERS, known)
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     save_pictures(built, looked.views, out)

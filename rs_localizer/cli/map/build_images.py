@@ -9,19 +9,15 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.image_source import tell_left_out, time_faults
-from rs_localizer.cli.shots import opened
+from rs_localizer.cli.image_input import opened, shutter_values, tell_left_out, time_faults
 from rs_localizer.core.camera import Camera
-from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.io.bags import is_bag
 from rs_localizer.io.images import Image
-from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.mapping.anchors import PointSight
 from rs_localizer.mapping.views import Looker, View
 from rs_localizer.offline.detect import Cameras
 from rs_localizer.offline.image_sources import Carried
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.settings import build, load_params_file
+from rs_localizer.settings import build
 
 # Images a hair before their time are in time.
 _EARLY = 0.9
@@ -47,14 +43,8 @@ class Shutter:
 
 def shutter_of(args: argparse.Namespace) -> Shutter:
     """As given, or as it stands beside the images of a recording."""
-    direction = args.scan_direction or ScanDirection.TOP_TO_BOTTOM.value
-    if args.readout_time is not None:
-        return Shutter(args.readout_time, direction)
-    beside = args.images / PARAMETERS
-    if is_bag(args.images) and beside.exists():
-        known = build(load_params_file(beside))
-        return Shutter(known.readout_time or None, args.scan_direction or known.scan_direction)
-    return Shutter(None, direction)
+    known = build(shutter_values(args))
+    return Shutter(known.readout_time or None, known.scan_direction)
 
 
 def look_at_images(args: argparse.Namespace, looker: Looker, scan_direction: str) -> Looked:

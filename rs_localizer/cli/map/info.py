@@ -18,17 +18,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     either.add_input(parser)
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> dict[str, str]:
     found, kind = either.read(args)
-    describe(args.file, found, kind)
+    return describe(args.file, found, kind)
 
 
-def describe(file: Path, found: Map | MarkerMap, kind: str) -> None:
-    """Print the table of a map."""
+def describe(file: Path, found: Map | MarkerMap, kind: str) -> dict[str, str]:
+    """Print the table of a map, and return it."""
     rows = _of_markers(found, kind) if isinstance(found, MarkerMap) else _of_landmarks(found)
+    rows += _extents(found.points)
     print(file)
-    for name, text in [*rows, *_extents(found.points)]:
+    for name, text in rows:
         print(f"  {name:40} {text}")
+    return dict(rows)
 
 
 def _of_landmarks(landmarks: Map) -> list[tuple[str, str]]:

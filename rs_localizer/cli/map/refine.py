@@ -10,14 +10,13 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.given import add_settings, given_settings
 from rs_localizer.cli.map import contradiction
-from rs_localizer.cli.topics import add_topics, given_topics
+from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import open_bag
-from rs_localizer.io.calibration.files import read_calibration, write_calibration
+from rs_localizer.io.calibration import read_calibration, write_calibration
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.topics import IMU

@@ -10,9 +10,9 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
-from rs_localizer.cli.given import add_settings, given_settings
+from rs_localizer.cli.image_input import opened, tell_times
 from rs_localizer.cli.map import contradiction
-from rs_localizer.cli.shots import opened, tell_times
+from rs_localizer.cli.settings_args import add_settings, given_settings
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera

@@ -1,21 +1,189 @@
-"""Maps from COLMAP: a sparse model's ``points3D``, and descriptors from its database.
+"""Sparse models of COLMAP: points with who sees them, images, and descriptors from its database.
 
 A landmark's descriptor is the medoid of those of the images that see it: the one nearest to the
-others.
+others. pycolmap, which reads whole models, is no help here: it takes a count in a damaged file at
+its word and allocates for it, and there is none for ARM, on which robots run.
 """
 
 from __future__ import annotations
 
 import sqlite3
+import struct
 import time
 from contextlib import closing
+from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rs_localizer.io.maps.colmap_model import Model, read_model
+from rs_localizer.core.arrays import Array
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
+
+# Id, x, y, z, color, error, length of the track; then image and feature of each observation.
+_POINT = struct.Struct("<Q3d3BdQ")
+_OBSERVATION = np.dtype([("image", "<u4"), ("feature", "<u4")])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """The points of a model and who sees them."""
+
+    ids: NDArray[np.int64]  # (n,)
+    points: Array  # (n,3)
+    tracks: NDArray[np.void]  # (m,) observations, point by point
+    starts: NDArray[np.int64]  # (n+1,) of each track
+
+
+def read_model(folder: Path) -> Model:
+    """Read the points of a model, in its binary or its text form.
+
+    Raises:
+        MapError: for anything that is no model, OSError as any file.
+    """
+    binary, text = folder / "points3D.bin", folder / "points3D.txt"
+    if binary.exists():
+        return _read_binary(binary.read_bytes())
+    if text.exists():
+        return _read_text(text)
+    raise MapError(f"the folder has neither {binary.name} nor {text.name}")
+
+
+def _read_binary(data: bytes) -> Model:
+    if len(data) < 8:
+        raise MapError("points3D.bin is truncated")
+    (count,) = struct.unpack_from("<Q", data)
+    if 8 + count * _POINT.size > len(data):
+        raise MapError(f"points3D.bin is truncated: {count} points, found {len(data)} bytes")
+    ids = np.empty(count, np.uint64)
+    points = np.empty((count, 3))
+    starts = np.zeros(count + 1, np.int64)
+    tracks: list[bytes] = []
+    position = 8
+    for row in range(count):
+        end = position + _POINT.size
+        if end <= len(data):
+            ids[row], *xyz, _, _, _, _, length = _POINT.unpack_from(data, position)
+            position, end = end, end + length * _OBSERVATION.itemsize
+        if end > len(data):
+            raise MapError(f"points3D.bin is truncated at point {row + 1} of {count}")
+        points[row] = xyz
+        starts[row + 1] = starts[row] + length
+        tracks.append(data[position:end])
+        position = end
+    if count and int(ids.max()) >= 2**63:
+        raise MapError(f"points3D.bin has a point with the id {ids.max()}")
+    return Model(
+        ids.astype(np.int64), points, np.frombuffer(b"".join(tracks), _OBSERVATION), starts
+    )
+
+
+def _read_text(path: Path) -> Model:
+    ids: list[int] = []
+    points: list[tuple[float, float, float]] = []
+    tracks: list[NDArray[np.uint32]] = []
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            words = line.split()
+            if not words or words[0].startswith(b"#"):
+                continue
+            try:
+                if len(words) < 8 or len(words) % 2:
+                    raise ValueError
+                ids.append(int(words[0]))
+                points.append((float(words[1]), float(words[2]), float(words[3])))
+                track = np.array([int(word) for word in words[8:]], np.int64)
+                if not 0 <= ids[-1] < 2**63 or np.any((track < 0) | (track >= 2**32)):
+                    raise ValueError
+            except (ValueError, OverflowError):
+                found = line[:80].decode("ascii", "replace").strip()
+                raise MapError(
+                    f"points3D.txt, line {number}: expected ID X Y Z R G B ERROR and pairs of "
+                    f"image and feature, found {found!r}"
+                ) from None
+            tracks.append(track.astype(np.uint32))
+    starts = np.cumsum([0, *(len(track) // 2 for track in tracks)], dtype=np.int64)
+    flat = np.concatenate([*tracks, np.zeros(0, np.uint32)])
+    return Model(
+        np.array(ids, np.int64),
+        np.array(points, np.float64).reshape(-1, 3),
+        np.ascontiguousarray(flat, "<u4").view(_OBSERVATION),
+        starts,
+    )
+
+
+# Number, quaternion, translation, number of the camera; then the name, ended by a zero.
+_IMAGE = struct.Struct("<I7dI")
+_COUNT = struct.Struct("<Q")
+_FEATURE_BYTES = 24  # x, y and the number of the point
+_FEATURE_WORDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class ModelImage:
+    """An image of a model."""
+
+    number: int
+    features: int  # 0: the model does not list them
+
+
+def read_images(folder: Path) -> dict[str, ModelImage]:
+    """A model's images by their names.
+
+    Raises:
+        MapError: for anything that is not a model, OSError as any file.
+    """
+    binary, text = folder / "images.bin", folder / "images.txt"
+    if binary.exists():
+        found = _read_binary_images(binary.read_bytes())
+    elif text.exists():
+        found = _read_text_images(text)
+    else:
+        raise MapError(f"{folder} has neither {binary.name} nor {text.name}")
+    if not found:
+        raise MapError(f"the model in {folder} has no images")
+    return found
+
+
+def _read_binary_images(data: bytes) -> dict[str, ModelImage]:
+    found: dict[str, ModelImage] = {}
+    try:
+        (count,) = _COUNT.unpack_from(data)
+        position = _COUNT.size
+        for _ in range(count):
+            number = _IMAGE.unpack_from(data, position)[0]
+            start = position + _IMAGE.size
+            end = data.index(0, start)
+            (features,) = _COUNT.unpack_from(data, end + 1)
+            found[data[start:end].decode("utf-8")] = ModelImage(number, features)
+            position = end + 1 + _COUNT.size + features * _FEATURE_BYTES
+    except (struct.error, ValueError, OverflowError):  # ValueError also where a name is no text
+        position = len(data) + 1
+    if position > len(data):
+        raise MapError("images.bin is truncated or damaged")
+    return found
+
+
+def _read_text_images(path: Path) -> dict[str, ModelImage]:
+    found: dict[str, ModelImage] = {}
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line[:1] != "#"]
+    # Every second line lists the features of an image, and may be empty.
+    for line, features in zip_longest(lines[::2], lines[1::2], fillvalue=""):
+        words = line.split(maxsplit=9)
+        if not words:
+            continue
+        try:
+            if len(words) != 10:
+                raise ValueError
+            count = len(features.split()) // _FEATURE_WORDS
+            found[words[9]] = ModelImage(int(words[0]), count)
+        except ValueError:
+            raise MapError(
+                f"images.txt: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, found {line[:80]!r}"
+            ) from None
+    return found
+
 
 DATABASE = "database.db"
 # Of a track, evenly: some are seen a thousand times.

@@ -194,7 +194,7 @@ def _local(workers: int) -> Iterator[Any]:
         "distributed.scheduler.allowed-failures": _DEATHS - 1,
         # A worker that dies takes no task along but the one that it is at.
         "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.worker.preload": ["rs_localizer.offline.fleet.worker"],
+        "distributed.worker.preload": ["rs_localizer.offline.fleet.cluster"],
         # Nobody looks at what Dask samples of the work every 10 ms.
         "distributed.worker.profile.enabled": False,
     }
@@ -224,3 +224,8 @@ def _kill(cluster: Any) -> None:
     for nanny in cluster.workers.values():
         with contextlib.suppress(AttributeError, ProcessLookupError, TypeError):
             os.kill(nanny.process.pid, signal.SIGKILL)
+
+
+def dask_setup(worker: Any) -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

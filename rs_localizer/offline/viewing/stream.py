@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,17 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.bags import BagReader
+from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.images import Gray, read_any_image
+from rs_localizer.io.keypoints import read_keypoints
+from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.topics import COMPRESSED_IMAGE, CORRESPONDENCES
+from rs_localizer.offline.image_sources import image_topics
 from rs_localizer.offline.replay import Topics
 from rs_localizer.offline.viewing import paths
-from rs_localizer.offline.viewing.blueprint import blueprint
-from rs_localizer.offline.viewing.recorded import Cloud, Picture, shown
-from rs_localizer.offline.viewing.series import series
 from rs_localizer.offline.viewing.shapes import (
+    Eye,
     ellipsoid,
     enlargement,
     eye,
@@ -30,6 +34,133 @@ from rs_localizer.offline.viewing.shapes import (
     reproject,
 )
 from rs_localizer.pipeline.frames import FrameLocalizer
+
+_MEDIA = {b"\xff\xd8": "image/jpeg", b"\x89P": "image/png"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """An image: compressed as it came where viewers can read that, else gray."""
+
+    stamp_ns: int
+    data: bytes | Gray
+    media_type: str = ""  # of the bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Where an image was matched, or has keypoints."""
+
+    stamp_ns: int
+    pixels: Array  # (n,2) raw
+    points: Array  # (n,3) m, map; of keypoints (0,3)
+
+
+def shown(bag: BagReader, topics: Topics) -> Iterator[Picture | Cloud]:
+    """All that can be read of these."""
+    matched = CORRESPONDENCES in topics.of
+    pictures = _picture_topic(bag)
+    wanted = [topics.frames, *([] if pictures is None else [pictures])]
+    for topic, _, message in bag.messages(wanted):
+        try:
+            item = _picture(message) if topic == pictures else _cloud(message, matched)
+        except MessageError:  # replay has refused it, too
+            continue
+        yield item
+
+
+def _picture_topic(bag: BagReader) -> str | None:
+    """The only one, or that of the name that ``detect --images`` gives; else none can be meant."""
+    found = image_topics(bag)
+    named = [topic for topic in found if topic.strip("/") == COMPRESSED_IMAGE]
+    chosen = found if len(found) == 1 else named
+    return chosen[0] if len(chosen) == 1 else None
+
+
+def _picture(message: Any) -> Picture:
+    stamp = stamp_ns(message)
+    if hasattr(message, "format"):
+        data = bytes(message.data)
+        media_type = _MEDIA.get(data[:2], "")
+        if media_type:
+            return Picture(stamp, data, media_type)
+    return Picture(stamp, read_any_image(message).pixels)
+
+
+def _cloud(message: Any, matched: bool) -> Cloud:
+    if matched:
+        found = read_correspondences(message)
+        return Cloud(found.stamp_ns, found.pixels, found.points)
+    keypoints = read_keypoints(message)
+    return Cloud(keypoints.stamp_ns, keypoints.pixels, np.zeros((0, 3)))
+
+
+Series = dict[str, tuple[list[str], Array]]
+_COMPONENTS = ["x", "y", "z"]
+_UNKNOWN = np.full(3, np.nan)
+
+
+def series(frames: Sequence[Localized]) -> Series:
+    """By path: the names of k curves, and their values (n,k), NaN where there is none."""
+    found = [frame.estimate for frame in frames]
+    spread = [np.sqrt(np.diag(frame.pose.covariance)) for frame in frames]
+    twists = [frame.twist for frame in frames]
+    return {
+        paths.ANGULAR: (_COMPONENTS, _rows([t.angular if t else _UNKNOWN for t in twists])),
+        paths.LINEAR: (_COMPONENTS, _rows([t.linear if t else _UNKNOWN for t in twists])),
+        paths.RESIDUAL: (
+            ["residual of the inliers", "model error"],
+            _rows([[_rms(frame), frame.estimate.model_error] for frame in frames]),
+        ),
+        paths.COUNTS: (
+            ["points", "inliers, rolling shutter", "inliers, global shutter"],
+            _rows([[len(e.inliers), e.inliers.sum(), e.global_shutter_inliers] for e in found]),
+        ),
+        paths.DEVIATION: (
+            ["position", "orientation"],
+            1e3 * _rows([[np.linalg.norm(s[:3]), np.linalg.norm(s[3:])] for s in spread]),
+        ),
+    }
+
+
+def _rms(frame: Localized) -> float:
+    """NaN for a sample of a smoothed motion between images."""
+    return frame.estimate.residual_rms if np.any(frame.estimate.inliers) else np.nan
+
+
+def _rows(values: Sequence[Any]) -> Array:
+    return np.array(values, dtype=np.float64)
+
+
+def blueprint(with_images: bool, eye: Eye) -> Any:
+    """Scene and image on the left, what changes with time on the right, one time line below.
+
+    Args:
+        with_images: whether there are any.
+        eye: from where the scene is seen.
+    """
+    import rerun.blueprint as rrb
+
+    scene = rrb.Spatial3DView(
+        origin=paths.MAP,
+        name="map: path, covariance (95 %), landmarks, inliers",
+        eye_controls=rrb.EyeControls3D(
+            position=eye.position, look_target=eye.target, eye_up=eye.up
+        ),
+    )
+    image = rrb.Spatial2DView(
+        origin=paths.IMAGE,
+        name=f"{'image' if with_images else 'pixels'}: inliers by row (blue first), residuals "
+        "enlarged, the others red",
+    )
+    plots = [rrb.TimeSeriesView(origin=path, name=name) for path, name in paths.PLOTS.items()]
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(scene, image), rrb.Vertical(*plots), column_shares=[3, 2]),
+        rrb.TimePanel(timeline=paths.TIMELINE, state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
 
 _APPLICATION = "rs_localizer"
 _TIMEOUT = 60.0  # s, for a viewer to take everything

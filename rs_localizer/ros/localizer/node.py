@@ -6,25 +6,77 @@ import contextlib
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from std_srvs.srv import Trigger
 
 from rs_localizer.config import NodeConfig, Px4Odometry
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import MapError
-from rs_localizer.io.outputs import Localized
+from rs_localizer.io.outputs import TYPES, Localized, each_message
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.localizer import px4, transforms
-from rs_localizer.ros.localizer.answers import Answer, tell
-from rs_localizer.ros.localizer.broadcaster import Broadcaster
 from rs_localizer.ros.localizer.feed import Feed, described, warm_up
-from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest
-from rs_localizer.ros.localizer.imu_health import imu_oddity
-from rs_localizer.ros.localizer.outputs import Outputs
+from rs_localizer.ros.localizer.health import (
+    Answer,
+    Condition,
+    diagnose,
+    imu_oddity,
+    of_interest,
+    tell,
+)
+from rs_localizer.ros.localizer.transforms import Broadcaster
+from rs_localizer.ros.node.conversion import make_message, message_class
 from rs_localizer.ros.node.health import Health
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW
 from rs_localizer.settings import NODE_NAME
+
+_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
+
+
+class Outputs:
+    """Publishes frames on the topics of :data:`rs_localizer.io.outputs.TYPES`.
+
+    Args:
+        node: creates the publishers, which publish while it is active.
+        afterwards: called with each frame after its messages (to broadcast transforms).
+    """
+
+    def __init__(
+        self, node: LifecycleNode, afterwards: Callable[[Localized], None] | None = None
+    ) -> None:
+        self._node = node
+        self._afterwards = afterwards
+        self._publishers = {
+            name: node.create_lifecycle_publisher(
+                message_class(type_name),
+                f"~/{name}",
+                QoSProfile(**_QOS),  # a new one each: overrides are written into it
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+            for name, type_name in TYPES.items()
+        }
+
+    def publish(self, frame: Localized) -> None:
+        """Publish what somebody listens to; nothing else is built."""
+        wanted = [
+            name
+            for name, publisher in self._publishers.items()
+            if publisher.get_subscription_count()
+        ]
+        for name, message in each_message(frame, make_message, wanted):
+            self._publishers[name].publish(message)
+        if self._afterwards is not None:
+            self._afterwards(frame)
+
+    def close(self) -> None:
+        for publisher in self._publishers.values():
+            self._node.destroy_lifecycle_publisher(publisher)
+        self._publishers = {}
+
 
 # Notices that the diagnostics repeat: frames are localized, and probably not as they should be.
 _ODD = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,8 +26,37 @@ from rclpy.subscription import Subscription
 from rs_localizer.core.reasons import Notice
 from rs_localizer.ros.node.conversion import type_name
 from rs_localizer.ros.node.intake import Intake, NotByExecutor
-from rs_localizer.ros.node.quality import Policies, best, offered, policies
 from rs_localizer.ros.node.refusals import Refusals
+
+Policies = tuple[ReliabilityPolicy, DurabilityPolicy]
+
+
+def policies(profile: QoSProfile) -> Policies:
+    return profile.reliability, profile.durability
+
+
+def offered(node: Node, topic: str) -> list[Policies]:
+    """By the publishers of a topic (full name)."""
+    return [policies(info.qos_profile) for info in node.get_publishers_info_by_topic(topic)]
+
+
+def best(wished: Policies, offers: Sequence[Policies]) -> Policies:
+    """What is wished, and where that is ``BEST_AVAILABLE``, the most that all of them offer.
+
+    A subscription that asks for more than a publisher offers hears nothing; one that asks for less
+    loses what is large (of reliable clouds of 2 MB a best-effort subscription of Fast DDS heard 3
+    of 60) and misses what was latched. The middleware's own ``BEST_AVAILABLE`` looks at publishers
+    only when a subscription is made.
+    """
+    reliability, durability = wished
+    if reliability == ReliabilityPolicy.BEST_AVAILABLE:
+        unanimous = offers and all(offer[0] == ReliabilityPolicy.RELIABLE for offer in offers)
+        reliability = ReliabilityPolicy.RELIABLE if unanimous else ReliabilityPolicy.BEST_EFFORT
+    if durability == DurabilityPolicy.BEST_AVAILABLE:
+        unanimous = offers and all(offer[1] == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if unanimous else DurabilityPolicy.VOLATILE
+    return reliability, durability
+
 
 # As qos_profile_sensor_data, but reliable where the publishers are, and with more room: what comes
 # while this process does not get the CPU shall be counted by the mailbox, which keeps the newest,

@@ -14,8 +14,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from rs_localizer.ros.node import parameters
-from rs_localizer.ros.node.diagnostics import Diagnostics
-from rs_localizer.ros.node.health import Health
+from rs_localizer.ros.node.health import Diagnostics, Health
 from rs_localizer.ros.node.inputs import Inputs, Silence, Topic
 from rs_localizer.ros.node.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.node.refusals import Refusals, describe

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.io.calibration.files import CalibrationError, read_calibration
+from rs_localizer.io.calibration import CalibrationError, read_calibration
 
 ROS = """
 image_width: 640
@@ -165,6 +165,8 @@ def test_both_kinds(tmp_path: Path, text: str, model: str, D: list[float]) -> No
         (BOOFCV.replace("skew: 0.0", "skew: 0.5"), r"skew must be 0, found 0.5"),
         (BOOFCV.replace("-0.16", "1, 2, 3"), r"at most 3 radial coefficients .* found 4"),
         (BOOFCV.replace("fx: 500.0", "fx: 0"), r"not calibrated"),
+        (ROS[: ROS.index("distortion_model")], r"no distortion coefficients: is it cut off"),
+        (BOOFCV[: BOOFCV.index("model:")], r"no radial_tangential: is it cut off"),
         (KALIBR.replace("pinhole", "ds"), r"camera_model must be pinhole, found 'ds'"),
         (KALIBR.replace("equidistant", "fov"), r"distortion_model must be one of radtan"),
         (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from rs_localizer.io.transforms.rigid import TransformError, from_numbers
-from rs_localizer.io.transforms.tree import TransformTree
+from rs_localizer.io.transforms import TransformError, TransformTree, from_numbers
 
 Numbers = tuple[float, ...]
 HALF_TURN = (0.0, 0.0, 1.0, 0.0)

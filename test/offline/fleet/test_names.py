@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer.offline.fleet.names import folder_names
+from rs_localizer.offline.fleet.identity import folder_names
 
 
 @pytest.mark.parametrize(

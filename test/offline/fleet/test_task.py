@@ -13,7 +13,7 @@ from pathlib import Path
 import killing
 import pytest
 
-from rs_localizer.offline.fleet import first
+from rs_localizer.offline.fleet import task as first
 from rs_localizer.offline.fleet.identity import MARKER, identity, program
 from rs_localizer.offline.fleet.task import LOG, PARTIAL, Figures, Kind, Task, finished, perform
 
@@ -139,7 +139,7 @@ def test_the_first_one_compiles_alone(tmp_path: Path, cache: Path) -> None:
     code = (
         "import os, sys, time\n"
         "from pathlib import Path\n"
-        "from rs_localizer.offline.fleet import first\n"
+        "from rs_localizer.offline.fleet import task as first\n"
         "first.cache_directory = lambda: Path(sys.argv[1])\n"
         "def say(text):\n"
         "    with open(sys.argv[2], 'a') as log: log.write(text)\n"

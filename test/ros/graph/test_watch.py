@@ -18,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.ros.graph.watched import Status, Values, Watched, euler, line, table
+from rs_localizer.ros.graph.watch import Status, Values, Watched, euler, line, table
 
 WATCH = [sys.executable, "-m", "rs_localizer", "watch"]
 

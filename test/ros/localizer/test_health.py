@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.localizer.answers import tell
-from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest
+from rs_localizer.ros.localizer.health import Condition, diagnose, of_interest, tell
 from rs_localizer.ros.node.health import Level
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.refusals import Refusals

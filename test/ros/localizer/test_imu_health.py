@@ -10,7 +10,7 @@ import numpy as np
 from rs_localizer.core.reasons import ImuReason
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.pipeline.imu import ImuState, Unused
-from rs_localizer.ros.localizer.imu_health import imu_oddity, imu_values
+from rs_localizer.ros.localizer.health import imu_oddity, imu_values
 
 STATUS = InertialStatus(
     Alone.NONE, np.radians([0.5, -0.25, 1.0]), math.radians(0.01), 0.0049, 0.0002

@@ -17,9 +17,8 @@ from geometry_msgs.msg import TransformStamped
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.io.transforms.rigid import NotYetError, TransformError
-from rs_localizer.ros.localizer.broadcaster import Broadcaster
-from rs_localizer.ros.localizer.transforms import check
+from rs_localizer.io.transforms import NotYetError, TransformError
+from rs_localizer.ros.localizer.transforms import Broadcaster, check
 
 STAND_IN = Path(__file__).parents[1] / "stand_in"
 Notes = list[tuple[str, str]]

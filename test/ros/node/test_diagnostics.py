@@ -9,8 +9,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 
-from rs_localizer.ros.node.diagnostics import Diagnostics
-from rs_localizer.ros.node.health import Health, Level, State
+from rs_localizer.ros.node.health import Diagnostics, Health, Level, State
 
 
 class Bench:

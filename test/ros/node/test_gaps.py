@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rs_localizer.ros.node.gaps import missing
+from rs_localizer.ros.node.statistics import missing
 
 RATES = (10.0, 30.0, 60.0)
 

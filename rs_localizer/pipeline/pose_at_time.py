@@ -32,9 +32,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from rs_localizer.config import Acceleration
+from rs_localizer.config import Acceleration, NodeConfig, PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
 from rs_localizer.core.shake import shake_at, within_rows
@@ -129,3 +130,19 @@ def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
             variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
             turn, rate = turn + variance * unknown**2, rate + variance
     return turn, rate
+
+
+def middle_row_ns(config: NodeConfig, camera: Camera, stamp_ns: int) -> int:
+    """When the middle row of the image with this stamp was exposed."""
+    delay = config.stamp_offset - config.readout_time * camera.first_row_time
+    return stamp_ns + round(delay * 1e9)
+
+
+def published_moment(config: NodeConfig, camera: Camera, stamp_ns: int) -> tuple[int, float]:
+    """The stamp for which a pose is published, and the row time of that moment."""
+    if config.pose_time == PoseTime.MID_FRAME:
+        return middle_row_ns(config, camera, stamp_ns), 0.0
+    tau = camera.first_row_time
+    if config.readout_time > 0.0:
+        tau -= config.stamp_offset / config.readout_time
+    return stamp_ns, tau

@@ -8,22 +8,202 @@ interpolated linearly and rotations by slerp.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
+import numpy as np
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.messages import stamp_ns as stamp_of
-from rs_localizer.io.transforms.rigid import Transform, TransformError, from_numbers
-from rs_localizer.io.transforms.tf2_arithmetic import (
-    Quaternion,
-    Vector,
-    conjugate,
-    plus,
-    rotate,
-    slerp,
-    through_matrix,
-    times,
-)
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # x y z w
+
+
+def plus(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    return -q[0], -q[1], -q[2], q[3]
+
+
+def times(p: Quaternion, q: Quaternion) -> Quaternion:
+    return (
+        p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1],
+        p[3] * q[1] + p[1] * q[3] + p[2] * q[0] - p[0] * q[2],
+        p[3] * q[2] + p[2] * q[3] + p[0] * q[1] - p[1] * q[0],
+        p[3] * q[3] - p[0] * q[0] - p[1] * q[1] - p[2] * q[2],
+    )
+
+
+def rotate(q: Quaternion, v: Vector) -> Vector:
+    turned = (
+        q[3] * v[0] + q[1] * v[2] - q[2] * v[1],
+        q[3] * v[1] + q[2] * v[0] - q[0] * v[2],
+        q[3] * v[2] + q[0] * v[1] - q[1] * v[0],
+        -q[0] * v[0] - q[1] * v[1] - q[2] * v[2],
+    )
+    return times(turned, conjugate(q))[:3]
+
+
+def _dot(p: Quaternion, q: Quaternion) -> float:
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
+
+
+def slerp(p: Quaternion, q: Quaternion, ratio: float) -> Quaternion:
+    cosine = _dot(p, q)
+    if cosine < 0.0:  # the same rotation, nearer
+        q = (-q[0], -q[1], -q[2], -q[3])
+    cosine = min(abs(cosine) / math.sqrt(_dot(p, p) * _dot(q, q)), 1.0)
+    angle = math.acos(cosine) * 2.0 / 2.0
+    if angle == 0.0:
+        return p
+    scale = 1.0 / math.sin(angle)
+    s, t = math.sin((1.0 - ratio) * angle), math.sin(ratio * angle)
+    return (
+        (p[0] * s + q[0] * t) * scale,
+        (p[1] * s + q[1] * t) * scale,
+        (p[2] * s + q[2] * t) * scale,
+        (p[3] * s + q[3] * t) * scale,
+    )
+
+
+def through_matrix(q: Quaternion) -> Quaternion:
+    """The quaternion of a quaternion's matrix, as tf2's Transform holds rotations."""
+    x, y, z, w = q
+    s = 2.0 / _dot(q, q)
+    xs, ys, zs = x * s, y * s, z * s
+    wx, wy, wz = w * xs, w * ys, w * zs
+    xx, xy, xz = x * xs, x * ys, x * zs
+    yy, yz, zz = y * ys, y * zs, z * zs
+    m = (
+        (1.0 - (yy + zz), xy - wz, xz + wy),
+        (xy + wz, 1.0 - (xx + zz), yz - wx),
+        (xz - wy, yz + wx, 1.0 - (xx + yy)),
+    )
+    trace = m[0][0] + m[1][1] + m[2][2]
+    if trace > 0.0:
+        s = math.sqrt(trace + 1.0)
+        w, s = s * 0.5, 0.5 / s
+        return (m[2][1] - m[1][2]) * s, (m[0][2] - m[2][0]) * s, (m[1][0] - m[0][1]) * s, w
+    i = 1 if m[0][0] < m[1][1] else 0
+    if m[i][i] < m[2][2]:
+        i = 2
+    j, k = (i + 1) % 3, (i + 2) % 3
+    s = math.sqrt(m[i][i] - m[j][j] - m[k][k] + 1.0)
+    result = [0.0, 0.0, 0.0, 0.0]
+    result[i], s = s * 0.5, 0.5 / s
+    result[3] = (m[k][j] - m[j][k]) * s
+    result[j] = (m[j][i] + m[i][j]) * s
+    result[k] = (m[k][i] + m[i][k]) * s
+    return result[0], result[1], result[2], result[3]
+
+
+# How far the squared norm of a quaternion may be from one; tf2 ignores those that are farther.
+_NORM_TOLERANCE = 1e-2
+
+
+class TransformError(ValueError):
+    """There is no such transform; the text names the frames and says why."""
+
+
+class NotYetError(TransformError):
+    """The transform is known for earlier times only."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transform:
+    """A rigid transform: ``x_target = rotation @ x_source + translation``."""
+
+    rotation: Array  # (3,3)
+    translation: Array  # (3,) m
+
+    def inverse(self) -> Transform:
+        return Transform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """``a_from_b @ b_from_c = a_from_c``."""
+        return Transform(
+            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
+        )
+
+
+class Transforms(Protocol):
+    """Answers what one frame is in another: TF, or the transforms of a recording."""
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None) -> Transform:
+        """``target_from_source`` at a time; None: the latest.
+
+        Raises:
+            NotYetError: when it is known for earlier times, and may still come.
+            TransformError: when it is not known for that time.
+        """
+
+    def moves(self, target: str, source: str) -> bool:
+        """Whether the transform may differ from one time to the next.
+
+        Raises:
+            TransformError: when it is not known at all.
+        """
+
+
+def read_transform(message: Any) -> Transform:
+    """The transform of a geometry_msgs/Transform.
+
+    Raises:
+        TransformError: for a number that is not finite, or no unit quaternion.
+    """
+    t, q = message.translation, message.rotation
+    return from_numbers((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+
+
+def from_numbers(
+    translation: tuple[float, float, float], quaternion: tuple[float, float, float, float]
+) -> Transform:
+    """The transform of a translation in m and a quaternion ``x y z w``.
+
+    Raises:
+        TransformError: for a number that is not finite, or no unit quaternion.
+    """
+    if not all(map(math.isfinite, translation)):
+        raise TransformError(f"the translation {translation} is not finite")
+    x, y, z, w = quaternion
+    square = x * x + y * y + z * z + w * w
+    if not abs(square - 1.0) < _NORM_TOLERANCE:  # NaN is wrong, too
+        raise TransformError(f"the quaternion {quaternion} is not a rotation")
+    s = 2.0 / square
+    rotation = np.array(
+        [
+            [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
+            [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
+            [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
+        ]
+    )
+    return Transform(rotation, np.array(translation, dtype=np.float64))
+
+
+def make_transform(
+    make: Make, stamp_ns: int, parent: str, child: str, parent_from_child: Transform
+) -> Any:
+    """A geometry_msgs/TransformStamped."""
+    x, y, z = parent_from_child.translation.tolist()
+    qx, qy, qz, qw = so3.quaternion(np.ascontiguousarray(parent_from_child.rotation)).tolist()
+    return make(
+        "geometry_msgs/msg/TransformStamped",
+        header=make_header(make, stamp_ns, parent),
+        child_frame_id=child,
+        transform=make(
+            "geometry_msgs/msg/Transform",
+            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        ),
+    )
+
 
 # Longer chains are loops.
 _MOST_LINKS = 1000
@@ -82,7 +262,7 @@ class _Track:
 
 
 class TransformTree:
-    """Transforms by the names of frames (see :class:`rs_localizer.io.transforms.rigid.Transforms`).
+    """Transforms by the names of frames (see :class:`Transforms`).
 
     A slash before a name, as ROS 1 has it, says nothing.
     """

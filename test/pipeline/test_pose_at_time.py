@@ -14,7 +14,7 @@ from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.types import Estimate
-from rs_localizer.pipeline.moments import pose_at, twist_at, with_timing
+from rs_localizer.pipeline.pose_at_time import pose_at, twist_at, with_timing
 
 from .plain_moments import plain_pose, plain_twist
 

@@ -10,8 +10,8 @@ import numpy as np
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Failure
-from rs_localizer.pipeline.experienced import ExperiencedFrames
 from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
+from rs_localizer.pipeline.single_frames import SingleFrames
 
 SIZES = np.array([0.0, -1.0])
 
@@ -27,22 +27,23 @@ def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset() -
         return results[len(priors) - 1]
 
     localizer: Any = SimpleNamespace(localize=localize)
-    frames = ExperiencedFrames(localizer)
+    frames = SingleFrames(localizer, remembers=True)
     for _ in range(3):
-        frames.localize([], [])
+        frames.localize(0, [], [])
     assert priors[0] is None
     for prior in priors[1:]:
         assert prior.motion is None
         np.testing.assert_array_equal(prior.of_field_sizes, 2.0 * SIZES)
     frames.reset()
-    frames.localize([], [])
+    frames.localize(0, [], [])
     assert priors[3] is None
 
 
 def test_it_takes_the_place_of_tracking() -> None:
     def remembers(**settings: Any) -> tuple[bool, bool]:
         method = Method.of(ANY_CALIBRATION, NodeConfig(**settings))
-        return method.tracker is not None, method.experienced is not None
+        frames = method.frames
+        return method.tracker is not None, isinstance(frames, SingleFrames) and frames.remembers
 
     assert remembers() == (False, True)
     assert remembers(readout_time=0.02) == (True, False)

@@ -19,8 +19,7 @@ from tqdm import tqdm
 from rs_localizer.cli import UsageError
 from rs_localizer.io.atomic_files import write_errors
 from rs_localizer.offline.fleet.cluster import Where, perform_all
-from rs_localizer.offline.fleet.identity import identity, program, read_marker
-from rs_localizer.offline.fleet.names import folder_names
+from rs_localizer.offline.fleet.identity import folder_names, identity, program, read_marker
 from rs_localizer.offline.fleet.summary import (
     CSV,
     DONE,
@@ -45,7 +44,7 @@ _LOCK = ".lock"
 _TOLD = 5
 
 
-def add_fleet_arguments(parser: argparse.ArgumentParser) -> None:
+def add_batch_arguments(parser: argparse.ArgumentParser) -> None:
     """How many recordings are shared out."""
     fleet = parser.add_argument_group(
         "many recordings",
@@ -66,7 +65,7 @@ def add_fleet_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def is_fleet(args: Namespace) -> bool:
+def is_batch(args: Namespace) -> bool:
     """Whether there are many recordings, or one is to be treated as many."""
     return len(args.recordings) > 1 or args.workers is not None or args.scheduler is not None
 
@@ -82,7 +81,7 @@ class Plan:
     overwrite: bool | None = None
 
 
-def run_fleet(args: Namespace, plan: Plan) -> None:
+def run_batch(args: Namespace, plan: Plan) -> None:
     """Do all recordings that are not done yet, and write the summary.
 
     Raises:
@@ -222,3 +221,20 @@ def _said(row: Row) -> str:
         if value != ""
     ]
     return ", ".join(said[:_TOLD])
+
+
+def folder_name(option: str, folder: Path | None) -> str | None:
+    """The name of a folder that each result gets.
+
+    Raises:
+        UsageError: when it is more than a name.
+    """
+    if folder is None:
+        return None
+    if len(folder.parts) != 1 or folder.is_absolute() or folder.name in ("", ".."):
+        raise UsageError(f"{option} is a name in the folder of each result, got {folder}")
+    return folder.name
+
+
+def inputs(*files: Path | str | None) -> list[Path]:
+    return [Path(file) for file in files if file]

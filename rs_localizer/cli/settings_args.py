@@ -1,14 +1,15 @@
-"""Settings of the method as commands are given them."""
+"""Arguments that say with which settings, and from which topics of a recording."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from rs_localizer.cli import UsageError
 from rs_localizer.config import NodeConfig
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.settings import build, load_params_file, parse_assignment
 
 # Rows by name, as row times.
@@ -30,12 +31,12 @@ def add_settings(
     )
 
 
-def given_settings(
+def given_values(
     args: argparse.Namespace,
     also: Sequence[str] = (),
     check: Callable[[NodeConfig], object] | None = None,
-) -> NodeConfig:
-    """The settings of a params file, and single ones over them.
+) -> dict[str, Any]:
+    """The values of a params file, and single ones over them, by dotted name.
 
     Args:
         args: of :func:`add_settings`.
@@ -50,18 +51,28 @@ def given_settings(
         if args.params is not None:
             values = load_params_file(args.params)
             where = f"--params: {args.params}"
-            _built(values, check)
+            _check(values, check)
         where = "-p"
-        return _built(values | dict(map(parse_assignment, [*args.assignments, *also])), check)
+        values |= dict(map(parse_assignment, [*args.assignments, *also]))
+        _check(values, check)
     except ValueError as error:
         raise UsageError(f"{where}: {error}") from error
+    return values
 
 
-def _built(values: dict[str, Any], check: Callable[[NodeConfig], object] | None) -> NodeConfig:
+def given_settings(
+    args: argparse.Namespace,
+    also: Sequence[str] = (),
+    check: Callable[[NodeConfig], object] | None = None,
+) -> NodeConfig:
+    """The settings of :func:`given_values`."""
+    return build(given_values(args, also, check))
+
+
+def _check(values: dict[str, Any], check: Callable[[NodeConfig], object] | None) -> None:
     config = build(values)
     if check is not None:
         check(config)
-    return config
 
 
 def row_time(text: str) -> float:
@@ -77,3 +88,15 @@ def row_time(text: str) -> float:
             f"must be {', '.join(_ROWS)}, or a row time from -0.5 to 0.5; got {text!r}"
         )
     return tau
+
+
+def add_topics(group: argparse._ArgumentGroup, but: Collection[str] = ()) -> None:
+    """An option for each input, but for some."""
+    for name, item in INPUTS.items():
+        if name not in but:
+            group.add_argument(item.option, metavar="TOPIC", help=item.help)
+
+
+def given_topics(args: argparse.Namespace, but: Collection[str] = ()) -> dict[str, str | None]:
+    """What was given, by input; None: nothing."""
+    return {name: getattr(args, name) for name in INPUTS if name not in but}

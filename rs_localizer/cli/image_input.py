@@ -1,0 +1,210 @@
+"""Images that a command takes: a video, a folder, or a bag; their camera and their times."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shlex
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rs_localizer.cli import UsageError
+from rs_localizer.cli.settings_args import add_settings, given_values
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.io.bags import BagReader, is_bag, open_bag
+from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
+from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
+from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.io.video import has_times
+from rs_localizer.offline.image_sources import (
+    IMAGE_TYPES,
+    INFO_TYPE,
+    Carried,
+    Shot,
+    find_topic,
+    from_bag,
+    from_files,
+    from_video,
+    have_times,
+    image_files,
+)
+from rs_localizer.process.arguments import number
+from rs_localizer.settings import build, settings, write_parameters
+
+
+def add_source_arguments(parser: argparse.ArgumentParser) -> None:
+    """The camera and the topics of a bag."""
+    camera = parser.add_argument_group("the camera")
+    camera.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help=f"{CALIBRATION_KINDS} (default: the bag's camera_info)",
+    )
+    add_settings(
+        camera,
+        f"as of calibrate; they go to {PARAMETERS} beside the data, for replay --params (default: "
+        f"those in {PARAMETERS} of the bag)",
+    )
+    longest = settings()["readout_time"].maximum or 0.0
+    camera.add_argument(
+        "--readout-time",
+        type=number(0.0, longest),
+        metavar="S",
+        help="as -p readout_time:=S, seconds from the first row to the last",
+    )
+    camera.add_argument(
+        "--scan-direction",
+        choices=[direction.value for direction in ScanDirection],
+        help=f"as -p scan_direction:= (default: {ScanDirection.TOP_TO_BOTTOM})",
+    )
+    camera.add_argument(
+        "--rate",
+        type=number(0.0, above=True),
+        metavar="HZ",
+        help="images per second, instead of the presentation times of a video, or for files whose "
+        "names are not times in ns",
+    )
+    camera.add_argument(
+        "--start",
+        type=number(0.0),
+        metavar="S",
+        help="time of the first image of a video or folder (default: "
+        f"{DEFAULT_START_NS * 1e-9:g}, since ROS takes 0 for none; of names that are times, their "
+        "own)",
+    )
+    bag = parser.add_argument_group("topics of a bag (default: the only ones of their types)")
+    bag.add_argument("--image", metavar="TOPIC")
+    bag.add_argument("--camera-info", metavar="TOPIC")
+
+
+def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
+    """The settings that were given, or that stand beside the images of a bag, by dotted name."""
+    also = [
+        f"{name}:={value}"
+        for name in ("readout_time", "scan_direction")
+        if (value := getattr(args, name)) is not None
+    ]
+    beside = args.images / PARAMETERS
+    if args.params is None and is_bag(args.images) and beside.exists():
+        return given_values(argparse.Namespace(params=beside, assignments=args.assignments), also)
+    return given_values(args, also)
+
+
+def write_shutter(args: argparse.Namespace, out: Path) -> None:
+    """What is known of the shutter, into the directory of a recording."""
+    if values := shutter_values(args):
+        write_parameters(out / PARAMETERS, values)
+
+
+def tell_left_out(refused: Mapping[str, str], carried: Mapping[str, int]) -> None:
+    """Images that could not be read, and other messages that are kept."""
+    for detail in refused.values():
+        print(f"images that cannot be read are left out, the first one because {detail}")
+    if carried:
+        kept = ", ".join(f"{topic} ({count})" for topic, count in carried.items())
+        print(f"kept for replay: {kept}")
+
+
+def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: float) -> list[str]:
+    """Say where the times are from; what speaks against them, and against the readout time.
+
+    Args:
+        period: s from one image to the next.
+    """
+    faults = []
+    if clock is not None:
+        print(clock.told())
+        faults.append(clock.fault())
+    faults.append(readout_fault(build(shutter_values(args)).readout_time, period))
+    return [fault for fault in faults if fault]
+
+
+def tell_next(args: argparse.Namespace, more: str = "") -> None:
+    """The command that makes poses of the recording, with further options."""
+    out = shlex.quote(str(args.out))
+    with_parameters = (args.out / PARAMETERS).exists()
+    shutter = f"--params {out}/{PARAMETERS}" if with_parameters else "-p readout_time:=SECONDS"
+    poses = shlex.quote(f"{args.out}_poses")
+    print(f"next: rs_localizer replay {out} {shutter}{more} --out {poses}")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Images, as far as they are open."""
+
+    shots: Iterator[Shot] | Iterator[Shot | Carried]
+    total: int | None  # None: unknown
+    clock: ImageClock | None  # of images without times of their own
+
+
+@contextlib.contextmanager
+def opened(args: argparse.Namespace, path: Path, start: float | None = None) -> Iterator[Source]:
+    """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
+
+    Args:
+        args: with ``rate``, and the topics ``image`` and ``camera_info`` of a bag.
+        path: of the images.
+        start: time of the first one, s; not of a bag.
+
+    Raises:
+        UsageError: for options that do not go with it, or that are missing.
+    """
+    if not is_bag(path):
+        for name in ("image", "camera_info"):
+            if getattr(args, name) is not None:
+                raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
+        if args.calibration is None:
+            raise UsageError("a video or folder has no camera_info: give --calibration")
+        clock = clock_of(path, args.rate, start)
+        yield of_files(path, read_calibration(args.calibration), clock)
+        return
+    for name, value in (("rate", args.rate), ("start", start)):
+        if value is not None:
+            raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
+    with open_bag(path) as bag:
+        given = None if args.calibration is None else read_calibration(args.calibration)
+        yield of_bag(bag, given, args)
+
+
+def of_bag(bag: BagReader, camera: Camera | None, args: argparse.Namespace) -> Source:
+    """The images of a bag; without a camera, with that of its camera_info."""
+    topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
+    info = None
+    if camera is None:
+        info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
+    return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
+
+
+def clock_of(path: Path, rate: float | None, start: float | None = None) -> ImageClock:
+    """What gives the images of a video or folder their times.
+
+    Raises:
+        UsageError: when they have none, and there is no rate.
+    """
+    if rate is None and not path.is_dir() and not has_times(path):
+        raise UsageError("this video has no presentation times: give --rate; the readout time "
+                         "scales with it")  # fmt: skip
+    if rate is None and path.is_dir() and not have_times(image_files(path)):
+        raise UsageError("the names of the files are not times in ns: give --rate")
+    return ImageClock(rate, None if start is None else round(start * 1e9))
+
+
+def of_files(path: Path, camera: Camera, clock: ImageClock) -> Source:
+    """The images of a video or folder."""
+    if not path.is_dir():
+        return Source(from_video(path, camera, clock), None, clock)
+    files = image_files(path)
+    return Source(from_files(files, camera, clock), len(files), clock)
+
+
+def tell_times(clock: ImageClock | None) -> None:
+    """Say where the times of images are from that have been read, and what speaks against them."""
+    if clock is None:
+        return
+    print(clock.told())
+    if fault := clock.fault():
+        print(f"warning: {fault}")

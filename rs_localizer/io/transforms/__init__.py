@@ -1,1 +1,0 @@
-"""Rigid transforms between named frames."""
