@@ -34,10 +34,10 @@ from rs_localizer.estimation.motion_model import (
 )
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.tone_memory import with_frame
-from rs_localizer.inertial.aiding import Before, Foreseen, GyroscopeAid
+from rs_localizer.inertial.aiding import Before, GyroPrediction, GyroscopeAid
+from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
-from rs_localizer.inertial.sight import sight_of
 from rs_localizer.inertial.status import InertialStatus
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
@@ -196,7 +196,7 @@ class Tracker:
             self._track = None
         share = 0.0 if self._track is None else self._track.share
 
-        def localized(foreseen: Foreseen | None) -> tuple[Estimate | Failure, Prior | None]:
+        def localized(foreseen: GyroPrediction | None) -> tuple[Estimate | Failure, Prior | None]:
             turn = None if foreseen is None else foreseen.turn
             prior = None if foreseen is None else foreseen.prior
             if prior is None:
@@ -225,7 +225,7 @@ class Tracker:
         if self._aid is not None and imu is not None and self._aid.wants_sight():
             lens, camera = result.lens, self.localizer.camera
             camera = camera if lens is None else lens.mended(camera)
-            self._aid.seek(sight_of(camera, points, pixels, result, time_ns))
+            self._aid.seek(row_offset_likelihood(camera, points, pixels, result, time_ns))
         return self.localizer.accepted(result)
 
     def _before(self, time_ns: int) -> Before | None:

@@ -23,7 +23,7 @@ from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.single_frames import SingleFrames
 from rs_localizer.tracking import Tracker
 from rs_localizer.trajectory.observe import Observed
-from rs_localizer.trajectory.online import REVERSED
+from rs_localizer.trajectory.online_readout import REVERSED
 
 Poses = list[Estimate | Failure]
 METHODS = ("default", "tracked", "single")

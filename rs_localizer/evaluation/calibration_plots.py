@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.trajectory.calibration import Calibration
-from rs_localizer.trajectory.evidence import likelihood, without_readout
+from rs_localizer.trajectory.calibration import Calibration, likelihood, without_readout
 
 _BLUE, _ORANGE, _GREY = "#0b3c8c", "#f08a24", "#c9c9c9"
 _BINS = 16

@@ -18,9 +18,9 @@ from rs_localizer.inertial.filter import RATE, GyroscopeFilter, Predicted
 from rs_localizer.inertial.gaps import span_of
 from rs_localizer.inertial.gravity import gravity_seen
 from rs_localizer.inertial.offset_search import OffsetSearch, warm_up
+from rs_localizer.inertial.row_offset_likelihood import RowOffsetLikelihood
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
-from rs_localizer.inertial.sight import Sight
 from rs_localizer.inertial.status import Alone, InertialStatus
 from rs_localizer.inertial.turning import TurnBetween, TurnWithin
 from rs_localizer.inertial.watch import Believed, GyroscopeWatch, contradicts
@@ -51,7 +51,7 @@ class Before:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Foreseen:
+class GyroPrediction:
     """What the gyroscope says of a frame."""
 
     middle_ns: int
@@ -125,7 +125,7 @@ class GyroscopeAid:
         """Whether this frame is to help in that: only where the camera vibrates one may err."""
         return self._shaken and self._search is not None and self._search.wants()
 
-    def seek(self, sight: Sight | None) -> None:
+    def seek(self, sight: RowOffsetLikelihood | None) -> None:
         """Look for the time offset with one more frame."""
         if self._search is None or sight is None:
             return
@@ -142,7 +142,7 @@ class GyroscopeAid:
         samples: ImuSamples | None,
         middle_ns: int,
         before: Callable[[], Before | None],
-        localized: Callable[[Foreseen | None], Found],
+        localized: Callable[[GyroPrediction | None], Found],
     ) -> Found:
         """Localize a frame with the gyroscope, or without it where that is better.
 
@@ -174,7 +174,7 @@ class GyroscopeAid:
 
     def _foreseen(
         self, samples: ImuSamples | None, middle_ns: int, before: Callable[[], Before | None]
-    ) -> Foreseen | None:
+    ) -> GyroPrediction | None:
         """What is known of a frame before its points; None: the camera has to go alone."""
         if samples is None or len(samples) == 0:
             self._state = Alone.NO_SAMPLES
@@ -195,7 +195,7 @@ class GyroscopeAid:
             if between is not None:
                 return self._predicted(last, between, turn, middle_ns)
         self.filter.forget_motion()
-        return Foreseen(middle_ns, turn, self._gravity(samples, middle_ns), None)
+        return GyroPrediction(middle_ns, turn, self._gravity(samples, middle_ns), None)
 
     def _gravity(self, samples: ImuSamples, middle_ns: int) -> Prior | None:
         up = self._settings.gravity_in_map
@@ -206,7 +206,7 @@ class GyroscopeAid:
 
     def _predicted(
         self, last: Before, between: TurnBetween, within: TurnWithin, middle_ns: int
-    ) -> Foreseen:
+    ) -> GyroPrediction:
         readouts = 1e-9 * (middle_ns - last.middle_ns) / self._readout_time
         predicted = self.filter.predict(
             last.motion, last.covariance, between, within, readouts, last.fading
@@ -218,9 +218,9 @@ class GyroscopeAid:
             of_shake_sizes=last.of_shake_sizes,
             of_field_sizes=last.of_field_sizes,
         )
-        return Foreseen(middle_ns, within, prior, predicted)
+        return GyroPrediction(middle_ns, within, prior, predicted)
 
-    def _learn(self, foreseen: Foreseen, found: Estimate | Failure, step: Array) -> None:
+    def _learn(self, foreseen: GyroPrediction, found: Estimate | Failure, step: Array) -> None:
         """Take in a frame that agrees with the gyroscope."""
         assert found
         self._state = Alone.NONE
@@ -272,7 +272,7 @@ def _believed(middle_ns: int, found: Estimate) -> Believed:
     return Believed(middle_ns, found.rotation, found.covariance[:3, :3])
 
 
-def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
+def _step(foreseen: GyroPrediction, found: Estimate | Failure) -> Array | None:
     """The step (18,) from what was foreseen to an estimate, beside the known turn.
 
     None where there is no estimate, or none near the prediction. Without a prediction only what the
@@ -291,7 +291,7 @@ def _step(foreseen: Foreseen, found: Estimate | Failure) -> Array | None:
     return step_between(state_in(foreseen.predicted.motion, origin), state_in(motion, origin))
 
 
-def _contradicts(foreseen: Foreseen, step: Array) -> bool:
+def _contradicts(foreseen: GyroPrediction, step: Array) -> bool:
     if foreseen.predicted is None:
         return contradicts(step[ANGULAR], foreseen.turn.error, _FIRST)
     return contradicts(step, foreseen.predicted.covariance, _SEEN)

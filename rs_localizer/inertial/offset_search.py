@@ -26,8 +26,8 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.rate_spline import multiplied, rotations_at_knots, spline, turns_at
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import PARAMETERS
+from rs_localizer.inertial.row_offset_likelihood import RowOffsetLikelihood
 from rs_localizer.inertial.settings import BIAS_DEVIATION, OFFSET_DEVIATION, SCALE_DEVIATION
-from rs_localizer.inertial.sight import Sight
 
 # Offsets to try, s: three standard deviations; a vibration of 120 Hz has 16 steps in a cycle.
 _FARTHEST, _STEP = 3.0 * OFFSET_DEVIATION, 5e-4
@@ -70,13 +70,13 @@ class OffsetSearch:
 
     def __init__(self, about: float = 0.0) -> None:
         self._about = about
-        self._waiting: deque[Sight] = deque()
+        self._waiting: deque[RowOffsetLikelihood] = deque()
         self._costs = (_OFFSETS / OFFSET_DEVIATION) ** 2  # of rows, and what is assumed
         self._closed = np.zeros(len(_OFFSETS))  # of orientations in chains that have ended
         self._frames = self._seen = 0
         self._begin(None)
 
-    def _begin(self, sight: Sight | None) -> None:
+    def _begin(self, sight: RowOffsetLikelihood | None) -> None:
         """Begin with orientations anew; what the former ones said is kept."""
         self._before_ns = None if sight is None else sight.middle_ns
         self._turned = np.eye(3)  # camera_then_from_camera_at_the_beginning, without an offset
@@ -91,7 +91,7 @@ class OffsetSearch:
         self._seen += 1
         return self._seen < _PATIENCE or self._seen % _LATER == 0
 
-    def add(self, sight: Sight) -> None:
+    def add(self, sight: RowOffsetLikelihood) -> None:
         """A frame; it is looked at when there are samples for all offsets."""
         self._waiting.append(sight)
 
@@ -108,7 +108,7 @@ class OffsetSearch:
             looked = True
         return self._decided() if looked and self._frames >= _FEWEST else None
 
-    def _take(self, sight: Sight, times_ns: IntArray, rates: Array) -> bool:
+    def _take(self, sight: RowOffsetLikelihood, times_ns: IntArray, rates: Array) -> bool:
         """Take in a frame; False: its samples may yet come."""
         here_ns = sight.middle_ns - round(1e9 * self._about)
         reach = round(1e9 * (float(np.abs(sight.rows).max()) + _FARTHEST)) + _AROUND_NS
@@ -139,7 +139,7 @@ class OffsetSearch:
             self._weigh(sight, times, cubics, knots)
         return True
 
-    def _weigh(self, sight: Sight, times: Array, cubics: Array, knots: Array) -> None:
+    def _weigh(self, sight: RowOffsetLikelihood, times: Array, cubics: Array, knots: Array) -> None:
         """Add what a frame says to the costs."""
         assert self._first is not None
         self._frames += 1

@@ -8,8 +8,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.trajectory.model import Freedom, State
-from rs_localizer.trajectory.spline import Spline
-from rs_localizer.trajectory.start import LONGEST_GAP, LONGEST_SPACING, spline_through
+from rs_localizer.trajectory.spline import LONGEST_GAP, LONGEST_SPACING, Spline, spline_through
 
 # A stretch reaches so far beyond its images (s), half as long as readouts take; and this share of
 # a known one.

@@ -11,9 +11,15 @@ from rs_localizer.inertial.gravity import STANDARD_GRAVITY
 from rs_localizer.mapping.refine import RefinedMap
 from rs_localizer.trajectory.gyro import NoMount
 from rs_localizer.trajectory.imu import ImuRecording
-from rs_localizer.trajectory.mean_accelerations import Means, mean_accelerations
-from rs_localizer.trajectory.metric import Lever, Metric, NoMetric, metric
-from rs_localizer.trajectory.mount_on_motion import MountOnMotion, mount_on_motion
+from rs_localizer.trajectory.imu_extrinsics import ImuExtrinsics, imu_extrinsics
+from rs_localizer.trajectory.metric import (
+    Lever,
+    Means,
+    Metric,
+    NoMetric,
+    mean_accelerations,
+    metric,
+)
 
 # Where the IMU is, m: as TF says, which is drawn on paper; where nothing says so, in the same box.
 _DRAWN, _SAME_BOX = 0.05, 0.1
@@ -42,7 +48,7 @@ class InertialMetres:
     """What an IMU says of a map."""
 
     metric: Metric
-    mount: MountOnMotion
+    mount: ImuExtrinsics
     share: float  # standard deviation of the scale, by it, with the disagreement of parts
     turned: float | None  # rad, between the rotation that was found and TF's; None: TF has none
     covered: float  # share of the motion that the accelerometer saw without a gap
@@ -104,11 +110,11 @@ def inertial_metres(refined: RefinedMap, imu: ImuRecording) -> InertialMetres:
     return InertialMetres(found, mount, found.inflation * found.share, turned, covered)
 
 
-def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[MountOnMotion, float | None]:
+def _mount(refined: RefinedMap, imu: ImuRecording) -> tuple[ImuExtrinsics, float | None]:
     """How the IMU hangs on the camera, and by how much (rad) TF has it otherwise."""
     given = imu.camera_from_imu
     try:
-        found = mount_on_motion(imu.samples(refined.start_ns), refined.spline, given)
+        found = imu_extrinsics(imu.samples(refined.start_ns), refined.spline, given)
     except NoMount as error:
         ends = refined.start_ns * 1e-9 + refined.times[[0, -1]]
         raise NoMetres(elsewhen(imu, *ends.tolist()) or str(error)) from error

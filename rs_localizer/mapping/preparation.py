@@ -15,9 +15,8 @@ from rs_localizer.mapping.sightings import (
     shared_landmarks,
 )
 from rs_localizer.trajectory.model import Observations
-from rs_localizer.trajectory.spline import Spline
+from rs_localizer.trajectory.spline import LONGEST_GAP, Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
-from rs_localizer.trajectory.start import LONGEST_GAP
 
 # Beyond so many unknowns of the motion its matrix takes more than 2 GB.
 _MOST_UNKNOWNS = 15000

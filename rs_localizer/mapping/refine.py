@@ -27,7 +27,7 @@ from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over, steepness
 from rs_localizer.trajectory.lens import with_lens
 from rs_localizer.trajectory.model import Freedom, start_state
-from rs_localizer.trajectory.online import REVERSED
+from rs_localizer.trajectory.online_readout import REVERSED
 from rs_localizer.trajectory.problem import LIMIT, Problem
 from rs_localizer.trajectory.spline import Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL

@@ -17,8 +17,8 @@ from rs_localizer.io.clouds import Correspondences
 from rs_localizer.pipeline.refusal import Notify
 from rs_localizer.pipeline.scan_axis import ScanAxis
 from rs_localizer.solvers.table import find_solver
-from rs_localizer.trajectory.measured_readout import MeasuredReadout, Measurement
-from rs_localizer.trajectory.online import REVERSED, ReadoutMonitor, warm_up
+from rs_localizer.trajectory.online_readout import REVERSED, ReadoutMonitor, warm_up
+from rs_localizer.trajectory.readout_equations import MeasuredReadout, Measurement
 
 # Frames from one measurement to the next: few at first, more when there is more to compute.
 _AT_FIRST, _LATER = 5, 30

@@ -96,7 +96,7 @@ REASONS: dict[str, Meaning] = {
         "no keypoint matches a landmark", "are descriptors, or ids, of map and camera of one kind?"
     ),
     Reason.BAD_IMAGE: Meaning(
-        "an image cannot be read", "its encoding: mono, color, Bayer, YUV 4:2:2, JPEG, PNG"
+        "an image cannot be read", "its encoding: mono, color, Bayer, YUV, JPEG, PNG"
     ),
     Reason.NO_TIME: Meaning(
         "OpenCV does not tell when an image of a video was taken",

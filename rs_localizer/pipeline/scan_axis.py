@@ -2,7 +2,7 @@
 
 Drivers that rotate images turn the scan sideways and say nothing of it. The axis that is set and
 the other one are compared by what their motions leave of each frame; the direction along the other
-one comes from its motions from frame to frame (:mod:`rs_localizer.trajectory.online`).
+one comes from its motions from frame to frame (:mod:`rs_localizer.trajectory.online_readout`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.io.clouds import Correspondences
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
-from rs_localizer.trajectory.measured_readout import MeasuredReadout
-from rs_localizer.trajectory.online import REVERSED, ReadoutMonitor
+from rs_localizer.trajectory.online_readout import REVERSED, ReadoutMonitor
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 _OTHER_AXIS = {
     ScanDirection.TOP_TO_BOTTOM: ScanDirection.LEFT_TO_RIGHT,
@@ -40,7 +40,7 @@ _CERTAIN, _DOUBT, _LEAST = 12.0, 3.0, -4.0
 # every so many, as long as nothing speaks for the other axis.
 _AT_FIRST, _SUSPECTED, _EVERY = 5, 40, 10
 # Frames in which motion along the other axis has to agree; it takes 22 in a row for a measurement,
-# and a few for odds of 100 that it agrees (see :mod:`rs_localizer.trajectory.shutter_odds`).
+# and a few for odds of 100 that it agrees (see :mod:`rs_localizer.trajectory.shutter_hypotheses`).
 _CHANCES, _AGREES, _CONTRADICTS = 40, 4.6, 2.0
 # Frames from one measurement of the readout time to the next: it takes as long as some frames.
 _MEASURED_EVERY = 5

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.inertial.aiding import Foreseen, GyroscopeAid
+from rs_localizer.inertial.aiding import GyroPrediction, GyroscopeAid
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.inertial.status import InertialStatus
@@ -72,7 +72,7 @@ class SingleFrames:
         if self._aid is None:
             return self._without_imu(points, pixels, scores)
 
-        def localized(foreseen: Foreseen | None) -> tuple[Estimate | Failure, Prior | None]:
+        def localized(foreseen: GyroPrediction | None) -> tuple[Estimate | Failure, Prior | None]:
             prior = None if foreseen is None else foreseen.prior
             turn = None if foreseen is None else foreseen.turn
             if turn is None and self.of_rest > 0.0:

@@ -6,22 +6,177 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Undetermined
-from rs_localizer.trajectory.blocks import Block, blocks_of, disagreement
 from rs_localizer.trajectory.bodies import is_flat
 from rs_localizer.trajectory.fit import Fit, cheaper, cost_at, fit, image_speeds
 from rs_localizer.trajectory.gyro import NoMount
+from rs_localizer.trajectory.gyro_terms import DELAY, MOUNT
 from rs_localizer.trajectory.imu import ImuRecording, MountFound, mount_of, with_gyro
 from rs_localizer.trajectory.lens import LensErrors, lens_difference, lens_errors
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
 from rs_localizer.trajectory.observe import Observed, Posed, collect, in_order, localize_each
-from rs_localizer.trajectory.spline import Spline
-from rs_localizer.trajectory.stamps import Stamps, examine
-from rs_localizer.trajectory.start import LONGEST_SPACING, first_spline, refined
+from rs_localizer.trajectory.spline import LONGEST_SPACING, Spline, first_spline, refined
+
+
+def likelihood(camera: Camera, found: Calibration, count: int = 9) -> tuple[Array, Array]:
+    """Readout times (count,) within four deviations, and what they cost more than the best."""
+    seen = within(found.posed.observations, found.fit.state.spline)
+    values = found.readout_time + np.linspace(-4.0, 4.0, count) * found.formal_deviation
+    costs = np.array([cost_at(camera, seen, found.fit, float(value)) for value in values])
+    return values, costs - found.fit.cost
+
+
+class Residuals(NamedTuple):
+    """Of the keypoints that fit."""
+
+    row_times: Array  # (n,)
+    speeds: Array  # (n,) px/s, in the image
+    squared_errors: Array  # (n,) px^2
+
+
+def without_readout(camera: Camera, found: Calibration) -> tuple[Residuals, Residuals]:
+    """What a global shutter would leave, and what the readout time leaves."""
+    seen = within(found.posed.observations, found.fit.state.spline).subset(found.fit.inliers)
+    seen = replace(seen, trusted=np.ones_like(seen.trusted))
+    held = replace(found.fit.freedom, readout_time=False)
+    both = []
+    for value in (0.0, found.readout_time):
+        start = replace(found.fit.state, readout_time=value)
+        both.append(fit(camera, seen, start, held).squared_errors)
+    speeds = image_speeds(camera, seen, found.fit.state)
+    before, after = (Residuals(seen.row_times, speeds, errors) for errors in both)
+    return before, after
+
+
+# A camera's own clock keeps its stamps within this (s) of even intervals.
+_MOST_JITTER = 5e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stamps:
+    """Images of a camera that should run evenly."""
+
+    interval: float  # s
+    jitter: float  # s rms, of the stamps about even intervals
+    missing: int  # images
+
+    @property
+    def irregular(self) -> bool:
+        return self.jitter > _MOST_JITTER
+
+
+def examine(times: Array) -> Stamps:
+    """Even intervals nearest to the stamps (f,), s, sorted.
+
+    The number of intervals is counted from stamp to stamp, so that images may be missing.
+    """
+    steps = np.diff(times)
+    interval = float(np.median(steps))
+    for _ in range(3):
+        counts = np.maximum(np.round(steps / interval), 1.0)
+        number = np.concatenate([[0.0], np.cumsum(counts)])
+        rate = np.polyfit(number, times, 1)
+        interval = float(rate[0])
+    even = np.polyval(rate, number)
+    off = times - even
+    jitter = float(np.sqrt(np.mean((off - np.median(off)) ** 2)))
+    return Stamps(interval, jitter, int(number[-1]) + 1 - len(times))
+
+
+# Parts of the recording that are calibrated on their own: three at least, for two that agree may do
+# so by chance, and more of a longer one.
+_BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS = 3.0, 3, 8
+# Blocks that would differ this much by chance once in a hundred recordings disagree.
+_DISAGREEMENT = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """A part of the recording on its own."""
+
+    start: float  # s
+    end: float  # s
+    readout_time: float  # s
+    deviation: float  # s
+    camera: Camera  # with the lens of this part
+    delay: float = math.nan  # s, of the gyroscope where there is one
+    delay_deviation: float = math.nan  # s
+
+
+def blocks_of(
+    camera: Camera, observations: Observations, whole: Fit, count: int | None = None
+) -> tuple[Block, ...]:
+    """Equal parts of the recording, each with a lens and a shape of the map of its own.
+
+    Args:
+        camera: whose lens the whole was started from.
+        count: of the parts; None: as many as the recording is long enough for.
+    """
+    first, last = observations.times.min(), observations.times.max()
+    if count is None:
+        count = int(np.clip((last - first) / _BLOCK_SECONDS, _LEAST_BLOCKS, _MOST_BLOCKS))
+    blocks: list[Block] = []
+    for start, end in pairwise(np.linspace(first, last + 1e-6, count + 1)):
+        # Not only what fits the whole: a part that differs would be left out of its own estimate.
+        part = observations.subset((observations.times >= start) & (observations.times < end))
+        state = _cut(whole.state, start, end)
+        if state is None or not np.any(part.trusted):
+            continue
+        try:
+            own = fit(camera, part, state, whole.freedom)
+        except ValueError:  # undetermined, or a lens that no camera has
+            continue
+        value, deviation = own.state.readout_time, own.readout_time_deviation
+        delay = _delay(own)
+        blocks.append(Block(float(start), float(end), value, deviation, own.camera, *delay))
+    return tuple(blocks)
+
+
+def _delay(own: Fit) -> tuple[float, float]:
+    """Delay of the gyroscope and its deviation, s; NaN without one."""
+    if own.state.mount is None:
+        return math.nan, math.nan
+    at = DELAY - MOUNT
+    return own.state.mount.delay, math.sqrt(float(own.border_covariance[at, at]))
+
+
+def _cut(state: State, start: float, end: float) -> State | None:
+    """The state with the motion between two times only."""
+    layout = state.spline.layout
+    intervals = np.column_stack([layout.starts, layout.ends])
+    margin = abs(state.readout_time)
+    kept = np.clip(intervals, start - margin, end + margin)
+    kept = kept[kept[:, 1] - kept[:, 0] > layout.spacing]
+    if len(kept) == 0:
+        return None
+    return replace(state, spline=refined(state.spline, layout.spacing, kept))
+
+
+def disagreement(values: Array, deviations: Array) -> float:
+    """By how much deviations (b,) are too small for the scatter of values (b,) (Birge's ratio),
+    1 if that may be chance.
+    """
+    if len(values) < 2:
+        return 1.0
+    weights = deviations**-2.0
+    total = float(np.sum(weights))
+    mean = np.sum(weights * values) / total
+    squared = float(np.sum(weights * (values - mean) ** 2))
+    freedoms = len(values) - 1
+    if chi2.sf(squared, freedoms) > _DISAGREEMENT:
+        return 1.0
+    # What the blocks disagree in is not their noise: none of them is better than the others.
+    scatter = np.std(values, ddof=1) / math.sqrt(len(values))
+    return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
+
 
 _LEAST_IMAGES = 20
 # A board: few landmarks, seen often. Each is where it should be to about this part of its size (a

@@ -13,12 +13,11 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.fit import Fit, fit
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, first_mount
-from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
-from rs_localizer.trajectory.gyro_terms import GyroTerms
-from rs_localizer.trajectory.mean_accelerations import ForceSamples
+from rs_localizer.trajectory.gyro_terms import DELAY, MOUNT, GyroTerms
+from rs_localizer.trajectory.metric import ForceSamples
 from rs_localizer.trajectory.model import Observations
-from rs_localizer.trajectory.online import REVERSED
-from rs_localizer.trajectory.start import refined
+from rs_localizer.trajectory.online_readout import REVERSED
+from rs_localizer.trajectory.spline import refined
 
 # The noise of the gyroscope has settled when it changes by less than this share.
 _ROUNDS, _SETTLED = 6, 0.03

@@ -1,6 +1,6 @@
 """Metres and gravity of a motion in units of its own, from an accelerometer that went along.
 
-Mean accelerations (:mod:`rs_localizer.trajectory.mean_accelerations`), divided by the scale s:
+Mean accelerations (:mod:`rs_localizer.trajectory.metric`), divided by the scale s:
 
     seen = m forces + w gravity - axes bias - arms lever
 
@@ -13,29 +13,217 @@ The noise of neighbouring means hangs together: that of positions by their secon
 of accelerations (an orientation that is off turns gravity) by the overlap of the B-splines. How
 much there is of both is told by the residuals, by restricted maximum likelihood (Patterson,
 Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 1971).
+
+Accelerations of a motion that is known by its positions, beside what an accelerometer felt.
+
+Nothing is differentiated. Positions averaged with a cardinal B-spline of degree k - 2, second
+differences taken of the means a spacing apart, are exactly the accelerations averaged with the
+B-spline of degree k (B_k'' is the second difference of B_{k-2}). The readings, turned into the
+map's axes, are averaged with the latter: both sides are then the same number, and a linear
+equation of scale, gravity, bias and lever arm. This is the weak form of p'' = a, with B-splines as
+test functions; what it says at frequencies above the spacing's is nothing on both sides.
+
+For a camera in units of the map at p, with an IMU at l (m) in the camera's axes, ``R`` the
+camera's axes in the map and ``C`` the IMU's in the camera:
+
+    s p'' + (R l)'' = R C (f - b) + g
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import cholesky, solve_triangular, toeplitz
+from scipy.stats import chi2
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
-from rs_localizer.trajectory.blocks import excess
-from rs_localizer.trajectory.mean_accelerations import Means
-from rs_localizer.trajectory.metric_equations import (
-    BIAS,
-    FORCE,
-    GRAVITY,
-    INVERSE,
-    LEVER,
-    UNKNOWNS,
-    Whitened,
-    design,
-)
+from rs_localizer.trajectory.spline import Layout, Spline
+
+DEGREE = 5
+"""Of the B-spline that accelerations are averaged with; positions with two less."""
+_SUPPORT = DEGREE + 1  # spacings
+# Positions are averaged over so many of them a spacing.
+_STEPS = 20
+# Without a sample for longer than this (s), or than so many usual steps, there is a gap.
+_LONGEST_STEP, _MOST_STEPS = 0.02, 2.5
+# So many means at once.
+_MOST = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceSamples:
+    """What an accelerometer measured."""
+
+    times: Array  # (k,) s, of the spline
+    forces: Array  # (k,3) m/s^2, specific force in its own axes; upwards at rest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Means:
+    """Mean accelerations around n moments that follow each other."""
+
+    spacing: float  # s
+    times: Array  # (n,) s
+    seen: Array  # (n,3) of the camera's centre, units of the map per s^2, along its axes
+    forces: Array  # (n,3) m/s^2, likewise
+    axes: Array  # (n,3,3) of the IMU, in the map's: what a bias of the readings does
+    arms: Array  # (n,3,3) second derivative of the camera's axes, 1/s^2
+    weights: Array  # (n,) about 1: of what is the same all the time
+
+
+def mean_accelerations(
+    spline: Spline, samples: ForceSamples, camera_from_imu: Array, spacing: float
+) -> list[Means]:
+    """Means of all parts of a motion that samples cover without a gap.
+
+    Args:
+        camera_from_imu: (3,3).
+        spacing: s, of the means; half the period of the quickest motion that counts.
+    """
+    found = []
+    for start, end in _covered(spline.layout, samples.times):
+        count = int((end - start) / spacing - _SUPPORT + 1.0 + 1e-9)
+        for first in range(0, count, _MOST):
+            numbers = np.arange(first, min(first + _MOST, count))
+            times = np.asarray(start + spacing * (0.5 * _SUPPORT + numbers), np.float64)
+            found.append(_means(spline, samples, camera_from_imu, spacing, times))
+    return found
+
+
+def _covered(layout: Layout, times: Array) -> list[tuple[float, float]]:
+    """Intervals (s) of stretches with samples without a gap."""
+    if len(times) < 2:
+        return []
+    steps = np.diff(times)
+    gaps = np.flatnonzero(steps > max(_LONGEST_STEP, _MOST_STEPS * float(np.median(steps))))
+    pieces = [(part[0], part[-1]) for part in np.split(times, gaps + 1)]
+    return [
+        (max(start, first), min(end, last))
+        for start, end in zip(layout.starts, layout.ends, strict=True)
+        for first, last in pieces
+        if max(start, first) < min(end, last)
+    ]
+
+
+def _means(
+    spline: Spline, samples: ForceSamples, camera_from_imu: Array, spacing: float, times: Array
+) -> Means:
+    reach = 0.5 * _SUPPORT * spacing
+    low, high = np.searchsorted(samples.times, [times[0] - reach, times[-1] + reach])
+    near = slice(max(int(low) - 1, 0), int(high) + 1)
+    at = samples.times[near]
+    turns = spline.states(at).rotations @ camera_from_imu
+    # Trapezoids; the B-spline is zero at both ends.
+    weights = _kernel(DEGREE, (at - times[:, None]) / spacing) * np.gradient(at) / spacing
+    # Positions are averaged at places that lie alike beside all means: second differences of what
+    # rises evenly are zero, whatever the steps are.
+    step = spacing / _STEPS
+    dense = times[0] - reach + step * np.arange(_STEPS * (len(times) - 1 + _SUPPORT) + 1)
+    states = spline.states(dense)
+    middles = times[0] + spacing * np.arange(-1, len(times) + 1)
+    average = _kernel(DEGREE - 2, (dense - middles[:, None]) / spacing) / _STEPS
+    return Means(
+        spacing,
+        times,
+        _second_differences(average @ states.positions, spacing),
+        np.einsum("nk,kij,kj->ni", weights, turns, samples.forces[near], optimize=True),
+        np.einsum("nk,kij->nij", weights, turns),
+        _second_differences(np.einsum("nk,kij->nij", average, states.rotations), spacing),
+        weights.sum(axis=1),
+    )
+
+
+def _kernel(degree: int, places: Array) -> Array:
+    """The centred cardinal B-spline of a degree."""
+    knots = np.arange(degree + 2) - 0.5 * (degree + 1)
+    values = BSpline.basis_element(knots, extrapolate=False)(places)
+    return np.nan_to_num(np.asarray(values, np.float64))
+
+
+def _second_differences(values: Array, spacing: float) -> Array:
+    return np.asarray((values[2:] - 2.0 * values[1:-1] + values[:-2]) / spacing**2)
+
+
+# Unknowns: 1 / s as the forces say it, and gravity, bias, lever arm and 1 / s by s.
+FORCE, GRAVITY, BIAS, LEVER, INVERSE = 0, slice(1, 4), slice(4, 7), slice(7, 10), 10
+UNKNOWNS = 11
+
+
+class Whitened:
+    """Normal equations of means at a ratio of the variances of their two noises.
+
+    Args:
+        means: of all parts.
+        kept: (n,) of each part, which count.
+        ratio: s^-4, variance of accelerations by that of positions.
+    """
+
+    def __init__(self, means: Sequence[Means], kept: Sequence[BoolArray], ratio: float) -> None:
+        self.normal = np.zeros((INVERSE, INVERSE))
+        self.right = np.zeros(INVERSE)
+        self.squared, self.log_determinant, self.count = 0.0, 0.0, 0
+        for part, chosen in zip(means, kept, strict=True):
+            size = int(np.count_nonzero(chosen))
+            if size == 0:
+                continue
+            noise = covariance(len(part.times), part.spacing, ratio)
+            factor = cholesky(noise[np.ix_(chosen, chosen)], lower=True)
+            rows = design(part)[chosen].reshape(size, -1)
+            rows = solve_triangular(factor, rows, lower=True).reshape(3 * size, INVERSE)
+            values = solve_triangular(factor, part.seen[chosen], lower=True).ravel()
+            self.normal += rows.T @ rows
+            self.right += rows.T @ values
+            self.squared += float(values @ values)
+            self.log_determinant += 6.0 * float(np.sum(np.log(np.diag(factor))))
+            self.count += 3 * size
+
+    def left(self, found: Array) -> float:
+        """Sum of squares that a solution (11,) leaves."""
+        x = found[:INVERSE]
+        return float(self.squared - 2.0 * x @ self.right + x @ self.normal @ x)
+
+
+def design(part: Means) -> Array:
+    """Derivatives (n,3,10) of what images show by the unknowns."""
+    rows = np.zeros((len(part.times), 3, INVERSE))
+    rows[:, :, FORCE] = part.forces
+    rows[:, :, GRAVITY] = part.weights[:, None, None] * np.eye(3)
+    rows[:, :, BIAS] = -part.axes
+    rows[:, :, LEVER] = -part.arms
+    return rows
+
+
+def covariance(count: int, spacing: float, ratio: float) -> Array:
+    """Of means (n,n): white noise of positions (1), and of accelerations (``ratio``)."""
+    of_positions, of_accelerations = _noises(count, spacing)
+    return np.asarray(of_positions + ratio * of_accelerations)
+
+
+@lru_cache(maxsize=32)
+def _noises(count: int, spacing: float) -> tuple[Array, Array]:
+    """Covariances (n,n) of means by white noise of positions, and of accelerations."""
+    differences = np.zeros((count, count + 2))
+    for offset, factor in enumerate((1.0, -2.0, 1.0)):
+        differences[np.arange(count), np.arange(count) + offset] = factor / spacing**2
+    of_positions = differences @ _overlaps(DEGREE - 2, count + 2) @ differences.T
+    return of_positions / spacing, _overlaps(DEGREE, count) / spacing
+
+
+def _overlaps(degree: int, count: int) -> Array:
+    """Integrals (n,n) of the products of B-splines a spacing apart, by it: one of twice the degree
+    and one more.
+    """
+    order = 2 * degree + 1
+    knots = np.arange(order + 2) - 0.5 * (order + 1)
+    values = BSpline.basis_element(knots, extrapolate=False)(np.arange(count, dtype=float))
+    return np.asarray(toeplitz(np.nan_to_num(values)))
+
 
 # What is known beforehand (m/s^2): gravity by place, biases of consumer accelerometers; their
 # scale, by itself.
@@ -55,6 +243,8 @@ _EXACT, _NOTHING = 1e-12, 1e-30
 _RESTING = 7.0
 # So much of the accelerations that images show must be the accelerometer's.
 _LEAST_EXPLAINED = 0.5
+# Parts that would differ this much by chance once in a hundred recordings disagree.
+_CHANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,3 +422,20 @@ def _part(part: Means, kept: BoolArray, fit: _Fitted) -> tuple[float, float]:
     others = others - np.outer(across, across) / fit.covariance[INVERSE, INVERSE]
     variance = fit.variance / weight + float(slope @ others @ slope) / weight**2
     return float(whole @ alone.right) / weight, float(np.sqrt(variance))
+
+
+def excess(values: Array, deviations: Array) -> float:
+    """By how much the deviation of the weighted mean of values (b,) is too small, as they scatter
+    more than by their deviations (b,); 1 if that may be chance.
+
+    Blocks may be known very differently well; all are taken to differ by the same on top
+    (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 1986).
+    """
+    weights = deviations**-2.0
+    total, squares = float(np.sum(weights)), float(np.sum(weights**2))
+    mean = np.sum(weights * values) / total
+    squared, freedoms = float(np.sum(weights * (values - mean) ** 2)), len(values) - 1
+    if freedoms < 1 or chi2.sf(squared, freedoms) > _CHANCE:
+        return 1.0
+    own = max(squared - freedoms, 0.0) / (total - squares / total)
+    return math.sqrt(1.0 + own * squares / total)

@@ -11,7 +11,7 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples
 from rs_localizer.trajectory.lens import lens_values
-from rs_localizer.trajectory.prior_kernels import Accelerations
+from rs_localizer.trajectory.normal_kernels import Accelerations
 from rs_localizer.trajectory.spline import Spline
 
 

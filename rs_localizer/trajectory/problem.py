@@ -16,12 +16,16 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.banded import Factored, Undetermined
 from rs_localizer.trajectory.bodies import Pieces, paper_covariance
-from rs_localizer.trajectory.gyro_kernels import MOUNT
-from rs_localizer.trajectory.gyro_terms import GyroTerms
+from rs_localizer.trajectory.gyro_terms import MOUNT, GyroTerms
 from rs_localizer.trajectory.lens import lens_prior, project
 from rs_localizer.trajectory.model import Freedom, Observations, State
-from rs_localizer.trajectory.normal_kernels import Normal, accumulate
-from rs_localizer.trajectory.prior_kernels import add_accelerations, add_rest, eliminate_stamps
+from rs_localizer.trajectory.normal_kernels import (
+    Normal,
+    accumulate,
+    add_accelerations,
+    add_rest,
+    eliminate_stamps,
+)
 from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, look, squared_errors
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 

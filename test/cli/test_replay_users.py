@@ -16,7 +16,7 @@ from rs_localizer.cli.replay_result import Tally, figures, print_summary
 from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.recording import write_image
-from rs_localizer.trajectory.measured_readout import MeasuredReadout
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 FRAMES = 8
 SHUTTER = ["-p", "readout_time:=0.03"]

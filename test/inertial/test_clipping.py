@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.inertial.clipping import clipped_product
+from rs_localizer.inertial.filter import clipped_product
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 18])

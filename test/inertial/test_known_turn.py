@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 from rs_localizer.core.gyro_compensated import gyro_compensated
 from rs_localizer.core.known_turn import KnownTurn, late_at
 from rs_localizer.core.so3 import hat
-from rs_localizer.inertial.band import densified
+from rs_localizer.inertial.turning import densified
 
 TAU = np.linspace(-0.8, 0.8, 33)
 ROWS = np.linspace(-0.5, 0.5, 7)

@@ -12,8 +12,8 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
 from benchmarks.independent.scenes import Rich
 from benchmarks.inertial.recordings import record
+from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.settings import InertialSettings
-from rs_localizer.inertial.sight import sight_of
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import twist_at
 from rs_localizer.tracking import Tracker
@@ -79,9 +79,9 @@ def test_few_inliers_say_nothing():
     points, pixels = recorded.frames.seen(0, 0.3)
     camera = believed(recorded.frames.camera)
     found = Localizer(camera).localize(points, pixels)
-    assert sight_of(camera, points, pixels, found, 0) is not None
+    assert row_offset_likelihood(camera, points, pixels, found, 0) is not None
     few = replace(found, inliers=found.inliers & (np.arange(len(points)) < 8))
-    assert sight_of(camera, points, pixels, few, 0) is None
+    assert row_offset_likelihood(camera, points, pixels, few, 0) is None
 
 
 @pytest.mark.parametrize("shaking", [(), ((0.2, 60.0),)])

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY, gravity_seen
-from rs_localizer.inertial.mounting import fit_mounting
 from rs_localizer.inertial.samples import MARGIN, ImuSamples, needed
 from rs_localizer.inertial.turning import GyroscopeErrors
+from rs_localizer.inertial.watch import fit_mounting
 
 ERRORS = GyroscopeErrors(np.zeros(3), 0.0, 1e-8 * np.eye(4), 1e-4)
 TIMES = 10**12 + np.arange(400) * 2_500_000

@@ -8,13 +8,12 @@ from scipy.linalg import toeplitz
 from scipy.spatial.transform import Rotation
 from test_fit import as_dense, guess, make_camera, observe
 
-from rs_localizer.trajectory.accelerations import told
 from rs_localizer.trajectory.fit import fit
 from rs_localizer.trajectory.model import Freedom, start_state
-from rs_localizer.trajectory.normal_kernels import Normal
-from rs_localizer.trajectory.prior_kernels import add_accelerations
+from rs_localizer.trajectory.normal_kernels import Normal, add_accelerations
 from rs_localizer.trajectory.problem import Problem
 from rs_localizer.trajectory.sight_kernels import Curve
+from rs_localizer.trajectory.smoothing import told
 from rs_localizer.trajectory.spline import Layout, Spline
 
 SPACING, ANGULAR, LINEAR, FADING = 0.04, 3.0, 2.0, 0.1

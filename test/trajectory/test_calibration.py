@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import Calibration, calibrate
+from rs_localizer.trajectory.calibration import Calibration, calibrate, examine
 from rs_localizer.trajectory.first_lens import first_lens
 from rs_localizer.trajectory.lens import lens_difference
 from rs_localizer.trajectory.observe import Observed, in_order
-from rs_localizer.trajectory.stamps import examine
 
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)
 

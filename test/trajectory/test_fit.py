@@ -15,8 +15,7 @@ from rs_localizer.trajectory.fit import fit
 from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
 from rs_localizer.trajectory.normal_kernels import Normal
 from rs_localizer.trajectory.problem import Problem
-from rs_localizer.trajectory.spline import Layout, Spline
-from rs_localizer.trajectory.start import first_spline
+from rs_localizer.trajectory.spline import Layout, Spline, first_spline
 
 READOUT = 0.03
 

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.calibration import calibrate
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, NoMount, first_mount
-from rs_localizer.trajectory.gyro_kernels import MOUNT
-from rs_localizer.trajectory.gyro_terms import GyroTerms
+from rs_localizer.trajectory.gyro_terms import MOUNT, GyroTerms
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.model import State
 from rs_localizer.trajectory.observe import Observed

@@ -9,10 +9,17 @@ import pytest
 from felt import GRAVITY, Felt
 
 from rs_localizer.trajectory.gyro import GyroSamples, NoMount
-from rs_localizer.trajectory.mean_accelerations import ForceSamples, Means, mean_accelerations
-from rs_localizer.trajectory.metric import Lever, Metric, NoMetric, metric
-from rs_localizer.trajectory.metric_equations import covariance
-from rs_localizer.trajectory.mount_on_motion import mount_on_motion
+from rs_localizer.trajectory.imu_extrinsics import imu_extrinsics
+from rs_localizer.trajectory.metric import (
+    ForceSamples,
+    Lever,
+    Means,
+    Metric,
+    NoMetric,
+    covariance,
+    mean_accelerations,
+    metric,
+)
 from rs_localizer.trajectory.spline import Layout, Spline
 
 SECONDS = 12.0
@@ -179,7 +186,7 @@ def test_the_mount_is_found() -> None:
     stamps = felt.stamps(SECONDS)
     rates = felt.rates(stamps)
     rates[500] = 40.0  # a message that went wrong
-    found = mount_on_motion(GyroSamples(stamps, rates), felt.spline(SECONDS))
+    found = imu_extrinsics(GyroSamples(stamps, rates), felt.spline(SECONDS))
     assert found.mount.delay == pytest.approx(felt.delay, abs=2e-4)
     turned = felt.camera_from_imu.as_matrix().T @ found.mount.camera_from_imu
     assert np.linalg.norm(turned - np.eye(3)) < 2e-3
@@ -195,7 +202,7 @@ def test_a_motor_s_tone_does_not_draw_the_offset() -> None:
     pulse = 2.0 * np.pi * 9.5 / 0.15
     tone = np.radians(0.5) * pulse * np.cos(pulse * stamps)
     samples = GyroSamples(stamps, felt.rates(stamps) + np.outer(tone, [0.5, 0.7, 0.5]))
-    found = mount_on_motion(samples, felt.spline(SECONDS))
+    found = imu_extrinsics(samples, felt.spline(SECONDS))
     assert found.mount.delay == pytest.approx(felt.delay, abs=3e-4)
     assert abs(found.mount.delay - felt.delay) < 3.0 * found.delay_deviation
 
@@ -204,9 +211,9 @@ def test_another_ones_turns_are_no_mount() -> None:
     felt, other = Felt.random(4), Felt.random(5)
     stamps = felt.stamps(SECONDS)
     with pytest.raises(NoMount, match="are not the camera's"):
-        mount_on_motion(GyroSamples(stamps, other.rates(stamps)), felt.spline(SECONDS))
+        imu_extrinsics(GyroSamples(stamps, other.rates(stamps)), felt.spline(SECONDS))
     with pytest.raises(NoMount, match="0 samples"):
-        mount_on_motion(GyroSamples(np.zeros(0), np.zeros((0, 3))), felt.spline(SECONDS))
+        imu_extrinsics(GyroSamples(np.zeros(0), np.zeros((0, 3))), felt.spline(SECONDS))
 
 
 def test_gaps_are_left_out() -> None:

@@ -12,8 +12,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.types import Estimate
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
-from rs_localizer.trajectory.measured_readout import MeasuredReadout
-from rs_localizer.trajectory.online import ReadoutMonitor
+from rs_localizer.trajectory.online_readout import ReadoutMonitor
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 READOUT = 0.03
 CAMERA = Camera(width=projector.WIDTH, height=projector.HEIGHT, K=projector.K, D=projector.D)

@@ -16,7 +16,7 @@ from numba.core.dispatcher import Dispatcher
 from rs_localizer.core.camera import Camera
 from rs_localizer.localizer import Localizer
 from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.evidence import likelihood
+from rs_localizer.trajectory.calibration import likelihood
 from rs_localizer.trajectory.observe import Observed, localize_each
 from rs_localizer.trajectory.smoothing import smooth
 from rs_localizer.trajectory.warm_up import warm_up
@@ -42,7 +42,7 @@ for lens in ({"D": projector.D}, fisheye):
     posed = [pair for pair in zip(images, localize_each(camera, images)) if pair[1]]
     smoothed = smooth(camera, *map(list, zip(*posed)))
     smoothed.sample(np.array([image.stamp_ns for image in images]))
-assert any(module.endswith("gyro_kernels") for module, _, _ in before)
+assert any(module.endswith("gyro_terms") for module, _, _ in before)
 print(sorted(compiled() - before))
 """
 

@@ -26,7 +26,7 @@ from rs_localizer.ros.node.health import (
 )
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import WINDOW, Summary
-from rs_localizer.trajectory.measured_readout import MeasuredReadout
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 
 @dataclass(frozen=True, slots=True)

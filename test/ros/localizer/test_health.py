@@ -16,7 +16,7 @@ from rs_localizer.ros.node.health import Level
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import Statistics
-from rs_localizer.trajectory.measured_readout import MeasuredReadout
+from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 COMES = Silence("/camera_info", 0.1, heard=True, cause="", mismatch=False)
 FRAMES = replace(COMES, topic="/correspondences")

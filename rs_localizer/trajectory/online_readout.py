@@ -12,8 +12,9 @@ together, so that plain least squares would be biased, to anything at rest: the 
 is corrected by what the frames' covariances expect of the noise. The deviation comes from the
 scatter of the equation's own terms (a sandwich with Bartlett's weights), not from the covariances.
 
-Each frame counts with what its image alone says (:mod:`rs_localizer.trajectory.image_alone`): the
-estimate of a tracked frame believes in the readout time that the tracker was given.
+Each frame counts with what its image alone says
+(:mod:`rs_localizer.trajectory.single_image_likelihood`): the estimate of a tracked frame believes
+in the readout time that the tracker was given.
 """
 
 from __future__ import annotations
@@ -29,10 +30,17 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.types import Estimate
-from rs_localizer.trajectory.image_alone import image_alone
-from rs_localizer.trajectory.measured_readout import MeasuredReadout, Measurement
-from rs_localizer.trajectory.online_kernels import SIDE, Equations, View, equation, jumps
-from rs_localizer.trajectory.shutter_odds import ShutterOdds
+from rs_localizer.trajectory.readout_equations import (
+    SIDE,
+    Equations,
+    MeasuredReadout,
+    Measurement,
+    View,
+    equation,
+    jumps,
+)
+from rs_localizer.trajectory.shutter_hypotheses import ShutterHypotheses
+from rs_localizer.trajectory.single_image_likelihood import single_image_likelihood
 
 REVERSED = {
     ScanDirection.TOP_TO_BOTTOM: ScanDirection.BOTTOM_TO_TOP,
@@ -116,7 +124,7 @@ class ReadoutMonitor:
         self._views: deque[tuple[int, View]] = deque(maxlen=3)
         self._window = _Window()
         self._in_a_row = 0  # triples, each one frame after the other
-        self.odds = ShutterOdds()
+        self.odds = ShutterHypotheses()
 
     def reset(self) -> None:
         """Forget all frames: the camera, the map or the assumed direction has changed."""
@@ -148,7 +156,7 @@ class ReadoutMonitor:
             estimate.angular_velocity,
             estimate.linear_velocity,
         )
-        alone = image_alone(camera, steady, points[chosen], pixels[chosen])
+        alone = single_image_likelihood(camera, steady, points[chosen], pixels[chosen])
         if alone is None:
             self._views.clear()
             self._in_a_row = 0
@@ -201,10 +209,10 @@ def warm_up(camera: Camera) -> None:
     """Compile every kernel that frames of this camera may need, or load it from the cache."""
     pixels = np.random.default_rng(0).uniform(0.3, 0.7, (20, 2)) * camera.size
     points = np.column_stack([np.nan_to_num(camera.rays(pixels)), np.ones(len(pixels))])
-    image_alone(camera, Motion(np.eye(3), *np.zeros((3, 3))), points, pixels)
+    single_image_likelihood(camera, Motion(np.eye(3), *np.zeros((3, 3))), points, pixels)
     window, view = _Window(), View(np.eye(3), np.zeros(3), np.zeros(SIDE), np.eye(2 * SIDE))
     window.add(0, [view, view, view], 1.0, 1.0)
     jumps(view, view, view, 1.0, 1.0)
     Measurement(window.equations()).finish()
     window.add(1, [view, view, view], 1.0, 1.0)
-    ShutterOdds().add(window.newest(2), 1.0)
+    ShutterHypotheses().add(window.newest(2), 1.0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rs_localizer.trajectory.online_kernels import SIDE, Equations
-from rs_localizer.trajectory.shutter_odds import ShutterOdds
+from rs_localizer.trajectory.readout_equations import SIDE, Equations
+from rs_localizer.trajectory.shutter_hypotheses import ShutterHypotheses
 
 SET = 0.02
 NOISE = 1e-3
@@ -14,7 +14,7 @@ NOISE = 1e-3
 
 def odds(
     true: float, speed: float = 0.3, offset: float = 0.01, shaking: float = 0.0, count: int = 20
-) -> ShutterOdds:
+) -> ShutterHypotheses:
     """Of triples whose velocities are off by the same everywhere, by ten times the noise."""
     rng = np.random.default_rng(1)
     off = rng.normal(0.0, offset, SIDE)
@@ -23,7 +23,7 @@ def odds(
     y = true * x + off + (images[:-2] + 4.0 * images[1:-1] + images[2:]) / 6.0
     none = np.zeros((count, SIDE, SIDE))
     yy = np.broadcast_to(0.5 * NOISE**2 * np.eye(SIDE), none.shape)
-    found = ShutterOdds()
+    found = ShutterHypotheses()
     for k in range(2, count + 1):
         of = Equations(x, y, none, none, yy)
         found.add(Equations(*(np.ascontiguousarray(part[k - 2 : k]) for part in of)), SET)
@@ -47,7 +47,7 @@ def test_nor_of_one_that_is_nearer_to_the_setting_than_to_none(share: float) -> 
 
 def test_at_rest_nothing_is_known() -> None:
     assert abs(odds(0.0, speed=0.0).logarithm) < 1e-9
-    assert ShutterOdds().logarithm == 0.0
+    assert ShutterHypotheses().logarithm == 0.0
 
 
 def test_a_camera_that_shakes_within_its_frames_has_no_global_shutter() -> None:

@@ -10,8 +10,8 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.trajectory.image_alone import image_alone
-from rs_localizer.trajectory.online_kernels import SIDE, Equations, View, equation, score
+from rs_localizer.trajectory.readout_equations import SIDE, Equations, View, equation, score
+from rs_localizer.trajectory.single_image_likelihood import single_image_likelihood
 
 CAMERA = Camera(projector.WIDTH, projector.HEIGHT, projector.K, projector.D)
 
@@ -107,12 +107,14 @@ def test_an_image_alone_finds_its_motion_and_says_how_well(direction: str) -> No
     points, exact = points[shown], exact[shown]
     distances = []
     for _ in range(60):
-        found = image_alone(camera, true, points, exact + rng.normal(0.0, 0.3, exact.shape))
+        found = single_image_likelihood(
+            camera, true, points, exact + rng.normal(0.0, 0.3, exact.shape)
+        )
         assert found is not None
         step, spread = found
         distances.append(step @ np.linalg.solve(spread, step))
     # Chi-squared of 12 degrees of freedom, but that the noise is an estimate.
     assert np.mean(distances) == pytest.approx(12.0, rel=0.2)
-    step, _ = image_alone(camera, true, points, exact)
+    step, _ = single_image_likelihood(camera, true, points, exact)
     assert np.abs(step).max() < 1e-9
-    assert image_alone(camera, true, points[:12], exact[:12]) is None
+    assert single_image_likelihood(camera, true, points[:12], exact[:12]) is None

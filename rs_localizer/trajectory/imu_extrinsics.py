@@ -23,8 +23,7 @@ from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.rate_spline import rotations_at_knots
 from rs_localizer.core.rate_spline import spline as cubics_of
 from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, NoMount, first_mount
-from rs_localizer.trajectory.gyro_kernels import DELAY, MOUNT
-from rs_localizer.trajectory.gyro_terms import by_shape
+from rs_localizer.trajectory.gyro_terms import DELAY, MOUNT, by_shape
 from rs_localizer.trajectory.spline import Layout, Spline
 
 # Turns are taken over about so long (s): short beside the motion, long beside the images' noise.
@@ -48,7 +47,7 @@ _LEAST_PARTS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MountOnMotion:
+class ImuExtrinsics:
     """A mount beside a given motion."""
 
     mount: GyroMount
@@ -65,9 +64,9 @@ class MountOnMotion:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
 
-def mount_on_motion(
+def imu_extrinsics(
     samples: GyroSamples, spline: Spline, given: Array | None = None
-) -> MountOnMotion:
+) -> ImuExtrinsics:
     """The mount under which a gyroscope shows the turns of a motion.
 
     Args:
@@ -99,7 +98,7 @@ def mount_on_motion(
         mount = _moved(mount, -inverse @ (scores.sum(axis=0) + held @ _offset(start, mount)))
     sums = np.zeros((parts[-1] + 1, MOUNT))
     np.add.at(sums, parts, scores)
-    return MountOnMotion(mount, inverse @ (sums.T @ sums + variance * held) @ inverse)
+    return ImuExtrinsics(mount, inverse @ (sums.T @ sums + variance * held) @ inverse)
 
 
 def _calmed(samples: GyroSamples) -> GyroSamples:

@@ -3,10 +3,10 @@
 A measured readout time needs a scatter, and so a second and more of motion. Sooner told is which of
 three values fits: the one that is set, none, or the one that is set with the other sign. Errors of
 map and lens look like velocities many times as large as noise makes them, but alike in neighbouring
-frames: what changes from triple to triple (see :mod:`rs_localizer.trajectory.online`) is left to
-compare, and its own scatter is the measure. Of a global shutter nothing may be left beside noise: a
-shaken camera turns otherwise between its frames than within them, whatever its shutter. No triple
-counts for more than a few: a camera that is elsewhere all at once changes two of them.
+frames: what changes from triple to triple (see :mod:`rs_localizer.trajectory.online_readout`) is
+left to compare, and its own scatter is the measure. Of a global shutter nothing may be left beside
+noise: a shaken camera turns otherwise between its frames than within them, whatever its shutter. No
+triple counts for more than a few: a camera that is elsewhere all at once changes two of them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.estimation.refine import inverted
-from rs_localizer.trajectory.online_kernels import SIDE, Equations
+from rs_localizer.trajectory.readout_equations import SIDE, Equations
 
 # What a triple says fades by this from triple to triple.
 _MEMORY = 0.95
@@ -43,7 +43,7 @@ _WAY_NOISE = 2.0
 _NONE, _SET, _REVERSED, _APART = range(4)
 
 
-class ShutterOdds:
+class ShutterHypotheses:
     """Compares the newest triples with those before them."""
 
     def __init__(self) -> None:

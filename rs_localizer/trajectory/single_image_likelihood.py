@@ -22,7 +22,7 @@ _PARAMETERS = 12
 _HELD = np.repeat([0.0, 0.0, 0.05**-2, 0.05**-2], 3)
 
 
-def image_alone(
+def single_image_likelihood(
     camera: Camera, motion: Motion, points: Array, pixels: Array
 ) -> tuple[Array, Array] | None:
     """The step (12,) from a motion to what the image says, and its covariance (12,12).

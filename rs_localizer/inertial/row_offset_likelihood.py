@@ -26,7 +26,7 @@ _TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class RowOffsetLikelihood:
     """The errors of n points of a frame about its motion, and what they depend on."""
 
     middle_ns: int
@@ -41,9 +41,9 @@ class Sight:
     turned: Array  # (n,3,3) turns from the middle row to each, that the motion supposes
 
 
-def sight_of(
+def row_offset_likelihood(
     camera: Camera, points: ArrayLike, pixels: ArrayLike, found: Estimate, middle_ns: int
-) -> Sight | None:
+) -> RowOffsetLikelihood | None:
     """What inliers of a frame say; None where they are too few.
 
     Args:
@@ -78,7 +78,7 @@ def sight_of(
     turned = own.at_rows(tau)[0]
     if found.turn is not None:
         turned = found.turn.at_rows(tau)[0] @ turned
-    return Sight(
+    return RowOffsetLikelihood(
         middle_ns,
         found.rotation,
         float(np.sqrt(np.sum(back**2) / 3.0)),
