@@ -53,14 +53,14 @@ def main(arguments: list[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     room = Room(read_tum(data.path(data.HAND_MOTION)), CAMERA, SENSOR, _KEYPOINTS)
-    with _bar("look", len(room.stamps(_WALK))) as step:
-        views = room.look(_WALK, lambda: step(1))
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as images, TemporaryDirectory() as folder:
+        with _bar("look", len(room.stamps(_WALK))) as step:
+            views = room.look(_WALK, Path(images), lambda: step(1))
         built = room.build(views, Path(folder), _bar)
     for name, text in rows(built, len(views), len(views)):
         sys.stdout.write(f"{name:32} {text}\n")
     write_npz(options.out / "map.npz", built.landmarks)
-    save_pictures(built, views, options.out)
+    save_pictures(built, options.out)
     ours, theirs = built.landmarks, without_refinement(built)
     kept = True
     for name, piece in _FLIGHTS.items():

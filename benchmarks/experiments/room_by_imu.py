@@ -28,10 +28,10 @@ from rs_localizer.evaluation.room_mapping import Piece, Room
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Given, Workshop, build_map
+from rs_localizer.mapping.colmap import Effort
+from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.refine import RefinedMap
-from rs_localizer.mapping.similarity import through
-from rs_localizer.mapping.structure import Effort
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.simulation.imu import ImuSettings, Lever, simulate_imu
 from rs_localizer.simulation.marker_frames import CAMERA, SENSOR
@@ -133,11 +133,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _mapped(room: Room, start: float) -> RefinedMap:
     piece = Piece(start, _SECONDS, _RATE)
-    with tqdm(total=len(room.stamps(piece)), desc="look", disable=None) as bar:
-        views = room.look(piece, lambda: bar.update(1), markers=False)
-    with TemporaryDirectory() as folder, tqdm(desc="map", disable=None) as bar:
-        work = Workshop(Path(folder), Effort(), lambda name, total: nullcontext(bar.update))
-        return build_map(Given(views, room.camera, Anchors()), work).refined
+    with TemporaryDirectory() as images, TemporaryDirectory() as folder:
+        with tqdm(total=len(room.stamps(piece)), desc="look", disable=None) as bar:
+            views = room.look(piece, Path(images), lambda: bar.update(1), markers=False)
+        with tqdm(desc="map", disable=None) as bar:
+            work = Workshop(Path(folder), Effort(), lambda name, total: nullcontext(bar.update))
+            given = Given(views, room.camera, Anchors(), room.camera.readout_time)
+            return build_map(given, work).refined
 
 
 if __name__ == "__main__":

@@ -16,12 +16,10 @@ from benchmarks.mapping.rooms import (
     walls,
 )
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.mapping.adjustment import MapProblem
-from rs_localizer.mapping.placing import laid_down
-from rs_localizer.mapping.preparation import Preparation
-from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.sightings import Sightings, Start
-from rs_localizer.mapping.similarity import through
+from rs_localizer.mapping.adjustment import MapProblem, apply_similarity
+from rs_localizer.mapping.gauge import through
+from rs_localizer.mapping.observations import MapObservations, Start
+from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine
 from rs_localizer.trajectory.model import Freedom, start_state
 
 _NOISE, _OFF = 0.3, 0.02  # px, m
@@ -95,7 +93,7 @@ def bound(seed: int, trials: int = 20) -> Iterator[str]:
     )
 
 
-def _least(seen: Sightings, found: RefinedMap, freedom: MapFreedom) -> Array:
+def _least(seen: MapObservations, found: RefinedMap, freedom: MapFreedom) -> Array:
     """Covariances (p,3,3) of an estimator that loses nothing, at errors of zero."""
     start = Start(found.points, *found.poses())
     prepared = Preparation(found.camera, seen, start, freedom, 0.0)
@@ -109,7 +107,9 @@ def _least(seen: Sightings, found: RefinedMap, freedom: MapFreedom) -> Array:
     errors = [sights.errors for sights in problem.motion.look(state)[1]]
     fitting = replace(observed, pixels=observed.pixels + np.concatenate(errors))
     problem = MapProblem(found.camera, fitting, state, free, prepared.deviations, False)
-    return laid_down(problem, state, _NOISE, np.ones(len(found.points), np.bool_)).covariances
+    return apply_similarity(
+        problem, state, _NOISE, np.ones(len(found.points), np.bool_)
+    ).covariances
 
 
 def large(seed: int) -> Iterator[str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.mapping.rooms import Film, Walk, estimators_camera
 from rs_localizer.core.arrays import Array
-from rs_localizer.mapping.spotting import Spotted, Spotter, every_marker
+from rs_localizer.mapping.unknown_markers import Spotted, Spotter, every_marker
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.families import Family, family
 from rs_localizer.simulation.planes import TexturedPlane

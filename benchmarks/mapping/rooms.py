@@ -10,8 +10,8 @@ import numpy as np
 from benchmarks.independent import cameras
 from benchmarks.independent.rotations import Array, exponential
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.sightings import Sightings, Start
-from rs_localizer.mapping.spotting import Spotted
+from rs_localizer.mapping.observations import MapObservations, Start
+from rs_localizer.mapping.unknown_markers import Spotted
 
 _HALF = 2.5  # m, of the room
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
@@ -73,7 +73,7 @@ class Film:
 
     def see(
         self, points: Array, noise: float, rng: np.random.Generator, most: int = 700
-    ) -> Sightings:
+    ) -> MapObservations:
         """Keypoints of points (p,3), so many of an image at most."""
         images, landmarks, pixels = [], [], []
         for g, shown in enumerate(self._shown(points)):
@@ -81,7 +81,7 @@ class Film:
             images.append(np.full(len(found), g))
             landmarks.append(found)
             pixels.append(shown[found] + rng.normal(0.0, noise, (len(found), 2)))
-        return Sightings(
+        return MapObservations(
             10**12 + np.round(1e9 * self.stamps).astype(np.int64),
             np.concatenate(images),
             np.concatenate(landmarks),

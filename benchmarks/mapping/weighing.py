@@ -11,9 +11,9 @@ from benchmarks.independent.cameras import Camera
 from benchmarks.independent.rotations import exponential, logarithm
 from benchmarks.mapping.rooms import Film, Walk, a_walk, estimators_camera, walls
 from rs_localizer.core.arrays import Array
+from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import inertial_metres
 from rs_localizer.mapping.refine import refine
-from rs_localizer.mapping.similarity import through
 from rs_localizer.trajectory.imu import ImuRecording
 
 _NOISE, _OFF, _READOUT = 0.3, 0.02, 0.03  # px, m, s

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import make_camera_info
 from rs_localizer.io.topics import KEYPOINTS
 from rs_localizer.io.trajectories import Trajectory, Twists, read_tum
-from rs_localizer.mapping.structure import Effort, require
+from rs_localizer.mapping.colmap import Effort, require
 from rs_localizer.process.missing import explain
 from rs_localizer.simulation.frames import middle_stamp
 from rs_localizer.simulation.renderer import ImageSettings
@@ -61,11 +62,12 @@ class RoomScene:
     def __init__(self, directory: Path) -> None:
         self.map_file, self.global_map_file = directory / "room.npz", directory / "global.npz"
         self._room = Room(read_tum(data.path(data.HAND_MOTION)), _CAMERA, _SENSOR, _KEYPOINTS)
-        with _bar("Walking through a room", len(self._room.stamps(_WALK))) as step:
-            views = self._room.look(_WALK, lambda: step(1))
         folder = directory / "colmap"
         folder.mkdir()
-        built = self._room.build(views, folder, _bar, _EFFORT)
+        with TemporaryDirectory() as images:
+            with _bar("Walking through a room", len(self._room.stamps(_WALK))) as step:
+                views = self._room.look(_WALK, Path(images), lambda: step(1))
+            built = self._room.build(views, folder, _bar, _EFFORT)
         self._landmarks = built.landmarks
         write_npz(self.map_file, built.landmarks)
         write_npz(self.global_map_file, without_refinement(built))

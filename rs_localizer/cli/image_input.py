@@ -142,13 +142,16 @@ class Source:
 
 
 @contextlib.contextmanager
-def opened(args: argparse.Namespace, path: Path, start: float | None = None) -> Iterator[Source]:
+def opened(
+    args: argparse.Namespace, path: Path, start: float | None = None, calibrated: bool = True
+) -> Iterator[Source]:
     """Images with the lens of ``args.calibration`` or, of a bag, its camera_info.
 
     Args:
         args: with ``rate``, and the topics ``image`` and ``camera_info`` of a bag.
         path: of the images.
         start: time of the first one, s; not of a bag.
+        calibrated: refuse images without a calibration.
 
     Raises:
         UsageError: for options that do not go with it, or that are missing.
@@ -157,24 +160,26 @@ def opened(args: argparse.Namespace, path: Path, start: float | None = None) -> 
         for name in ("image", "camera_info"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is a topic of a bag")
-        if args.calibration is None:
+        if args.calibration is None and calibrated:
             raise UsageError("a video or folder has no camera_info: give --calibration")
-        clock = clock_of(path, args.rate, start)
-        yield of_files(path, read_calibration(args.calibration), clock)
+        camera = None if args.calibration is None else read_calibration(args.calibration)
+        yield of_files(path, camera, clock_of(path, args.rate, start))
         return
     for name, value in (("rate", args.rate), ("start", start)):
         if value is not None:
             raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
     with open_bag(path) as bag:
         given = None if args.calibration is None else read_calibration(args.calibration)
-        yield of_bag(bag, given, args)
+        yield of_bag(bag, given, args, calibrated)
 
 
-def of_bag(bag: BagReader, camera: Camera | None, args: argparse.Namespace) -> Source:
+def of_bag(
+    bag: BagReader, camera: Camera | None, args: argparse.Namespace, calibrated: bool = True
+) -> Source:
     """The images of a bag; without a camera, with that of its camera_info."""
     topic = find_topic(bag, IMAGE_TYPES, args.image, "--image")
     info = None
-    if camera is None:
+    if camera is None and (calibrated or INFO_TYPE in bag.topics.values()):
         info = find_topic(bag, (INFO_TYPE,), args.camera_info, "--camera-info")
     return Source(from_bag(bag, topic, info, camera), bag.count([topic]), None)
 
@@ -193,7 +198,7 @@ def clock_of(path: Path, rate: float | None, start: float | None = None) -> Imag
     return ImageClock(rate, None if start is None else round(start * 1e9))
 
 
-def of_files(path: Path, camera: Camera, clock: ImageClock) -> Source:
+def of_files(path: Path, camera: Camera | None, clock: ImageClock) -> Source:
     """The images of a video or folder."""
     if not path.is_dir():
         return Source(from_video(path, camera, clock), None, clock)

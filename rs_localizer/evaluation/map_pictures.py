@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.mapping.build import Built
-from rs_localizer.mapping.views import View
 
 _DPI = 110
 _BINS = 40
@@ -26,7 +25,7 @@ _RIM = 0.15
 _GAZE = 0.03
 
 
-def save_pictures(built: Built, views: Sequence[View], directory: Path) -> None:
+def save_pictures(built: Built, directory: Path) -> None:
     """Write ``map.png`` and ``residuals.png`` into a directory."""
     figure = Figure(figsize=(11.0, 5.5), dpi=_DPI, layout=ConstrainedLayoutEngine(h_pad=_RIM))
     left, right = figure.subplots(1, 2)
@@ -34,7 +33,7 @@ def save_pictures(built: Built, views: Sequence[View], directory: Path) -> None:
         _scene(axes, built, pair, title)
     figure.savefig(directory / "map.png")
     figure = Figure(figsize=(7.0, 4.0), dpi=_DPI, layout="constrained")
-    _residuals(figure.subplots(), built, views)
+    _residuals(figure.subplots(), built)
     figure.savefig(directory / "residuals.png")
 
 
@@ -63,8 +62,8 @@ def _scene(axes: Axes, built: Built, pair: tuple[int, int], title: str) -> None:
     axes.legend(frameon=False, loc="upper right", markerscale=3.0)
 
 
-def _residuals(axes: Axes, built: Built, views: Sequence[View]) -> None:
-    before = _global_errors(built, views)
+def _residuals(axes: Axes, built: Built) -> None:
+    before = _global_errors(built)
     after = np.sqrt(built.refined.squared_errors[np.isfinite(built.refined.squared_errors)])
     most = float(np.percentile(before, 98.0))
     edges = np.linspace(0.0, most, _BINS)
@@ -79,21 +78,13 @@ def _residuals(axes: Axes, built: Built, views: Sequence[View]) -> None:
     axes.legend(frameon=False)
 
 
-def _global_errors(built: Built, views: Sequence[View]) -> Array:
+def _global_errors(built: Built) -> Array:
     """Reprojection errors (n,) px of the structure that COLMAP found."""
     structure = built.structure
     at = np.searchsorted(structure.views, structure.seen_views)
     offset = structure.points[structure.seen_points] - structure.positions[at]
     local = np.einsum("nji,nj->ni", structure.rotations[at], offset)
-    pixels = np.array(
-        [
-            views[view].features.pixels[feature]
-            for view, feature in zip(
-                structure.seen_views.tolist(), structure.seen_features.tolist(), strict=True
-            )
-        ]
-    )
-    errors: Array = np.linalg.norm(built.camera.project(local) - pixels, axis=1)
+    errors: Array = np.linalg.norm(structure.camera.project(local) - structure.pixels, axis=1)
     return errors[np.isfinite(errors)]
 
 

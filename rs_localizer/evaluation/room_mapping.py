@@ -22,8 +22,8 @@ from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
 from rs_localizer.io.trajectories import Trajectory
 from rs_localizer.mapping.anchors import Anchors
 from rs_localizer.mapping.build import Built, Given, Workshop, build_map
-from rs_localizer.mapping.similarity import through
-from rs_localizer.mapping.structure import Effort, Stage
+from rs_localizer.mapping.colmap import Effort, Stage
+from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.views import Looker, View
 from rs_localizer.pipeline.features import FrameExtractor, keypoints
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -88,10 +88,16 @@ class Room:
         return in_order(render, self.stamps(piece))
 
     def look(
-        self, piece: Piece, done: Callable[[], object] = lambda: None, markers: bool = True
+        self,
+        piece: Piece,
+        images: Path,
+        done: Callable[[], object] = lambda: None,
+        markers: bool = True,
     ) -> list[View]:
-        """The views of a piece, with the markers or without looking for them."""
-        looker = Looker(self._most, self.marker_map if markers else None)
+        """The views of a piece, with the markers or without looking for them; their images go to a
+        folder.
+        """
+        looker = Looker(self._most, images, self.marker_map if markers else None)
         views = []
         for image in self.images(piece):
             views.append(looker.look(image))
@@ -106,8 +112,11 @@ class Room:
         effort: Effort | None = None,
     ) -> Built:
         """The map, with its metres from the markers."""
-        observations = Given(views, self.camera, Anchors(self.marker_map))
-        return build_map(observations, Workshop(folder, effort or Effort(), stage or _silent))
+        given = Given(
+            views, self.camera, Anchors(self.marker_map), self.camera.readout_time,
+            self.camera.scan_direction,
+        )  # fmt: skip
+        return build_map(given, Workshop(folder, effort or Effort(), stage or _silent))
 
     def clouds(self, piece: Piece, done: Callable[[], object] = lambda: None) -> list[Any]:
         """The keypoints of a piece, as the node ``feature_detector`` sends them."""

@@ -153,6 +153,30 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     )
 
 
+def colmap_parameters(camera: Camera) -> dict[str, Any]:
+    """``model`` and ``params`` that COLMAP knows a camera's delivered images by.
+
+    Raises:
+        ValueError: for coefficients that no model of COLMAP has.
+    """
+    distortion = str(camera.distortion_model)
+    order, D = _ORDER[distortion], camera.D.tolist()
+    if len(D) > len(order):
+        raise ValueError(
+            f"COLMAP knows {len(order)} coefficients of {distortion}, the lens has {len(D)}"
+        )
+    offset = np.zeros(2) if camera.roi is None else (camera.roi.x_offset, camera.roi.y_offset)
+    binning = np.array(camera.binning, float)
+    fx, fy = (np.diag(camera.K)[:2] / binning).tolist()
+    cx, cy = ((camera.K[:2, 2] - offset) / binning + _HALF).tolist()
+    values = dict(zip(order, D, strict=False)) | {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    model = {"equidistant": "OPENCV_FISHEYE", "plumb_bob": "OPENCV"}.get(distortion, "FULL_OPENCV")
+    if model == "OPENCV" and values.get("k3"):
+        model = "FULL_OPENCV"
+    names = _COLMAP_MODELS[model][0].split()
+    return {"model": model, "params": [values.get(name, 0.0) for name in names]}
+
+
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "K", "mtx")
 _DISTORTION = (
     *("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs"),

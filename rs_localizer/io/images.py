@@ -26,6 +26,7 @@ class _Encoding:
     kind: str  # NumPy's code of a channel, without byte order
     to_gray: int = -1  # OpenCV's conversion
     luma: int | None = None  # the channel that is gray already
+    planes: float = 1.0  # bytes of the whole image, in those of its first plane
 
 
 def _encodings() -> dict[str, _Encoding]:
@@ -39,6 +40,11 @@ def _encodings() -> dict[str, _Encoding]:
         # Two bytes per pixel, of which one is the brightness.
         **dict.fromkeys(("yuv422", "uyvy"), _Encoding(2, "u1", luma=1)),
         **dict.fromkeys(("yuv422_yuy2", "yuyv"), _Encoding(2, "u1", luma=0)),
+        # Planes, as of libcamera's drivers: the brightness comes first.
+        **dict.fromkeys(
+            ("nv12", "nv21", "yuv420", "i420", "yv12"), _Encoding(1, "u1", luma=0, planes=1.5)
+        ),
+        "nv24": _Encoding(1, "u1", luma=0, planes=3.0),
     }
     for bits, kind in ((8, "u1"), (16, "u2")):
         table[f"bgr{bits}"] = _Encoding(3, kind, cv2.COLOR_BGR2GRAY)
@@ -113,6 +119,8 @@ def read_image(message: Any) -> Image:
     if step < row:
         raise MessageError(f"step is {step}, too small for {width} pixels of {name}: {row} bytes")
     expected = (height - 1) * step + row
+    if encoding.planes > 1.0:
+        expected = max(expected, int(encoding.planes * height * width))
     if len(message.data) < expected:
         raise MessageError(
             f"the data are truncated: {width} x {height} pixels of {name} take {expected} bytes, "

@@ -1,1 +1,5 @@
 """Maps from images: landmarks and markers refined together with the motion that saw them."""
+
+
+class MappingError(ValueError):
+    """Images that make no map; the message says why and what would help."""

@@ -1,6 +1,7 @@
 """What gives a map its scale and its place: markers of known places, points a known distance apart.
 
-Both are seen in images beside the landmarks, and triangulated with the refined motion.
+Both are seen in images beside the landmarks, and triangulated with the refined motion. Markers also
+take part in the adjustment, where they hold frame, size and shape of the map.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.mapping.errors import MappingError
-from rs_localizer.mapping.similarity import Similarity, through, upright
-from rs_localizer.mapping.triangulation import Triangulated
+from rs_localizer.core.camera import Camera
+from rs_localizer.mapping import MappingError
+from rs_localizer.mapping.gauge import Similarity, through, upright
+from rs_localizer.mapping.observations import MapFreedom, MapObservations, Start
+from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
 from rs_localizer.mapping.views import View
 from rs_localizer.markers.maps import MarkerMap
 
@@ -72,7 +75,7 @@ class Anchors:
     def seen(self, views: Sequence[View]) -> tuple[IntArray, IntArray, Array]:
         """Views (n,), anchors (n,) and pixels (n,2) of all sights."""
         rows, anchors, pixels = [], [], []
-        for row, view in enumerate(views):
+        for row, view in enumerate(views if self.corners else ()):
             for corner, pixel in zip(view.corner_ids.tolist(), view.corners, strict=True):
                 rows.append(row)
                 anchors.append(corner)
@@ -187,3 +190,50 @@ def _down(rotations: Array) -> Array:
     down = rotations[:, :, 1].mean(axis=0)
     axis: Array = vectors[:, 0]
     return axis if axis @ down >= 0.0 else -axis
+
+
+# How well corners are where their map says (m): prints are measured to within this.
+_DEVIATION = 0.001
+# Observations that determine a corner.
+_LEAST_OBSERVATIONS = 3
+
+
+def marker_constraints(
+    camera: Camera,
+    seen: MapObservations,
+    start: Start,
+    corners: MapObservations,
+    places: Array,
+) -> tuple[MapObservations, Start, MapFreedom]:
+    """What is adjusted with the corners of markers, in their frame; without, if too few are seen.
+
+    Args:
+        seen, start: of the landmarks.
+        corners: of the same images; their landmarks are rows of ``places``.
+        places: (c,3) m, of the corners.
+    """
+    at = corners.images
+    rough = Sights(start.rotations[at], start.positions[at], corners.pixels, corners.landmarks)
+    found = triangulate(camera, rough, len(places))
+    known = np.isfinite(found.points).all(axis=1) & (found.counts >= _LEAST_OBSERVATIONS)
+    if np.count_nonzero(known) < _LEAST_CORNERS:
+        return seen, start, MapFreedom()
+    to_markers = through(found.points[known], places[known])
+    kept = known[corners.landmarks]
+    count = len(start.points)
+    images = np.concatenate([seen.images, at[kept]])
+    order: IntArray = np.argsort(images, kind="stable")
+    return (
+        MapObservations(
+            seen.stamps_ns,
+            images[order],
+            np.concatenate([seen.landmarks, count + corners.landmarks[kept]])[order],
+            np.concatenate([seen.pixels, corners.pixels[kept]])[order],
+        ),
+        Start(
+            np.concatenate([to_markers(start.points), places]),
+            to_markers.rotation @ start.rotations,
+            to_markers(start.positions),
+        ),
+        MapFreedom(deviations=np.repeat([np.inf, _DEVIATION], [count, len(places)])),
+    )

@@ -1,42 +1,46 @@
-"""A map from views: structure, motion, refinement with the rolling shutter, metres.
+"""A map from views: COLMAP's structure, the rolling shutter, metres.
 
-1. Keyframes are matched and mapped by COLMAP, with a global shutter.
-2. Every view is localized on that map, with its shutter: what it shows, and a first motion.
-3. Motion and the most useful landmarks are adjusted together, each keypoint at its row's time.
+1. COLMAP extracts, matches and maps the keyframes, with a global shutter; without a calibration it
+   finds the lens as well.
+2. The views between them are localized on that map.
+3. Motion and the most useful landmarks are adjusted together, each keypoint at its row's time. A
+   readout time that nobody knows is estimated along both axes of the image, and believed where it
+   explains the images better than a global shutter.
 4. All landmarks are triangulated with that motion, and so is what gives the map its metres.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.maps.colmap import medoid
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.mapping.anchors import Anchors, Placement, placement
-from rs_localizer.mapping.errors import MappingError
-from rs_localizer.mapping.following import follow
-from rs_localizer.mapping.inertial_placing import (
+from rs_localizer.mapping import MappingError
+from rs_localizer.mapping.anchors import Anchors, Placement, marker_constraints, placement
+from rs_localizer.mapping.colmap import Effort, Stage, Structure, build_structure
+from rs_localizer.mapping.gauge import Similarity, scaled
+from rs_localizer.mapping.inertial_metres import (
     GivenImu,
     InertialPlace,
     place_by_imu,
     refuse_early,
 )
-from rs_localizer.mapping.keyframes import Keyframes, choose_keyframes
+from rs_localizer.mapping.initial_trajectory import usual_accelerations
+from rs_localizer.mapping.observations import MapObservations, Start, most_observed
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.sightings import Sightings
-from rs_localizer.mapping.sights import Seen, all_seen, for_adjustment
-from rs_localizer.mapping.similarity import Similarity, scaled
-from rs_localizer.mapping.structure import Effort, Stage, Structure, build_structure
-from rs_localizer.mapping.tied import tied
+from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
+from rs_localizer.mapping.track_on_map import Tracked, track_on_map
 from rs_localizer.mapping.triangulation import Sights, Triangulated, triangulate
-from rs_localizer.mapping.views import View
+from rs_localizer.mapping.views import View, blurred
 
 # Settings of the localizer are in metres: so far (m) is the median landmark taken to be from where
 # it is seen, until it is known how far it is.
@@ -44,12 +48,21 @@ _USUAL_DISTANCE = 2.5
 # A view with fewer features is blurred, dark, or of a blank wall.
 _FEW_FEATURES = 50
 _LEAST_VIEWS = 3
+# Pictures in which features move by less than this share of their size (median) show no depth.
+_LEAST_PARALLAX = 0.01
+# COLMAP gets all views of a short recording and so many a second of a long one: at a turn of 60
+# degrees a second, neighbours have three quarters of a picture of 60 degrees in common.
+_KEYFRAMES, _KEYFRAMES_PER_SECOND = 60, 4.0
 # Share of the keypoints that fit a good map: nine in ten do.
 _LEAST_FIT = 0.8
 # Share of the keyframes that must hang together.
 _LEAST_PART = 0.5
 # A landmark counts when so many views agree, and it is known to this part of its usual distance.
 _LEAST_SIGHTS, _MOST_DEVIATION = 3, 0.03
+# How well COLMAP's lens is known: focal length and centre by focal length (of one phone's video 21
+# images give 384.2 px, 42 give 383.2), distortion. Under a steady motion a focal length along the
+# scan stands for a shutter: looser ones leave the two to chance.
+_LENS = 0.005, 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,9 +70,10 @@ class Given:
     """What a map is built from."""
 
     views: Sequence[View]  # in the order of their stamps
-    camera: Camera  # of all of them, with its readout time (0: a global shutter, or not known)
+    camera: Camera | None  # its lens; None: COLMAP finds it
     anchors: Anchors
-    estimate_readout: bool = False
+    readout_time: float | None = None  # s, 0: a global shutter; None: estimated
+    scan_direction: str | None = None  # None: unknown
     frame: str = "map"
     imu: GivenImu | None = None
 
@@ -89,19 +103,15 @@ class Motion:
         """map_from_camera (g,3,3), (g,3) at the middle rows, in the refinement's frame."""
         return self.refined.poses()
 
-    def sights(self, seen: Seen) -> Sights:
-        """Keypoints with the pose at the time of their rows."""
-        camera = self.refined.camera
-        readout_time = self.refined.readout_time
-        times = self.times[seen.images] + readout_time * camera.row_time(seen.pixels)
-        states = self.refined.spline.states(times)
-        return Sights(states.rotations, states.positions, seen.pixels, seen.landmarks)
-
-    def seen(self, views: IntArray, landmarks: IntArray, pixels: Array) -> Seen:
-        """What those of the views (n,) show that have a pose."""
+    def sights(self, views: IntArray, landmarks: IntArray, pixels: Array) -> Sights:
+        """Keypoints (n,) of those views that have a pose, with that at the time of their rows."""
         place = np.minimum(np.searchsorted(self.rows, views), len(self.rows) - 1)
         known = self.rows[place] == views
-        return Seen(place[known], landmarks[known], pixels[known])
+        at, pixels = place[known], pixels[known]
+        camera = self.refined.camera
+        times = self.times[at] + self.refined.readout_time * camera.row_time(pixels)
+        states = self.refined.spline.states(times)
+        return Sights(states.rotations, states.positions, pixels, landmarks[known])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,11 +119,13 @@ class Built:
     """A map and how it came about; all in the map's frame, in metres if it is scaled."""
 
     landmarks: Map
-    camera: Camera  # with its readout time and scan direction, as they were found
+    camera: Camera  # with its lens, readout time and scan direction, as they were found
     place: InertialPlace
-    keyframes: Keyframes
+    keyframes: IntArray  # rows of the views that COLMAP got
+    blurred: BoolArray  # of the views
     structure: Structure  # as COLMAP had it, moved into this frame as a whole
     kept: IntArray  # (l,) rows of the structure's points that are landmarks
+    shutter: ShutterFit | None  # None: it was given
     refined: RefinedMap  # in a frame of its own
     posed: IntArray  # (g,) rows of the views with a pose
     rotations: Array  # (g,3,3) map_from_camera at their middle rows
@@ -139,115 +151,176 @@ def build_map(given: Given, work: Workshop) -> Built:
     """Build a map.
 
     Raises:
-        ImportError: without pycolmap.
         ValueError: when the images make no map, saying what was found.
     """
-    keyframes = _keyframes(given)
+    check_views(given.views)
     if given.imu is not None and not given.anchors.tell_scale:
         refuse_early(given.imu, given.stamps_ns)
+    unsharp = blurred(given.views)
+    keyframes = choose_keyframes(given.stamps_ns, given.views)
     structure = _structure(given, keyframes, work)
-    descriptors = _descriptors(given.views, structure)
-    first = Map(structure.points, None, descriptors, given.frame)
-    with work.stage("follow", len(given.views)) as step:
-        followed = follow(given.views, first, given.camera, lambda: step(1))
-    if len(followed.views) < _LEAST_VIEWS:
-        raise MappingError(
-            f"{len(followed.views)} of {len(given.views)} images could be localized on the first "
-            "map: it is wrong, as repeated texture or a wrong calibration make it"
-        )
-    seen = all_seen(given.views, structure, followed)
-    sightings, start, used = for_adjustment(
-        given.stamps_ns, followed, seen, structure.points, work.effort.adjusted
+    camera = replace(
+        structure.camera,
+        readout_time=given.readout_time or 0.0,
+        scan_direction=given.scan_direction or likely_axes(structure.camera.size)[0],
     )
-    freedom = MapFreedom()
-    if given.anchors.marker_map is not None:
-        corners = _corners(given, sightings.stamps_ns)
-        places = given.anchors.marker_map.points
-        sightings, start, freedom = tied(given.camera, sightings, start, corners, places)
-    with work.stage("refine", 3) as step:
-        freedom = replace(freedom, readout_time=given.estimate_readout)
-        refined = refine(given.camera, sightings, start, freedom, done=lambda _: step(1))
+    with work.stage("track", len(given.views)) as step:
+        tracked = track_on_map(given.views, structure, camera, lambda: step(1))
+    refined, shutter, rows = _refined(given, tracked, structure, camera, work)
     _check_fit(refined)
-    motion = Motion(followed.views[used], refined.times, refined)
-    shown = motion.seen(followed.views[seen.images], seen.landmarks, seen.pixels)
-    found = triangulate(refined.camera, motion.sights(shown), len(structure.points))
-    by_all = place_by_imu(_placement(given, motion), refined, given.imu)
-    similarity = by_all.placement.similarity
-    kept = _kept(found, motion)
-    landmarks = _landmarks(found, kept, descriptors, similarity, given.frame)
+    motion = Motion(rows, refined.times, refined)
+    shown = motion.sights(tracked.views[tracked.images], tracked.points, tracked.pixels)
+    triangulated = triangulate(refined.camera, shown, len(structure.points))
+    place = place_by_imu(_placement(given, motion), refined, given.imu)
+    similarity = place.placement.similarity
+    kept = _kept(triangulated, motion)
     rotations, positions = motion.poses()
     return Built(
-        landmarks=landmarks,
+        landmarks=_landmarks(
+            triangulated, kept, structure.descriptors, similarity, given.frame
+        ),
         camera=refined.camera_as_found,
-        place=by_all,
+        place=place,
         keyframes=keyframes,
+        blurred=unsharp,
         structure=structure.moved(similarity),
         kept=kept,
+        shutter=shutter,
         refined=refined,
         posed=motion.rows,
         rotations=similarity.rotation @ rotations,
         positions=similarity(positions),
         deviation=refined.deviation,
-    )
+    )  # fmt: skip
 
 
-def _keyframes(given: Given) -> Keyframes:
-    views = given.views
+def check_views(views: Sequence[View]) -> None:
+    """Refuse, before minutes of work, views that will make no map.
+
+    Raises:
+        MappingError: saying what was found and what to film instead.
+    """
     if len(views) < _LEAST_VIEWS:
         raise MappingError(f"{len(views)} images make no map; at least {_LEAST_VIEWS} are needed")
+    check_features(views)
+    first, step = views[0], max(1, len(views) // 8)
+    moved = [_moved(first, view) for view in views[step::step]]
+    if all(share < _LEAST_PARALLAX for share in moved):
+        raise MappingError(
+            f"the camera hardly moves (features by {100.0 * max(moved):.1f} % of the picture's "
+            "size): walk sideways and around what is to be mapped"
+        )
+
+
+def check_features(views: Sequence[View]) -> None:
+    """Refuse views that show too little.
+
+    Raises:
+        MappingError: saying what was found.
+    """
     features = float(np.median([len(view.features) for view in views]))
     if features < _FEW_FEATURES:
         raise MappingError(
             f"the images show {features:.0f} features each (median), at least {_FEW_FEATURES} are "
             "needed: are they blurred, dark, or of blank walls?"
         )
-    motions = np.array([view.motion for view in views])
-    sharpness = np.array([view.sharpness for view in views])
-    return choose_keyframes(motions, sharpness, given.camera.size)
 
 
-def _structure(given: Given, keyframes: Keyframes, work: Workshop) -> Structure:
-    """The first structure, of about the right size."""
-    found = build_structure(
-        given.views, keyframes.chosen, given.camera, work.folder, work.effort, work.stage
+def _moved(one: View, other: View) -> float:
+    """How far features move (median), by the size of the picture; infinite: they are others."""
+    if min(len(one.features), len(other.features)) < _FEW_FEATURES:
+        return math.inf
+    matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)
+    matches = matcher.match(
+        one.features.descriptors.astype(np.float32), other.features.descriptors.astype(np.float32)
     )
-    total = len(keyframes.chosen)
-    if found.parts[0] < max(_LEAST_VIEWS, _LEAST_PART * total):
-        listed = ", ".join(map(str, found.parts))
+    here = one.features.pixels[[match.queryIdx for match in matches]]
+    there = other.features.pixels[[match.trainIdx for match in matches]]
+    if len(matches) < _FEW_FEATURES:
+        return math.inf
+    size = np.ptp(np.vstack([here, there]), axis=0).max()
+    return float(np.median(np.linalg.norm(there - here, axis=1)) / size)
+
+
+def choose_keyframes(stamps_ns: IntArray, views: Sequence[View]) -> IntArray:
+    """Rows (k,) of the views that COLMAP gets: evenly spaced, the sharpest of each few."""
+    seconds = 1e-9 * float(stamps_ns[-1] - stamps_ns[0])
+    count = max(_KEYFRAMES, math.ceil(_KEYFRAMES_PER_SECOND * seconds))
+    slots = np.array_split(np.arange(len(views)), min(count, len(views)))
+    return np.array([max(slot, key=lambda row: views[row].sharpness) for slot in slots], np.int64)
+
+
+def _structure(given: Given, keyframes: IntArray, work: Workshop) -> Structure:
+    """The first structure, of about the right size."""
+    structure = build_structure(
+        given.views[0].image.parent, keyframes, given.camera, work.folder, work.effort, work.stage
+    )
+    total = len(keyframes)
+    if structure.parts[0] < max(_LEAST_VIEWS, _LEAST_PART * total):
+        listed = " and ".join(map(str, structure.parts))
         raise MappingError(
-            f"the {total} keyframes fall apart: {listed} of them hang together, and nothing joins "
-            "these parts; record what lies between them, slowly, without blank walls"
+            f"reconstruction is disconnected (components of {listed} keyframes, of {total}): "
+            "record what lies between them, slowly, without blank walls"
         )
-    places = found.positions[np.searchsorted(found.views, found.seen_views)]
-    away = np.linalg.norm(found.points[found.seen_points] - places, axis=1)
-    factor = _USUAL_DISTANCE / float(np.median(away))
-    return found.moved(scaled(factor))
+    places = structure.positions[np.searchsorted(structure.views, structure.seen_views)]
+    depths = np.linalg.norm(structure.points[structure.seen_points] - places, axis=1)
+    return structure.moved(scaled(_USUAL_DISTANCE / float(np.median(depths))))
 
 
-def _descriptors(views: Sequence[View], structure: Structure) -> np.ndarray:
-    """Of each point the medoid (p,d) of its features' descriptors."""
-    order = np.argsort(structure.seen_points, kind="stable")
-    ends = np.cumsum(np.bincount(structure.seen_points, minlength=len(structure.points)))
-    all_rows = np.stack(
-        [
-            views[view].features.descriptors[feature]
-            for view, feature in zip(
-                structure.seen_views[order].tolist(),
-                structure.seen_features[order].tolist(),
-                strict=True,
-            )
-        ]
-    ).astype(np.float32)
-    return np.stack([rows[medoid(rows)] for rows in np.split(all_rows, ends[:-1])])
+def _refined(
+    given: Given, tracked: Tracked, structure: Structure, camera: Camera, work: Workshop
+) -> tuple[RefinedMap, ShutterFit | None, IntArray]:
+    """The refined map, what is found of an unknown shutter, and the rows of its views."""
+    chosen = np.zeros(len(structure.points), np.bool_)
+    wanted = most_observed(tracked.points, tracked.images, work.effort.adjusted)
+    chosen[: len(wanted)] = wanted
+    of = chosen[tracked.points]
+    used, images = np.unique(tracked.images[of], return_inverse=True)
+    rows = tracked.views[used]
+    observations = MapObservations(
+        given.stamps_ns[rows], images, tracked.points[of], tracked.pixels[of]
+    )
+    start = Start(structure.points, tracked.rotations[used], tracked.positions[used])
+    freedom = MapFreedom()
+    # A time lapse, whose stamps are closer than its images were, moves faster than any hand.
+    angular, linear = usual_accelerations(
+        1e-9 * (observations.stamps_ns - observations.stamps_ns[0]), start.rotations,
+        start.positions,
+    )  # fmt: skip
+    if given.anchors.marker_map is not None:
+        corners = _corners(given, observations.stamps_ns)
+        places = given.anchors.marker_map.points
+        observations, start, freedom = marker_constraints(
+            camera, observations, start, corners, places
+        )
+    freedom = replace(
+        freedom,
+        lens=given.camera is None,
+        lens_deviations=_LENS,
+        angular_acceleration=max(freedom.angular_acceleration, angular),
+        linear_acceleration=max(freedom.linear_acceleration, linear),
+    )
+    directions = [ScanDirection(camera.scan_direction)]
+    if given.scan_direction is None:
+        directions = likely_axes(camera.size)
+    unknown = given.readout_time is None
+    with work.stage("refine", 3 * (1 + len(directions)) if unknown else 3) as step:
+
+        def done(_: str) -> None:
+            step(1)
+
+        if not unknown:
+            return refine(camera, observations, start, freedom, done=done), None, rows
+        return *fit_shutter(camera, observations, start, freedom, directions, done), rows
 
 
-def _corners(given: Given, stamps_ns: IntArray) -> Sightings:
+def _corners(given: Given, stamps_ns: IntArray) -> MapObservations:
     """Corners of markers in the images with these stamps."""
     views, corners, pixels = given.anchors.seen(given.views)
     stamps = given.stamps_ns[views]
     images = np.minimum(np.searchsorted(stamps_ns, stamps), len(stamps_ns) - 1)
     known = stamps_ns[images] == stamps
-    return Sightings(stamps_ns, images[known], corners[known], pixels[known])
+    return MapObservations(stamps_ns, images[known], corners[known], pixels[known])
 
 
 def _check_fit(refined: RefinedMap) -> None:
@@ -262,18 +335,18 @@ def _check_fit(refined: RefinedMap) -> None:
 
 
 def _placement(given: Given, motion: Motion) -> Placement:
-    seen = motion.seen(*given.anchors.seen(given.views))
-    camera = motion.refined.camera
-    found = triangulate(camera, motion.sights(seen), given.anchors.count)
-    return placement(given.anchors, found, *motion.poses())
+    shown = motion.sights(*given.anchors.seen(given.views))
+    triangulated = triangulate(motion.refined.camera, shown, given.anchors.count)
+    return placement(given.anchors, triangulated, *motion.poses())
 
 
-def _kept(found: Triangulated, motion: Motion) -> IntArray:
+def _kept(triangulated: Triangulated, motion: Motion) -> IntArray:
     """Rows of the points that are good enough to be landmarks."""
     _, positions = motion.poses()
-    away = np.linalg.norm(found.points - np.median(positions, axis=0), axis=1)
-    spread = np.sqrt(np.trace(found.covariances, axis1=1, axis2=2))
-    good = (found.counts >= _LEAST_SIGHTS) & (spread < _MOST_DEVIATION * np.nanmedian(away))
+    away = np.linalg.norm(triangulated.points - np.median(positions, axis=0), axis=1)
+    spread = np.sqrt(np.trace(triangulated.covariances, axis1=1, axis2=2))
+    good = triangulated.counts >= _LEAST_SIGHTS
+    good &= spread < _MOST_DEVIATION * np.nanmedian(away)
     if not good.any():
         raise MappingError(
             f"none of {len(good)} landmarks is seen by {_LEAST_SIGHTS} images that determine it"
@@ -282,13 +355,14 @@ def _kept(found: Triangulated, motion: Motion) -> IntArray:
 
 
 def _landmarks(
-    found: Triangulated, kept: IntArray, descriptors: np.ndarray, to_map: Similarity, frame: str
-) -> Map:
+    triangulated: Triangulated, kept: IntArray, descriptors: np.ndarray, to_map: Similarity,
+    frame: str,
+) -> Map:  # fmt: skip
     turn = to_map.scale * to_map.rotation
     return Map(
-        to_map(found.points[kept]),
+        to_map(triangulated.points[kept]),
         np.arange(len(kept)),
         np.ascontiguousarray(descriptors[kept]),
         frame,
-        covariances=turn @ found.covariances[kept] @ turn.T,
+        covariances=turn @ triangulated.covariances[kept] @ turn.T,
     )

@@ -15,24 +15,133 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.mapping.adjustment import MapProblem, sights_of
-from rs_localizer.mapping.alike import Pull, pull_at_landmarks
-from rs_localizer.mapping.asked_readout import AskedReadout, asked_readout
-from rs_localizer.mapping.first_motion import ANGULAR_VELOCITY, LINEAR_VELOCITY, calm
-from rs_localizer.mapping.placing import laid_down
-from rs_localizer.mapping.preparation import Preparation
-from rs_localizer.mapping.sightings import MapFreedom, Sightings, Start, check
+from rs_localizer.mapping.adjustment import MapProblem, apply_similarity, sights_of
+from rs_localizer.mapping.cluster_robust import Pull, pull_at_landmarks
+from rs_localizer.mapping.initial_trajectory import (
+    ANGULAR_VELOCITY,
+    LINEAR_VELOCITY,
+    acceleration_prior,
+    initial_trajectory,
+)
+from rs_localizer.mapping.observations import (
+    LEAST_KEYPOINTS,
+    MapFreedom,
+    MapObservations,
+    Start,
+    check,
+    shared_landmarks,
+)
+from rs_localizer.mapping.readout_check import ReadoutCheck, readout_check
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.descent import settle
 from rs_localizer.trajectory.fit import inflation_of, left_over, steepness
 from rs_localizer.trajectory.lens import with_lens
-from rs_localizer.trajectory.model import Freedom, start_state
+from rs_localizer.trajectory.model import Freedom, Observations, start_state
 from rs_localizer.trajectory.online_readout import REVERSED
 from rs_localizer.trajectory.problem import LIMIT, Problem
-from rs_localizer.trajectory.spline import Spline
+from rs_localizer.trajectory.spline import LONGEST_GAP, Spline
 from rs_localizer.trajectory.spline_kernels import CONTROL
 
-__all__ = ["MapFreedom", "RefinedMap", "Sightings", "Start", "refine"]
+# Beyond so many unknowns of the motion its matrix takes more than 2 GB.
+_MOST_UNKNOWNS = 15000
+# Landmarks are held to where they were by the map's size, which says nothing, but for those that
+# hardly any image sees.
+_LOOSE = 1.0
+# So many landmarks of known place hold the map's frame and size.
+_LEAST_ANCHORS = 3
+# Images in a row that may tell the readout time.
+_LEAST_STRETCH = 20
+
+
+class Preparation:
+    """The keypoints that count, and the first motion."""
+
+    def __init__(
+        self, camera: Camera, seen: MapObservations, start: Start, freedom: MapFreedom,
+        stamp_offset: float,
+    ) -> None:  # fmt: skip
+        self.camera, self.seen, self.start, self.freedom = camera, seen, start, freedom
+        self.start_ns = int(seen.stamps_ns[0])
+        delay = stamp_offset - camera.readout_time * camera.first_row_time
+        self.times = np.asarray(1e-9 * (seen.stamps_ns - self.start_ns) + delay, np.float64)
+        self.size = float(np.linalg.norm(np.ptp(start.points, axis=0)))
+        self.deviations, self.floating = self._known()
+        self.used = self._usable()
+        self.spline = self._spline()
+        if freedom.readout_time:
+            self._check_stretches()
+        held = CONTROL * len(self.spline.positions)
+        if held > _MOST_UNKNOWNS:
+            raise ValueError(
+                f"{len(self.times)} images have {held} unknowns of motion, at most "
+                f"{_MOST_UNKNOWNS} can be refined at once: leave images out"
+            )
+
+    def _known(self) -> tuple[Array, bool]:
+        """Deviations (p,) of the landmarks, m, and whether nothing holds the whole."""
+        given = self.freedom.deviations
+        if given is None:
+            given = np.full(len(self.start.points), np.inf)
+        anchors = np.count_nonzero(np.isfinite(given))
+        if 0 < anchors < _LEAST_ANCHORS:
+            raise ValueError(
+                f"{anchors} landmarks of known place do not hold a map: none, or at least "
+                f"{_LEAST_ANCHORS}, can be given"
+            )
+        return np.minimum(given, _LOOSE * self.size), anchors == 0
+
+    def _usable(self) -> BoolArray:
+        """Keypoints (n,) that say something of map or motion."""
+        shared = np.zeros(len(self.start.points), np.bool_)
+        found = shared_landmarks(self.seen)
+        shared[: len(found)] = found
+        if self.freedom.deviations is not None:
+            shared |= np.isfinite(self.freedom.deviations)
+        used = shared[self.seen.landmarks]
+        counts = np.bincount(self.seen.images[used], minlength=len(self.times))
+        return used & (counts >= LEAST_KEYPOINTS)[self.seen.images]
+
+    def _spline(self) -> Spline:
+        """Through the images with keypoints: stretches where they follow each other."""
+        own = np.unique(self.seen.images[self.used])
+        return initial_trajectory(
+            self.times[own], self.start.rotations[own], self.start.positions[own],
+            self.camera.readout_time,
+        )  # fmt: skip
+
+    def _check_stretches(self) -> None:
+        """Raise ValueError when the readout time cannot be found."""
+        if not self.tells_readout:
+            raise ValueError(
+                f"the readout time is found from at least {_LEAST_STRETCH} images that follow each "
+                f"other within {LONGEST_GAP} s, found {self._longest()}: give it, or more "
+                "of the recording"
+            )
+
+    @property
+    def tells_readout(self) -> bool:
+        """Images on their own tell turn and way per readout only, and not how long it takes."""
+        return self._longest() >= _LEAST_STRETCH
+
+    def _longest(self) -> int:
+        """Images in the longest stretch."""
+        own = self.times[np.unique(self.seen.images[self.used])]
+        return int(np.bincount(self.spline.layout.stretches(own)).max())
+
+    def observations(self) -> Observations:
+        images, pixels = self.seen.images[self.used], self.seen.pixels[self.used]
+        return Observations(
+            times=self.times[images],
+            row_times=self.camera.row_time(pixels),
+            pixels=pixels,
+            landmarks=self.start.points,
+            points=self.seen.landmarks[self.used],
+            frames=images,
+            trusted=np.ones(len(images), np.bool_),
+        )
+
+
+__all__ = ["MapFreedom", "MapObservations", "RefinedMap", "Start", "refine"]
 
 # A landmark that is not known to this part of the map's size is not refined.
 _KNOWN = 0.1
@@ -52,7 +161,7 @@ class RefinedMap:
     camera: Camera  # with the readout time and the lens that were found
     readout_time: float  # s; negative: against the scan direction
     readout_time_deviation: float  # s; NaN where it was given
-    asked_readout: AskedReadout | None  # of a given one; None: the images do not tell, or found
+    readout_check: ReadoutCheck | None  # of a given one; None: the images do not tell, or found
     deviation: float  # px, of the noise of u and of v
     squared_errors: Array  # (n,) px^2, whitened; infinite for keypoints that took no part
     inliers: BoolArray  # (n,)
@@ -61,6 +170,7 @@ class RefinedMap:
     spline: Spline  # s since ``start_ns``
     start_ns: int
     times: Array  # (g,) s, of the images' middle rows
+    tells_readout: bool  # images follow each other closely enough to tell the readout time
 
     @property
     def camera_as_found(self) -> Camera:
@@ -78,7 +188,7 @@ class RefinedMap:
 
 def refine(
     camera: Camera,
-    seen: Sightings,
+    seen: MapObservations,
     start: Start,
     freedom: MapFreedom | None = None,
     *,
@@ -121,6 +231,7 @@ class _Refinement:
         self.freedom = Freedom(
             readout_time=given.readout_time,
             lens=given.lens,
+            lens_deviations=given.lens_deviations,
             angular_acceleration=given.angular_acceleration,
             linear_acceleration=given.linear_acceleration,
             angular_velocity=ANGULAR_VELOCITY,
@@ -136,7 +247,7 @@ class _Refinement:
         problem = self._problem(self.freedom)
         self.state, deviation = settle(problem, self.state, before)
         done("map")
-        calmer = calm(self.state, self.freedom)
+        calmer = acceleration_prior(self.state, self.freedom)
         if calmer is not None:
             self.freedom, problem = calmer, self._problem(calmer)
             self.state, deviation = settle(problem, self.state, deviation)
@@ -156,8 +267,8 @@ class _Refinement:
         sights, images = sights_of(seen, inliers)
         used = _freedoms(state.spline, seen.frames) + 3 * int(np.count_nonzero(images))
         inflation = inflation_of(squared[inliers], deviation, used + problem.motion.border)
-        inflation = self._with_alike_errors(problem, deviation, inflation)
-        placed = laid_down(problem, state, deviation, images > 1)
+        inflation = self._cluster_robust(problem, deviation, inflation)
+        placed = apply_similarity(problem, state, deviation, images > 1)
         covariances = inflation * placed.covariances
         spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         refined = (images > 1) & (spread < _KNOWN * prepared.size)
@@ -175,7 +286,7 @@ class _Refinement:
             camera=with_lens(replace(self.camera, readout_time=abs(readout_time)), state.lens),
             readout_time=readout_time,
             readout_time_deviation=math.sqrt(inflation * placed.shared[0, 0]) if free else math.nan,
-            asked_readout=self._asked(deviation, inflation),
+            readout_check=self._asked(deviation, inflation),
             deviation=deviation * math.sqrt(left_over(len(inliers), used)),
             squared_errors=all_squared,
             inliers=all_squared < (LIMIT * deviation) ** 2,
@@ -184,11 +295,10 @@ class _Refinement:
             spline=placed.spline,
             start_ns=prepared.start_ns,
             times=prepared.times,
+            tells_readout=prepared.tells_readout,
         )
 
-    def _with_alike_errors(
-        self, problem: MapProblem, deviation: float, independent: float
-    ) -> float:
+    def _cluster_robust(self, problem: MapProblem, deviation: float, independent: float) -> float:
         """The covariances' inflation, with what errors of a second pull together."""
         rows, seen = problem.normal(self.state, deviation)[1].rows, self.observations
         squared = problem.errors(self.state)
@@ -198,14 +308,14 @@ class _Refinement:
         own *= left_over(len(inside), _freedoms(self.state.spline, seen.frames))
         return Pull(own * pull.found, pull.expected).inflation(independent)
 
-    def _asked(self, deviation: float, inflation: float) -> AskedReadout | None:
+    def _asked(self, deviation: float, inflation: float) -> ReadoutCheck | None:
         """Whether a readout time that was given is the one of the images."""
         given = self.camera.readout_time > 0.0 and not self.freedom.readout_time
         if not given or not self.prepared.tells_readout:
             return None
         free = self._problem(replace(self.freedom, readout_time=True))
         try:
-            asked = asked_readout(free, self.state, deviation)
+            asked = readout_check(free, self.state, deviation)
         except Undetermined:
             return None
         return replace(asked, deviation=math.sqrt(inflation) * asked.deviation)

@@ -1,6 +1,11 @@
 """Where markers are, from one recording that shows them: continuous-time adjustment with the poses
 of the markers free, each a rigid square of known size. The first marker is the origin; whatever
 shows several of them closes loops.
+
+A square that is seen from one side fits two poses. From few directions the wrong one is a minimum,
+too, which no adjustment leaves (Collins and Bartoli, *Infinitesimal plane-based pose estimation*,
+IJCV 2014). With the motion held, each marker is mirrored about its mean line of sight, adjusted on
+its own, and compared.
 """
 
 from __future__ import annotations
@@ -13,25 +18,112 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.alike import with_alike_errors
-from rs_localizer.mapping.asked_readout import AskedReadout
-from rs_localizer.mapping.chaining import Chained, chain
-from rs_localizer.mapping.first_motion import (
+from rs_localizer.mapping.cluster_robust import cluster_robust
+from rs_localizer.mapping.gauge import of_the_shape, through
+from rs_localizer.mapping.initial_trajectory import (
     ANGULAR_VELOCITY,
     LINEAR_VELOCITY,
-    calm,
-    first_motion,
+    acceleration_prior,
+    initial_trajectory,
 )
-from rs_localizer.mapping.free_network import of_the_shape
-from rs_localizer.mapping.mirrored import mirrored
-from rs_localizer.mapping.spotting import Spotted
+from rs_localizer.mapping.readout_check import ReadoutCheck
+from rs_localizer.mapping.unknown_markers import Chained, Spotted, chain
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.trajectory.banded import Undetermined
 from rs_localizer.trajectory.bodies import BODY, PLACE
 from rs_localizer.trajectory.fit import Fit, fit
-from rs_localizer.trajectory.model import Freedom, Observations, start_state
-from rs_localizer.trajectory.problem import Problem
+from rs_localizer.trajectory.model import Freedom, Observations, State, start_state
+from rs_localizer.trajectory.normal_kernels import Normal
+from rs_localizer.trajectory.problem import LIMIT, Problem
+
+# Steps of Gauss and Newton, and the noise of each by what it is.
+_NOISES = (10.0,) * 6 + (1.0,) * 4
+# Of the cost of independent errors: the other pose is e^6 times less likely, or it may be true.
+_LEAST_DIFFERENCE = 12.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mirrored:
+    """What is known of the other pose of each marker."""
+
+    better: BoolArray  # (m,) which fit better mirrored
+    doubtful: BoolArray  # (m,) which fit nearly as well, one way or the other
+    state: State  # with those mirrored that fit better so
+
+
+def mirrored(camera: Camera, seen: Observations, found: Fit) -> Mirrored:
+    """Compare each marker with its mirror image, the motion held.
+
+    Args:
+        seen: corners, four of each marker; those of the first, the origin, are known.
+        found: the adjustment of these.
+    """
+    count = len(found.state.landmarks) // 4
+    # The origin, too, may lie the other way among all others.
+    free = replace(seen, bodies=np.repeat(np.arange(count), 4))
+    problem = Problem(camera, free, found.state, replace(found.freedom, readout_time=False))
+    other = replace(found.state, landmarks=_turned_over(seen, found.state))
+    for noise in _NOISES:
+        normal = problem.normal(other, noise * found.deviation)[1]
+        still = np.zeros(len(normal.slope))
+        other = problem.moved(other, normal, (still, _steps(normal, count)))
+    own, theirs = (_costs(problem, state, found.deviation) for state in (found.state, other))
+    better = theirs < own
+    doubtful = np.abs(theirs - own) < _LEAST_DIFFERENCE * found.inflation
+    # What came back is the same pose.
+    apart = _normals(other) * _normals(found.state)
+    same = np.sum(apart, axis=1) > np.cos(0.02)
+    chosen = np.where(np.repeat(better & ~same, 4)[:, None], other.landmarks, found.state.landmarks)
+    return Mirrored(better & ~same, doubtful & ~same, _at_the_origin(found.state, chosen))
+
+
+def _turned_over(seen: Observations, state: State) -> Array:
+    """Corners (p,3) of each marker mirrored in depth as its images see it."""
+    layout, corners = state.spline.layout, state.landmarks.reshape(-1, 4, 3)
+    times = np.clip(seen.times, layout.starts.min(), layout.ends.max())
+    markers, middles = seen.points // 4, corners.mean(axis=1)
+    toward: Array = state.spline.states(times).positions - middles[markers]
+    toward /= np.linalg.norm(toward, axis=1)[:, None]
+    sums = [np.bincount(markers, of, len(corners)) for of in toward.T]
+    sight: Array = np.column_stack(sums)
+    sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
+    depth = np.einsum("mci,mi->mc", corners - middles[:, None], sight)
+    return np.asarray(corners - 2.0 * depth[..., None] * sight[:, None]).reshape(-1, 3)
+
+
+def _steps(normal: Normal, count: int) -> Array:
+    """Of all markers (6 m,), each on its own."""
+    at = BODY * np.arange(count)[:, None] + np.arange(BODY)
+    lower = np.tril(normal.corner[at[:, :, None], at[:, None, :]])
+    blocks = lower + np.tril(lower, -1).swapaxes(1, 2)
+    steps: Array = -np.linalg.solve(blocks, normal.border_slope[at][..., None]).ravel()
+    return steps
+
+
+def _costs(problem: Problem, state: State, deviation: float) -> Array:
+    """Of the corners of each marker (m,), Tukey's."""
+    limit = (LIMIT * deviation) ** 2
+    rest = np.maximum(1.0 - problem.errors(state) / limit, 0.0)
+    costs = (1.0 - rest**3) * limit / (3.0 * deviation**2)
+    points = problem.observations.points
+    return np.asarray(np.bincount(points // 4, costs, len(state.landmarks) // 4), np.float64)
+
+
+def _normals(state: State) -> Array:
+    """Of the markers (m,3)."""
+    corners = state.landmarks.reshape(-1, 4, 3)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+    return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
+
+
+def _at_the_origin(state: State, landmarks: Array) -> State:
+    """With these landmarks (p,3), and all moved so that the first four stay where they were."""
+    back = through(landmarks[:4], state.landmarks[:4])
+    moved = back(landmarks)
+    moved[:4] = state.landmarks[:4]
+    return replace(state, spline=back.moved(state.spline), landmarks=moved)
+
 
 _LEAST_IMAGES = 5
 # Images that show a marker: fewer say hardly anything of it.
@@ -63,7 +155,7 @@ class Survey:
     rare: tuple[Marker, ...]
     images: int  # with a pose
     fit: Fit
-    asked_readout: AskedReadout | None = None  # where it was given
+    readout_check: ReadoutCheck | None = None  # where it was given
 
     @property
     def deviations(self) -> Array:
@@ -129,7 +221,7 @@ def _adjusted(
     seen, times = _observations(camera, images, markers, chained, own, stamp_offset)
     rotations = np.array([pose.rotation for pose in chained.poses])
     positions = np.array([pose.translation for pose in chained.poses])
-    spline = first_motion(times[chained.images], rotations, positions, camera.readout_time)
+    spline = initial_trajectory(times[chained.images], rotations, positions, camera.readout_time)
     seen = seen.subset(spline.layout.inside(seen.times))
     freedom = Freedom(
         readout_time=not camera.readout_time > 0.0,
@@ -141,7 +233,7 @@ def _adjusted(
     # Where a chain ends far off, its errors are large and no outliers.
     errors = np.sqrt(Problem(camera, seen, start, freedom).errors(start))
     found = fit(camera, seen, start, freedom, float(np.clip(np.median(errors), *_FIRST_NOISE)))
-    calmer = calm(found.state, freedom)
+    calmer = acceleration_prior(found.state, freedom)
     if calmer is not None:
         found = fit(camera, seen, found.state, calmer, found.deviation)
     found, doubtful = _right_side_up(camera, seen, found)
@@ -197,7 +289,7 @@ def _less_noise(camera: Camera, seen: Observations, found: Fit) -> Fit:
 
 def _believable(camera: Camera, seen: Observations, found: Fit) -> Fit:
     """With covariances as large as the corners' errors show."""
-    return with_alike_errors(Problem(camera, seen, found.state, found.freedom), found)
+    return cluster_robust(Problem(camera, seen, found.state, found.freedom), found)
 
 
 def _covariance(found: Fit, order: list[int]) -> Array:
@@ -228,14 +320,14 @@ def _check_places(found: Survey) -> None:
         )
 
 
-def _asked(camera: Camera, seen: Observations, found: Fit) -> AskedReadout:
+def _asked(camera: Camera, seen: Observations, found: Fit) -> ReadoutCheck:
     """The readout time that the corners ask for where one was given."""
     free = fit(
         camera, seen, found.state, replace(found.freedom, readout_time=True), found.deviation
     )
     free = _believable(camera, seen, free)
     given = float(found.state.readout_time)
-    return AskedReadout(given, float(free.state.readout_time), free.readout_time_deviation)
+    return ReadoutCheck(given, float(free.state.readout_time), free.readout_time_deviation)
 
 
 def _often(images: list[Spotted], chained: Chained) -> list[int]:

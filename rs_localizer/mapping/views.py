@@ -1,78 +1,38 @@
-"""Images as the mapping needs them: what is left of each one when its pixels have been let go."""
+"""Images as the mapping needs them: what is kept of each one when its pixels have been let go."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from rs_localizer.config import FeatureKind
-from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.features.extraction import FeatureExtractor, Features
 from rs_localizer.io.images import Gray, Image
+from rs_localizer.mapping.colmap import image_name
 from rs_localizer.markers.detection import MarkerDetector
 from rs_localizer.markers.maps import MarkerMap
 
-# Corners that are followed from image to image, their least distance (px) and quality; an image
-# this wide (px) shows enough of them.
-_CORNERS, _DISTANCE, _QUALITY = 200, 12, 0.01
-_WIDTH = 320
-# Followed forth and back, a corner comes back to itself within this (px).
-_ROUND_TRIP = 1.0
-# Fewer corners than this determine no motion.
-_LEAST_CORNERS = 12
+# JPEG's quality of what COLMAP gets: at this one, errors are below a grey level.
+_QUALITY = 97
+# A view this much less sharp than those around it (so many each way) is blurred.
+_BLURRED, _AROUND = 0.6, 15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What an image shows, and how it follows from the one before."""
+    """What an image shows."""
 
     stamp_ns: int
+    image: Path  # its picture, by colmap.image_name
     features: Features
     sharpness: float  # the higher the sharper; comparable between views of the same scene
-    motion: Array  # (3,3) pixels here from those of the view before; NaN: nothing was followed
     corners: Array  # (m,2) raw, of the markers
     corner_ids: IntArray  # (m,) rows of the marker map's points
-
-
-class Follower:
-    """Follows corners from image to image (pyramidal Lucas-Kanade): how pictures move."""
-
-    def __init__(self) -> None:
-        self._last: Gray | None = None
-
-    def follow(self, image: Gray) -> Array:
-        """Motion (3,3) of the picture (a similarity) since the last image, in its own pixels."""
-        scale = min(1.0, _WIDTH / image.shape[1])
-        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        before, self._last = self._last, np.asarray(small, np.uint8)
-        if before is None:
-            return np.eye(3)
-        found = _similarity(before, self._last)
-        # A pixel's centre lies at scale (u + 1/2) - 1/2 in the small image.
-        to_small = np.diag([scale, scale, 1.0])
-        to_small[:2, 2] = 0.5 * scale - 0.5
-        motion: Array = np.linalg.inv(to_small) @ found @ to_small
-        return motion
-
-
-def _similarity(before: Gray, after: Gray) -> Array:
-    lost = np.full((3, 3), np.nan)
-    corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _DISTANCE)
-    if corners is None or len(corners) < _LEAST_CORNERS:
-        return lost
-    # The last argument is filled: without a flag it is no start of the search.
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.empty_like(corners))
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(corners))
-    near = np.linalg.norm(back - corners, axis=2)[:, 0] < _ROUND_TRIP
-    good = near & (found[:, 0] > 0) & (returned[:, 0] > 0)
-    if np.count_nonzero(good) < _LEAST_CORNERS:
-        return lost
-    similarity, inliers = cv2.estimateAffinePartial2D(corners[good], there[good])
-    if similarity is None or np.count_nonzero(inliers) < _LEAST_CORNERS:
-        return lost
-    return np.vstack([similarity, [0.0, 0.0, 1.0]])
 
 
 def sharpness(image: Gray) -> float:
@@ -81,29 +41,37 @@ def sharpness(image: Gray) -> float:
 
 
 class Looker:
-    """Looks at the images of a recording, in their order.
+    """Looks at the images of a recording, in their order, and writes them down for COLMAP.
 
     Args:
         most: features of an image.
+        images: folder to write to.
         marker_map: markers to look for, too.
     """
 
-    def __init__(self, most: int, marker_map: MarkerMap | None = None) -> None:
+    def __init__(self, most: int, images: Path, marker_map: MarkerMap | None = None) -> None:
         self._extractor = FeatureExtractor(FeatureKind.SIFT, most)
-        self._follower = Follower()
+        self._images, self._count = images, 0
         self._detector = None if marker_map is None else MarkerDetector(marker_map)
 
     def look(self, image: Image) -> View:
         """What is needed of an image."""
+        path = self._images / image_name(self._count)
+        self._count += 1
+        quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+        # Not cv2.imwrite, which says nothing of a full disk.
+        path.write_bytes(cv2.imencode(".jpg", image.pixels, quality)[1].tobytes())
         corners, ids = np.zeros((0, 2)), np.zeros(0, np.int64)
         if self._detector is not None:
             found = self._detector.detect(image.pixels, image.stamp_ns)
             corners, ids = found.pixels, found.ids
-        return View(
-            image.stamp_ns,
-            self._extractor.extract(image.pixels),
-            sharpness(image.pixels),
-            self._follower.follow(image.pixels),
-            corners,
-            ids,
-        )
+        features = self._extractor.extract(image.pixels)
+        return View(image.stamp_ns, path, features, sharpness(image.pixels), corners, ids)
+
+
+def blurred(views: Sequence[View]) -> BoolArray:
+    """Which views (n,) are much less sharp than those around them."""
+    values = np.array([view.sharpness for view in views])
+    rows = np.arange(len(values))
+    usual = [np.median(values[max(0, row - _AROUND) : row + _AROUND + 1]) for row in rows]
+    return np.asarray(values < _BLURRED * np.array(usual))

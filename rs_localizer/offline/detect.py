@@ -24,10 +24,9 @@ from rs_localizer.io.recording import (
     KEYPOINTS_TOPIC,
 )
 from rs_localizer.localizer import Localizer
-from rs_localizer.markers.displaced import LeaveOneOut, Predict
+from rs_localizer.markers.displaced import LeaveOneOut, Predict, rms, still_errors, still_pose
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.recognition import recognized
-from rs_localizer.markers.still import rms, still_errors, still_pose
 from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.pipeline.features import Extracted, FrameExtractor, keypoints
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences

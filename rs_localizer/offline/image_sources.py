@@ -40,7 +40,7 @@ class Shot:
     """One image of a source, and the camera that took it."""
 
     image: Image | Refusal
-    camera_info: Any  # sensor_msgs/CameraInfo
+    camera_info: Any  # sensor_msgs/CameraInfo; None: nobody has calibrated it
     compressed: Any | None  # the image as sensor_msgs/CompressedImage, where it was compressed
     recorded_ns: int  # when it was recorded; of a file, its stamp
 
@@ -54,7 +54,7 @@ class Carried:
     message: Any
 
 
-def from_video(path: Path, camera: Camera, clock: ImageClock) -> Iterator[Shot]:
+def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
     """The images of a video.
 
     Raises:
@@ -64,12 +64,12 @@ def from_video(path: Path, camera: Camera, clock: ImageClock) -> Iterator[Shot]:
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:
             lost = Refusal(Reason.NO_TIME, "OpenCV does not tell its presentation time")
-            yield Shot(lost, make_camera_info(camera, 0), None, 0)
+            yield Shot(lost, _info(camera, 0), None, 0)
         else:
             yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")
 
 
-def from_files(files: list[Path], camera: Camera, clock: ImageClock) -> Iterator[Shot]:
+def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:
     """JPEG and PNG files; their names are times in ns, or they follow each other at a rate."""
     timed = have_times(files)
     for file in files:
@@ -172,7 +172,7 @@ def from_bag(
 
 
 def _shot(
-    image: Image | Refusal, camera: Camera, data: bytes, format_: str, stamp: int = 0
+    image: Image | Refusal, camera: Camera | None, data: bytes, format_: str, stamp: int = 0
 ) -> Shot:
     """An image of a file."""
     if isinstance(image, Image):
@@ -183,4 +183,8 @@ def _shot(
         format=format_,
         data=np.frombuffer(data, np.uint8),
     )
-    return Shot(image, make_camera_info(camera, stamp), compressed, stamp)
+    return Shot(image, _info(camera, stamp), compressed, stamp)
+
+
+def _info(camera: Camera | None, stamp: int) -> Any:
+    return None if camera is None else make_camera_info(camera, stamp)

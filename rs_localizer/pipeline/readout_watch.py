@@ -281,15 +281,16 @@ def _sentence(kind: _Kind, config: NodeConfig, found: MeasuredReadout | None) ->
     if kind is _Kind.REVERSED and found is not None:
         given = ScanDirection(config.scan_direction)
         return (
-            f"the camera's motion says that the shutter moves against scan_direction {given}, in "
+            f"the shutter moves against scan_direction {given}, in "
             f"{_milliseconds(-found.readout_time, found.deviation)}: is it {REVERSED[given]}?"
         )
-    span = "" if found is None else f"of {_milliseconds(found.readout_time, found.deviation)}"
-    parts = (span, "as of a global shutter" if kind is _Kind.GLOBAL else "")
-    said = ", ".join(part for part in parts if part)
-    return (
-        f"the camera's motion says a readout time {said}; readout_time is {config.readout_time:g}"
+    estimated = (
+        "estimated readout time 0 ms (a global shutter)"
+        if found is None
+        else f"estimated readout time {_milliseconds(found.readout_time, found.deviation)}"
+        + (" (a global shutter)" if kind is _Kind.GLOBAL else "")
     )
+    return f"{estimated} differs from readout_time = {1e3 * config.readout_time:g} ms"
 
 
 def _milliseconds(value: float, deviation: float) -> str:

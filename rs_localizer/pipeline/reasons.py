@@ -37,7 +37,7 @@ REASONS: dict[str, Meaning] = {
         "most points would lie behind the camera", "is the map mirrored, or another one?"
     ),
     Reason.RESIDUAL: Meaning(
-        "the errors of the inliers fill inlier_threshold: nothing fits them",
+        "inlier residuals are as large as inlier_threshold allows; no pose fits",
         f"calibration, map, or a too small inlier_threshold; {_TURNED}",
     ),
     Reason.DEGENERATE: Meaning(
@@ -49,7 +49,7 @@ REASONS: dict[str, Meaning] = {
         "the motion would be faster than a camera moves", f"mostly chance matches; {_TURNED}"
     ),
     Reason.MIRRORED: Meaning(
-        "points on a plane fit two poses alike: mirrored on it, or leaning and facing the camera",
+        "planar pose ambiguity: two poses fit equally well, mirrored or tilted and frontoparallel",
         "come nearer, look from an angle, use a larger board or markers on several walls",
     ),
     Reason.MODEL_ERROR: Meaning(
@@ -59,8 +59,8 @@ REASONS: dict[str, Meaning] = {
         f"map: show points at several depths), the map; {_TURNED}",
     ),
     Reason.UNCERTAIN: Meaning(
-        "the points tell the orientation less well than max_orientation_deviation, as those of a "
-        "small plane before a camera that may move",
+        "orientation uncertainty exceeds max_orientation_deviation, as before a small plane when "
+        "the camera may move",
         "come nearer, use a larger board or markers on several walls; leave tracking on, give the "
         "velocity_prior of a slow camera, or raise the limit where a filter weighs each pose",
     ),
@@ -96,7 +96,7 @@ REASONS: dict[str, Meaning] = {
         "no keypoint matches a landmark", "are descriptors, or ids, of map and camera of one kind?"
     ),
     Reason.BAD_IMAGE: Meaning(
-        "an image cannot be read", "its encoding: mono, color, Bayer, YUV 4:2:2, JPEG, PNG"
+        "an image cannot be read", "its encoding: mono, color, Bayer, YUV, JPEG, PNG"
     ),
     Reason.NO_TIME: Meaning(
         "OpenCV does not tell when an image of a video was taken",
@@ -115,7 +115,7 @@ REASONS: dict[str, Meaning] = {
 IMU_REASONS: dict[str, Meaning] = {
     ImuReason.NEVER: Meaning("no message has come on imu", "is its topic remapped, does it run?"),
     ImuReason.LATE: Meaning(
-        "the messages of the exposure come later than imu.wait, or by another clock",
+        "IMU messages arrive later than imu.wait or use another clock",
         "a larger imu.wait, imu.time_offset, the driver of the IMU",
     ),
     ImuReason.STOPPED: Meaning(

@@ -102,5 +102,5 @@ def test_a_readout_time_that_the_images_contradict_is_refused(
     assert "with --keep-readout-time it is written all the same" in error
     assert not out.exists()
     assert survey(walk, out, *wrong, "--keep-readout-time") == 0
-    assert "warning: the images ask for a readout time of" in capsys.readouterr().out
+    assert "warning: estimated readout time is" in capsys.readouterr().out
     assert out.exists()

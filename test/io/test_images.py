@@ -242,3 +242,24 @@ def test_an_animated_png_is_read_as_its_still_image() -> None:
     ended = subprocess.run([sys.executable, "-c", program], input=animated, capture_output=True)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.split() == [b"(12,", b"16)"]
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21", "yuv420", "nv24"])
+def test_planes_of_which_the_first_is_the_brightness(encoding: str) -> None:
+    step, behind = 11, 12 if encoding == "nv24" else 3
+    rows = [row.tobytes() for row in GRAY] + [bytes(8)] * behind
+    message = image(encoding, rows, 8, step)
+    message.height = len(GRAY)
+    np.testing.assert_array_equal(read_image(message).pixels, GRAY)
+    message = image(encoding, rows[:7], 8)
+    message.height = len(GRAY)
+    with pytest.raises(MessageError, match="the data are truncated"):
+        read_image(message)
+
+
+def test_planes_are_converted_as_opencv_does() -> None:
+    packed = np.random.default_rng(2).integers(0, 256, (9, 8), np.uint8)
+    message = image("nv12", [row.tobytes() for row in packed], 8)
+    message.height = 6
+    expected = cv2.cvtColor(packed, cv2.COLOR_YUV2GRAY_NV12)
+    np.testing.assert_array_equal(read_image(message).pixels, expected)

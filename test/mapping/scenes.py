@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
+from rs_localizer.mapping.observations import MapObservations, Start
 from rs_localizer.mapping.refine import RefinedMap
-from rs_localizer.mapping.sightings import Sightings, Start
-from rs_localizer.mapping.spotting import Spotted
+from rs_localizer.mapping.unknown_markers import Spotted
 from rs_localizer.trajectory.imu import ImuRecording
 
 READOUT = 0.03
@@ -40,7 +40,7 @@ def hand(rng: np.random.Generator, slow: float = 0.5, stamps: int = 2) -> projec
 class Walk:
     """What is refined, and the truth."""
 
-    seen: Sightings
+    seen: MapObservations
     start: Start
     points: np.ndarray  # (p,3)
 
@@ -65,7 +65,7 @@ def walk(
         positions + rng.normal(0.0, off, positions.shape),
     )
     stamps_ns = 10**12 + np.round(1e9 * stamps).astype(np.int64)
-    seen = Sightings(
+    seen = MapObservations(
         stamps_ns, np.concatenate(images), np.concatenate(landmarks), np.concatenate(pixels)
     )
     return Walk(seen, start, room)
@@ -105,9 +105,10 @@ def refined_of(felt: Felt) -> RefinedMap:
     none, empty = np.zeros((0, 3)), np.zeros(0)
     return RefinedMap(
         points=none, covariances=np.zeros((0, 3, 3)), refined=empty > 0, sights=np.zeros(0, int),
-        camera=camera(), readout_time=0.02, readout_time_deviation=np.nan, asked_readout=None,
+        camera=camera(), readout_time=0.02, readout_time_deviation=np.nan, readout_check=None,
         deviation=0.1, squared_errors=empty, inliers=empty > 0, before=1.0, after=0.1,
         spline=felt.spline(SECONDS), start_ns=START_NS, times=np.arange(0.0, SECONDS, 1 / 15),
+        tells_readout=True,
     )  # fmt: skip
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rs_localizer.cli.map.align import Wishes, alignment, moved, moved_markers
 from rs_localizer.core import so3
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.mapping.aligning import Wishes, alignment, moved, moved_markers
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Chessboard, Marker

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.anchors import Anchors, Distance, PointSight, placement
-from rs_localizer.mapping.errors import MappingError
-from rs_localizer.mapping.similarity import Similarity
+from rs_localizer.mapping.gauge import Similarity
 from rs_localizer.mapping.triangulation import Triangulated
 from rs_localizer.markers.maps import MarkerMap, wall
 

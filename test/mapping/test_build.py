@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,12 +21,12 @@ from rs_localizer.evaluation.room_mapping import Errors, Piece, Room, without_re
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.mapping.build import Built
-from rs_localizer.mapping.inertial_metres import inertial_metres
-from rs_localizer.mapping.inertial_placing import InertialPlace
+from rs_localizer.mapping.anchors import Anchors
+from rs_localizer.mapping.build import Built, Given, Workshop, build_map
+from rs_localizer.mapping.colmap import DATABASE, SPARSE, Effort
+from rs_localizer.mapping.gauge import through
+from rs_localizer.mapping.inertial_metres import InertialPlace, inertial_metres
 from rs_localizer.mapping.report import written
-from rs_localizer.mapping.similarity import through
-from rs_localizer.mapping.structure import DATABASE, SPARSE
 from rs_localizer.mapping.views import View
 from rs_localizer.simulation.renderer import ImageSettings
 
@@ -45,8 +46,8 @@ def room() -> Room:
 
 
 @pytest.fixture(scope="module")
-def views(room: Room) -> list[View]:
-    return room.look(WALK)
+def views(room: Room, tmp_path_factory: pytest.TempPathFactory) -> list[View]:
+    return room.look(WALK, tmp_path_factory.mktemp("images"))
 
 
 @pytest.fixture(scope="module")
@@ -134,26 +135,45 @@ def test_the_refinement_lowers_the_noise(built: Built) -> None:
 
 
 def test_each_stage_tells_how_far_it_is(built: Built, stages: dict[str, int]) -> None:
-    assert set(stages) == {"match", "map", "follow", "refine"}
+    assert set(stages) == {"extract", "match", "map", "track", "refine"}
     assert min(stages.values()) > 0
 
 
-def test_the_report_says_it(built: Built) -> None:
-    page = written(built, 60, 27)
+def test_the_report_says_it(built: Built, views: list[View]) -> None:
+    page = written(built, 60, views)
     assert "| scale | " in page
     assert "corners of markers" in page
     assert "![map.png](map.png)" in page
 
 
-def test_the_report_says_what_an_imu_says(built: Built) -> None:
+def test_the_report_says_what_an_imu_says(built: Built, views: list[View]) -> None:
     felt = Felt.random(0)
     metres = inertial_metres(refined_of(felt), imu_of(felt))
     place = InertialPlace(built.placement, metres, checked=True)
-    page = written(replace(built, place=place), 60, 27)
+    page = written(replace(built, place=place), 60, views)
     assert "| gravity by the IMU | " in page
     assert f"{100 * abs(felt.scale / built.placement.similarity.scale - 1):.0f}" in page
     assert "| imu.time_offset | +5.0" in page
     assert "| z is up | as in the marker map |" in page
+
+
+def test_without_calibration_lens_and_shutter_are_found(views: list[View], folder: Path) -> None:
+    """Nor a readout time, a direction or a scale; the images are enough for all but the last."""
+    alone = folder / "alone"
+    alone.mkdir()
+    work = Workshop(alone, Effort(), lambda *_: nullcontext(lambda count: None))
+    built = build_map(Given(views, None, Anchors()), work)
+    assert len(built.posed) == len(views)
+    assert built.shutter is not None
+    assert built.shutter.visible
+    assert built.camera.scan_direction == "top_to_bottom"
+    apart = abs(built.camera.readout_time - 0.03)
+    assert apart < max(4.0 * built.refined.readout_time_deviation, 1e-3)
+    assert built.camera.K[0, 0] == pytest.approx(260.0, rel=0.02)
+    assert built.shutter.noise < 0.7 * built.shutter.global_noise
+    assert not built.placement.scaled
+    assert "top_to_bottom (estimated" in written(built, len(views), views)
+    shutil.rmtree(alone)
 
 
 def test_the_model_of_colmap_can_be_read(built: Built, folder: Path) -> None:

@@ -10,12 +10,17 @@ import pytest
 from felt import GRAVITY, Felt
 from scenes import SECONDS, START_NS, camera, hand, imu_of, refined_of, walk
 
+from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.anchors import Placement
-from rs_localizer.mapping.errors import MappingError
-from rs_localizer.mapping.inertial_metres import NoMetres, inertial_metres
-from rs_localizer.mapping.inertial_placing import GivenImu, place_by_imu, refuse_early
+from rs_localizer.mapping.gauge import Similarity
+from rs_localizer.mapping.inertial_metres import (
+    GivenImu,
+    NoMetres,
+    inertial_metres,
+    place_by_imu,
+    refuse_early,
+)
 from rs_localizer.mapping.refine import RefinedMap, refine
-from rs_localizer.mapping.similarity import Similarity
 from rs_localizer.trajectory.imu import ImuRecording
 
 NOTHING = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "nothing")

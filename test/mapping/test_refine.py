@@ -9,12 +9,10 @@ import pytest
 from scenes import READOUT, Walk, camera, walk
 
 from rs_localizer.core.scanning import ScanDirection
-from rs_localizer.mapping.adjustment import MapProblem, MapStep
-from rs_localizer.mapping.preparation import Preparation
-from rs_localizer.mapping.reduced import MapNormal, Reduced
-from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
-from rs_localizer.mapping.sightings import Sightings
-from rs_localizer.mapping.similarity import through
+from rs_localizer.mapping.adjustment import MapNormal, MapProblem, MapStep, Reduced
+from rs_localizer.mapping.gauge import through
+from rs_localizer.mapping.observations import MapObservations
+from rs_localizer.mapping.refine import MapFreedom, Preparation, RefinedMap, refine
 from rs_localizer.trajectory.model import Freedom, State, start_state
 from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
 
@@ -142,15 +140,15 @@ def test_the_readout_time_is_found(video: Walk) -> None:
 
 
 def test_a_wrong_readout_time_is_named(video: Walk) -> None:
-    right = refine(camera(), video.seen, video.start).asked_readout
+    right = refine(camera(), video.seen, video.start).readout_check
     assert right is not None
     assert not right.differs
-    wrong = refine(camera(0.4 * READOUT), video.seen, video.start).asked_readout
+    wrong = refine(camera(0.4 * READOUT), video.seen, video.start).readout_check
     assert wrong is not None
     assert wrong.differs
     # One step brings it most of the way.
-    assert abs(wrong.asked - READOUT) < 0.3 * READOUT
-    assert f"{0.4e3 * READOUT:.1f} ms was given" in wrong.told
+    assert abs(wrong.estimated - READOUT) < 0.3 * READOUT
+    assert f"{0.4e3 * READOUT:.1f} ms was given" in wrong.message
 
 
 def test_the_reverse_scan_direction_is_found(video: Walk) -> None:
@@ -203,7 +201,7 @@ def test_images_that_stand_alone() -> None:
         refine(camera(), scene.seen, scene.start, MapFreedom(readout_time=True))
 
 
-def shifted(seen: Sightings, by: int) -> Sightings:
+def shifted(seen: MapObservations, by: int) -> MapObservations:
     """The second half of the images sees other landmarks."""
     late = seen.images >= len(seen.stamps_ns) // 2
     return replace(seen, landmarks=seen.landmarks + np.where(late, by, 0))
@@ -221,7 +219,7 @@ def test_what_is_no_map_is_refused(video: Walk) -> None:
     with pytest.raises(ValueError, match="landmarks that are not among the 10"):
         refine(camera(), video.seen, replace(video.start, points=np.zeros((10, 3))))
     some = video.seen.images < 2
-    few = Sightings(
+    few = MapObservations(
         video.seen.stamps_ns[:2], video.seen.images[some], video.seen.landmarks[some],
         video.seen.pixels[some],
     )  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.mapping.similarity import Similarity, through, upright
+from rs_localizer.mapping.gauge import Similarity, through, upright
 
 
 def test_the_similarity_through_points_is_found() -> None:

@@ -10,9 +10,8 @@ from scenes import READOUT, camera, ring, spot
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.transforms import Transform
-from rs_localizer.mapping.chaining import Chained, chain
-from rs_localizer.mapping.spotting import Spotted, every_marker
 from rs_localizer.mapping.survey import Survey, survey
+from rs_localizer.mapping.unknown_markers import Chained, Spotted, chain, every_marker
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import family
 from rs_localizer.markers.maps import MarkerMap
@@ -111,14 +110,14 @@ def test_images_of_one_marker_do_not_hide_the_noise(spotted: list[Spotted], pose
 
 
 def test_a_wrong_readout_time_is_named(spotted: list[Spotted]) -> None:
-    right = survey(camera(), spotted, MARKERS).asked_readout
+    right = survey(camera(), spotted, MARKERS).readout_check
     assert right is not None
     assert not right.differs
-    wrong = survey(camera(0.7 * READOUT), spotted, MARKERS).asked_readout
+    wrong = survey(camera(0.7 * READOUT), spotted, MARKERS).readout_check
     assert wrong is not None
     assert wrong.differs
-    assert wrong.asked == pytest.approx(READOUT, abs=3e-3)
-    assert survey(camera(0.0), spotted, MARKERS).asked_readout is None
+    assert wrong.estimated == pytest.approx(READOUT, abs=3e-3)
+    assert survey(camera(0.0), spotted, MARKERS).readout_check is None
 
 
 def test_a_survey_that_few_corners_fit_is_refused(spotted: list[Spotted]) -> None:

@@ -1,38 +1,69 @@
-"""How pictures move, and how sharp they are."""
+"""What is kept of images, and which of them COLMAP gets."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
+import pytest
 
-from rs_localizer.mapping.views import Follower, sharpness
+from rs_localizer.features.extraction import Features
+from rs_localizer.io.images import Image
+from rs_localizer.mapping import MappingError
+from rs_localizer.mapping.build import check_views, choose_keyframes
+from rs_localizer.mapping.views import Looker, View, blurred, sharpness
 from rs_localizer.simulation.walls import collage
 
 PICTURE = collage(900, 700, np.random.default_rng(0))
 
 
-def test_the_motion_of_a_picture_is_found() -> None:
-    """Turned, enlarged and shifted as a hand does, in pixels of the full image."""
-    motion = np.vstack([cv2.getRotationMatrix2D((320.0, 240.0), 3.0, 1.03), [0.0, 0.0, 1.0]])
-    motion[:2, 2] += (14.0, -9.0)
-    size = (640, 480)
-    into = np.array([[1.0, 0.0, -100.0], [0.0, 1.0, -100.0], [0.0, 0.0, 1.0]])
-    first = cv2.warpPerspective(PICTURE, into, size)
-    second = cv2.warpPerspective(PICTURE, motion @ into, size)
-    follower = Follower()
-    assert np.array_equal(follower.follow(first), np.eye(3))
-    found = follower.follow(second)
-    corners = np.array([[0.0, 639.0, 639.0, 0.0], [0.0, 0.0, 479.0, 479.0], [1.0] * 4])
-    assert np.abs((found - motion) @ corners).max() < 1.0
+def views_of(sharpnesses: list[float], rate: float = 15.0) -> list[View]:
+    nothing = Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.uint8))
+    none = np.zeros(0, np.int64)
+    return [
+        View(round(k * 1e9 / rate), Path(), nothing, value, np.zeros((0, 2)), none)
+        for k, value in enumerate(sharpnesses)
+    ]
 
 
-def test_nothing_is_followed_on_a_blank_wall() -> None:
-    follower = Follower()
-    follower.follow(PICTURE[:480, :640])
-    assert np.isnan(follower.follow(np.full((480, 640), 128, np.uint8))).all()
-    assert np.isnan(follower.follow(PICTURE[:480, :640])).all()
+def chosen(views: list[View]) -> list[int]:
+    stamps = np.array([view.stamp_ns for view in views])
+    rows: list[int] = choose_keyframes(stamps, views).tolist()
+    return rows
 
 
 def test_blur_is_less_sharp() -> None:
-    blurred = np.asarray(cv2.blur(PICTURE, (9, 1)), np.uint8)
-    assert sharpness(blurred) < 0.6 * sharpness(PICTURE)
+    unsharp = np.asarray(cv2.blur(PICTURE, (9, 1)), np.uint8)
+    assert sharpness(unsharp) < 0.6 * sharpness(PICTURE)
+    values = [10.0] * 20 + [5.0] + [10.0] * 20
+    assert np.flatnonzero(blurred(views_of(values))).tolist() == [20]
+
+
+def test_all_views_of_a_short_recording_are_keyframes() -> None:
+    assert chosen(views_of([1.0] * 42)) == list(range(42))
+
+
+def test_of_a_long_one_the_sharpest_four_a_second_are() -> None:
+    values = np.random.default_rng(0).uniform(1.0, 2.0, 900).tolist()
+    rows = chosen(views_of(values))
+    assert len(rows) == 240
+    assert max(np.diff(rows)) <= 8
+    assert np.mean([values[row] for row in rows]) > np.mean(values) + 0.2
+
+
+def test_the_image_is_kept_for_colmap(tmp_path: Path) -> None:
+    image = np.asarray(PICTURE[:240, :320])
+    view = Looker(100, tmp_path).look(Image(7, "camera", image))
+    kept = cv2.imread(str(view.image), cv2.IMREAD_GRAYSCALE)
+    assert kept is not None
+    assert np.abs(kept.astype(int) - image).mean() < 1.0
+
+
+def test_a_camera_that_stands_still_is_refused_early(tmp_path: Path) -> None:
+    looker = Looker(300, tmp_path)
+    images = [np.asarray(PICTURE[20:500, x : x + 640]) for x in (0, 1, 2, 1, 0)]
+    with pytest.raises(MappingError, match="the camera hardly moves"):
+        check_views([looker.look(Image(k, "camera", image)) for k, image in enumerate(images)])
+    moving = [np.asarray(PICTURE[20:500, x : x + 640]) for x in (0, 40, 80, 120, 160)]
+    check_views([looker.look(Image(k, "camera", image)) for k, image in enumerate(moving)])

@@ -1,4 +1,4 @@
-"""``rs_localizer map build``: images of a room -> a map of landmarks, in metres."""
+"""``rs_localizer map build``: images of a place -> a map of landmarks, in metres."""
 
 from __future__ import annotations
 
@@ -7,35 +7,206 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError, add_overwrite, replaced
-from rs_localizer.cli.image_input import add_source_arguments
-from rs_localizer.cli.map.build_images import Looked, Shutter, look_at_images, shutter_of
-from rs_localizer.cli.map.build_imu import add_imu_arguments, imu_of
+from rs_localizer.cli.image_input import (
+    add_source_arguments,
+    opened,
+    shutter_values,
+    tell_left_out,
+    time_faults,
+)
 from rs_localizer.config import FeatureConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.io.atomic_files import atomic_directory
+from rs_localizer.io.bags import is_bag, open_bag
+from rs_localizer.io.calibration import write_calibration
+from rs_localizer.io.images import Image
+from rs_localizer.io.imu_files import read_imu_csv
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
+from rs_localizer.io.topics import IMU
 from rs_localizer.io.trajectories import Trajectory, write_tum
-from rs_localizer.mapping.anchors import Anchors, Distance
-from rs_localizer.mapping.build import Built, Given, Workshop, build_map
-from rs_localizer.mapping.inertial_placing import GivenImu
-from rs_localizer.mapping.report import rows, written
-from rs_localizer.mapping.structure import Effort, require
-from rs_localizer.mapping.views import Looker
+from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
+from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_features
+from rs_localizer.mapping.colmap import Effort, require
+from rs_localizer.mapping.inertial_metres import GivenImu
+from rs_localizer.mapping.report import advice, rows, written
+from rs_localizer.mapping.views import Looker, View
 from rs_localizer.markers.consistency import other_units
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.offline.detect import Cameras
+from rs_localizer.offline.image_sources import Carried
+from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
+from rs_localizer.offline.recordings import RecordingError
+from rs_localizer.offline.replay import imu_topics
+from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.process.arguments import integer, number
-from rs_localizer.settings import write_parameters
+from rs_localizer.settings import build, write_parameters
+from rs_localizer.trajectory.imu import ImuRecording
 
-COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
+# After so many, images without features are refused: two seconds of a usual video.
+_EARLY_VIEWS = 30
+# Images a hair before their time are in time.
+_EARLY = 0.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looked:
+    """What was seen."""
+
+    views: list[View]
+    camera: Camera | None  # without its readout time; None: nobody has calibrated it
+    images: int
+    points: tuple[PointSight, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Shutter:
+    """What is known of it."""
+
+    readout_time: float | None  # s; None: not known
+    scan_direction: str | None
+
+
+def shutter_of(args: argparse.Namespace) -> Shutter:
+    """As given, or as it stands beside the images of a recording."""
+    values = shutter_values(args)
+    known = build(values)
+    # 0 is a global shutter where the user says so, and unknown in a file.
+    unknown = args.readout_time is None and not known.readout_time
+    readout_time = None if unknown else known.readout_time
+    return Shutter(readout_time, known.scan_direction if "scan_direction" in values else None)
+
+
+def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
+    """Look at the images that are kept: so many a second, and those in which points are given."""
+    wanted = sorted({seconds for _, seconds, _, _ in args.point})
+    cameras, camera = Cameras(ScanDirection.TOP_TO_BOTTOM), None
+    views: list[View] = []
+    size = None
+    images, stamps = 0, list[int]()
+    refused, named = dict[str, str](), dict[float, int]()
+    with opened(args, args.images, args.start, calibrated=False) as source, tqdm(
+        total=source.total, unit="image", desc="look", disable=None
+    ) as bar:  # fmt: skip
+        for shot in source.shots:
+            if isinstance(shot, Carried):
+                continue
+            images += 1
+            bar.update()
+            image = shot.image
+            if isinstance(image, Refusal):
+                refused.setdefault(image.reason, image.detail)
+                continue
+            seen_by = None if shot.camera_info is None else cameras.of(shot, image)
+            if size not in (None, image.pixels.shape) or (views and seen_by is not camera):
+                raise ValueError("the camera changes on the way; cut the recording there")
+            camera, size = seen_by, image.pixels.shape
+            stamps.append(image.stamp_ns)
+            asked = [s for s in wanted if s not in named and _time(image, stamps) >= s - 1e-3]
+            named |= dict.fromkeys(asked, len(views))
+            if asked or _due(image, views, args.images_per_second):
+                views.append(looker.look(image))
+                if len(views) == _EARLY_VIEWS:
+                    check_features(views)
+    if size is None:
+        why = "; ".join(refused.values())
+        raise ValueError(f"{args.images} has no image that can be read; {why}")
+    tell_left_out(refused, {})
+    period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.nan
+    for fault in time_faults(args, source.clock, period):
+        print(f"warning: {fault}")
+    return Looked(views, camera, images, _points(args, named))
+
+
+def _time(image: Image, stamps: list[int]) -> float:
+    """s since the first image."""
+    return (image.stamp_ns - stamps[0]) * 1e-9
+
+
+def _due(image: Image, views: list[View], rate: float) -> bool:
+    if not views:
+        return True
+    since = (image.stamp_ns - views[-1].stamp_ns) * 1e-9
+    return since >= _EARLY / rate
+
+
+def _points(args: argparse.Namespace, named: dict[float, int]) -> tuple[PointSight, ...]:
+    sights = []
+    for name, seconds, u, v in args.point:
+        if seconds not in named:
+            raise UsageError(f"--point {name}: the images end before {seconds:g} s")
+        sights.append(PointSight(name, named[seconds], (u, v)))
+    return tuple(sights)
+
+
+def add_imu_arguments(group: argparse._ArgumentGroup) -> None:
+    """Options that :func:`imu_of` reads."""
+    group.add_argument(
+        "--imu",
+        nargs="?",
+        const="",
+        metavar="TOPIC|FILE.csv",
+        help="the IMU that went along: no map without its scale. A topic of the bag (default: the "
+        "only one; used without this option, too, if it gives a scale); beside a video or a folder "
+        "a file as EuRoC's imu0/data.csv, with the clock of the images",
+    )
+    group.add_argument("--no-imu", action="store_true", help="without that of the bag")
+
+
+def imu_of(args: argparse.Namespace) -> GivenImu | None:
+    """The IMU, where there is one.
+
+    Raises:
+        UsageError: for options that do not go together.
+        ValueError: when one that is asked for cannot be read.
+    """
+    if args.imu is not None and args.no_imu:
+        raise UsageError("give --imu or --no-imu, not both")
+    if args.no_imu:
+        return None
+    if is_bag(args.images):
+        return _of_bag(args)
+    if args.imu is None:
+        return None
+    if not args.imu:
+        raise UsageError("a video or folder has no IMU of its own: give --imu FILE.csv")
+    stamps, rates, forces = read_imu_csv(Path(args.imu))
+    return GivenImu(ImuRecording(stamps, rates, specific_forces=forces), asked=True)
+
+
+def _of_bag(args: argparse.Namespace) -> GivenImu | None:
+    with open_bag(args.images) as bag:
+        topics = imu_topics(bag)
+        named = [topic for topic in topics if topic.split("/")[-1] == IMU]
+        found = named if len(named) == 1 else topics
+        if args.imu is None and len(found) != 1:
+            if found:
+                print(f"no IMU is used: choose {' or '.join(found)} with --imu")
+            return None
+        topic = args.imu or (found[0] if len(found) == 1 else None)
+        frame = optical_frame(bag, args.camera_info, args.image)
+        try:
+            return GivenImu(read_imu_recording(bag, topic, frame), asked=args.imu is not None)
+        except RecordingError as error:
+            if args.imu is not None:
+                raise
+            print(f"no IMU is used: {error}")
+            return None
+
+
+CAMERA, COLMAP, POSES, REPORT = "camera_info.yaml", "colmap", "poses.txt", "report.md"
 # A hand's motion is held by so many images a second.
 _IMAGES_PER_SECOND = 15.0
 
@@ -105,11 +276,16 @@ def run(args: argparse.Namespace) -> None:
     shutter, imu = shutter_of(args), imu_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
-        looker = Looker(args.max_keypoints, markers)
-        looked = look_at_images(args, looker, shutter.scan_direction)
-        built = _build(
-            args, looked, shutter, Anchors(markers, looked.points, tuple(args.distance)), imu, out
-        )
+        with TemporaryDirectory(dir=out) as images:
+            looked = look_at_images(args, Looker(args.max_keypoints, Path(images), markers))
+            anchors = Anchors(markers, looked.points, tuple(args.distance))
+            given = Given(
+                looked.views, looked.camera, anchors, shutter.readout_time,
+                shutter.scan_direction, MAP_FRAME if markers is None else markers.map_frame, imu,
+            )  # fmt: skip
+            folder = out / COLMAP
+            folder.mkdir()
+            built = build_map(given, Workshop(folder, Effort(args.threads, args.seed), _stage))
         _write(out, built, looked)
     _tell(args, built, looked)
 
@@ -134,24 +310,6 @@ def _marker_map(path: Path) -> MarkerMap:
     return marker_map
 
 
-def _build(
-    args: argparse.Namespace, looked: Looked, shutter: Shutter, anchors: Anchors,
-    imu: GivenImu | None, out: Path,
-) -> Built:  # fmt: skip
-    markers = anchors.marker_map
-    given = Given(
-        looked.views,
-        replace(looked.camera, readout_time=shutter.readout_time or 0.0),
-        anchors,
-        estimate_readout=shutter.readout_time is None,
-        frame=MAP_FRAME if markers is None else markers.map_frame,
-        imu=imu,
-    )
-    folder = out / COLMAP
-    folder.mkdir()
-    return build_map(given, Workshop(folder, Effort(args.threads, args.seed), _stage))
-
-
 @contextmanager
 def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
     with tqdm(total=total, desc=name, disable=None) as bar:
@@ -169,8 +327,10 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
     write_parameters(out / PARAMETERS, known)
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
-    save_pictures(built, looked.views, out)
-    (out / REPORT).write_text(written(built, looked.images, len(looked.views)), encoding="utf-8")
+    if looked.camera is None:
+        write_calibration(out / CAMERA, replace(built.camera, readout_time=0.0))
+    save_pictures(built, out)
+    (out / REPORT).write_text(written(built, looked.images, looked.views), encoding="utf-8")
 
 
 def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
@@ -182,16 +342,20 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
             "warning: nothing tells the scale: poses and velocities are in units of the map; give "
             "--markers, --point and --distance, or --imu"
         )
-    asked = built.refined.asked_readout
-    if asked is not None and asked.differs:
-        print(f"warning: {asked.told}")
+    check = built.refined.readout_check
+    if check is not None and check.differs:
+        print(f"warning: {check.message}")
     for doubt in (built.placement.doubt, *built.place.doubts):
         if doubt:
             print(f"warning: {doubt}")
+    for text in advice(built, looked.views):
+        print(f"to film otherwise: {text}")
     out = shlex.quote(str(args.out))
+    lens = f" --calibration {out}/{CAMERA}" if looked.camera is None else ""
     print(
-        "next, for images of another walk: rs_localizer detect IMAGES --features sift --out seen "
-        f"&& rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out poses"
+        f"next, for images of another walk: rs_localizer detect IMAGES --features sift{lens} --out "
+        f"seen && rs_localizer replay seen --params {out}/{PARAMETERS} --map {out}/{MAP} --out "
+        "poses"
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from rs_localizer.mapping.asked_readout import AskedReadout
+from rs_localizer.mapping.readout_check import ReadoutCheck
 
 _KEEP = "--keep-readout-time"
 
@@ -13,11 +13,11 @@ def add_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         _KEEP,
         action="store_true",
-        help="write the map even where the images ask for another readout time than was given",
+        help="write the map even where the images show another readout time than was given",
     )
 
 
-def check(args: argparse.Namespace, asked: AskedReadout | None, instead: str) -> None:
+def check(args: argparse.Namespace, readout: ReadoutCheck | None, instead: str) -> None:
     """Refuse a map that is made with the wrong readout time: it is bent by many times what its
     deviations say, and fits its images nearly as well.
 
@@ -27,8 +27,10 @@ def check(args: argparse.Namespace, asked: AskedReadout | None, instead: str) ->
     Raises:
         ValueError: unless the user wants it all the same.
     """
-    if asked is None or not asked.differs:
+    if readout is None or not readout.differs:
         return
     if not args.keep_readout_time:
-        raise ValueError(f"{asked.told}; {instead}, and with {_KEEP} it is written all the same")
-    print(f"warning: {asked.told}")
+        raise ValueError(
+            f"{readout.message}; {instead}, and with {_KEEP} it is written all the same"
+        )
+    print(f"warning: {readout.message}")

@@ -20,7 +20,7 @@ from rs_localizer.io.calibration import read_calibration, write_calibration
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.topics import IMU
-from rs_localizer.mapping.recorded import RecordedMap, from_recording
+from rs_localizer.mapping.observations import RecordedMap, from_recording
 from rs_localizer.mapping.refine import MapFreedom, RefinedMap, refine
 from rs_localizer.offline.recordings import Recorded, read_recording
 from rs_localizer.offline.replay import find_topics
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> None:
         camera, known.seen, known.start, freedom, stamp_offset=config.stamp_offset, done=_told
     )
     _tell(known, found)
-    contradiction.check(args, found.asked_readout, "see --shutter estimated")
+    contradiction.check(args, found.readout_check, "see --shutter estimated")
     _write(args, known.landmarks, found)
 
 

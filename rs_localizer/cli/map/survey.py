@@ -19,8 +19,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.camera_info import Calibration, read_camera_info
 from rs_localizer.io.images import Image
-from rs_localizer.mapping.spotting import LEAST_SIDE, Spotted, Spotter, every_marker
 from rs_localizer.mapping.survey import Survey, survey
+from rs_localizer.mapping.unknown_markers import LEAST_SIDE, Spotted, Spotter, every_marker
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import FAMILIES, Family, family
 from rs_localizer.markers.map_files import write_marker_map
@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> None:
     found = survey(camera, spotted, markers, origin=origin, stamp_offset=config.stamp_offset)
     every = found.deviations_of_shape if args.deviations == _SHAPE else found.deviations
     _tell(found, every, len(spotted))
-    contradiction.check(args, found.asked_readout, "without one it is found")
+    contradiction.check(args, found.readout_check, "without one it is found")
     surveyed = tuple(
         replace(marker, deviations=deviations)
         for marker, deviations in zip(found.markers, every, strict=True)

@@ -329,7 +329,7 @@ class Broadcaster:
         other = self._parents.get(item.child, item.parent)
         if other != item.parent:
             raise TransformError(
-                f"frame {item.child!r} hangs on {other!r} already and can have one parent only; "
+                f"TF frame {item.child!r} already has parent {other!r}; "
                 "choose publish_tf map_to_odom, or the root of the camera's frames as base_frame"
             )
         self._own.add((item.parent, item.child))

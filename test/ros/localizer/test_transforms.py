@@ -240,7 +240,9 @@ def test_a_frame_has_one_parent(made: Any, robot: Any, peer: Any) -> None:
     node.publish(frame(5 * 10**9), node.config)
     reason, text = node.notes[0]
     assert reason == "not_broadcast"
-    assert text.startswith("publish_tf map_to_camera: frame 'base_link' hangs on 'odom' already")
+    assert text.startswith(
+        "publish_tf map_to_camera: TF frame 'base_link' already has parent 'odom'"
+    )
     assert node.broadcaster.fault() == {"not_broadcast": text}  # for the diagnostics
     peer.spin_until(lambda: False, 0.1)
     assert not robot_knows(robot, "map")

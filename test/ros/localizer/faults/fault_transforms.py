@@ -70,7 +70,11 @@ def second_parent(world: World) -> str:
         ),
     ):
         assert world.set(publish_tf="map_to_camera") == ""
-        world.wait(lambda: world.localizes() and any("hangs on" in t for t in world.said[before:]))
+        world.wait(
+            lambda: (
+                world.localizes() and any("already has parent" in t for t in world.said[before:])
+            )
+        )
     assert world.set(publish_tf="none") == ""
     return "; ".join(world.said[before:])
 

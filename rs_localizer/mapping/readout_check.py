@@ -1,5 +1,5 @@
-"""Which readout time the images ask for where one was given: a wrong one bends a map that still
-fits them.
+"""The readout time that the images show, beside one that was given: a wrong one bends a map that
+still fits them.
 """
 
 from __future__ import annotations
@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rs_localizer.mapping.adjustment import MapProblem
-from rs_localizer.mapping.reduced import Reduced
+from rs_localizer.mapping.adjustment import MapProblem, Reduced
 from rs_localizer.trajectory.model import State
 
 # So far from what was given is another time: in its own deviations, and s.
@@ -17,31 +16,31 @@ _DEVIATIONS, _LEAST = 6.0, 0.001
 
 
 @dataclass(frozen=True, slots=True)
-class AskedReadout:
-    """The readout time that keypoints ask for, beside the one that was given."""
+class ReadoutCheck:
+    """The readout time that keypoints show, beside the one that was given."""
 
     given: float  # s
-    asked: float  # s; negative: against the scan direction
+    estimated: float  # s; negative: against the scan direction
     deviation: float  # s
 
     @property
     def differs(self) -> bool:
         """Whether noise does not explain the difference."""
-        apart = abs(self.asked - self.given)
+        apart = abs(self.estimated - self.given)
         return apart > max(_DEVIATIONS * self.deviation, _LEAST)
 
     @property
-    def told(self) -> str:
+    def message(self) -> str:
         """What to say of it."""
-        reverse = " in the reverse direction" if self.asked < 0.0 else ""
+        reverse = " in the reverse direction" if self.estimated < 0.0 else ""
         return (
-            f"the images ask for a readout time of about {1e3 * abs(self.asked):.1f} ms"
-            f"{reverse}, {1e3 * self.given:.1f} ms was given: if it is wrong, so is the map"
+            f"estimated readout time is {1e3 * abs(self.estimated):.1f} ms{reverse}, but "
+            f"{1e3 * self.given:.1f} ms was given; a wrong value distorts the map"
         )
 
 
-def asked_readout(problem: MapProblem, state: State, deviation: float) -> AskedReadout:
-    """What is asked for at the minimum of a problem.
+def readout_check(problem: MapProblem, state: State, deviation: float) -> ReadoutCheck:
+    """The readout time at the minimum of a problem.
 
     Args:
         problem: with the readout time free.
@@ -58,4 +57,4 @@ def asked_readout(problem: MapProblem, state: State, deviation: float) -> AskedR
     unit[place] = 1.0
     variance = reduced.solve(unit, np.zeros((*state.landmarks.shape, 1)))[0][place, 0]
     given = float(state.readout_time)
-    return AskedReadout(given, given + change, float(np.sqrt(variance)))
+    return ReadoutCheck(given, given + change, float(np.sqrt(variance)))

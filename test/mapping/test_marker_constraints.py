@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.mapping.sightings import Sightings, Start
-from rs_localizer.mapping.similarity import Similarity
-from rs_localizer.mapping.tied import tied
+from rs_localizer.mapping.anchors import marker_constraints
+from rs_localizer.mapping.gauge import Similarity
+from rs_localizer.mapping.observations import MapObservations, Start
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)
@@ -24,18 +24,20 @@ POSITIONS = np.column_stack([np.linspace(-0.5, 0.5, IMAGES), np.zeros((IMAGES, 2
 STAMPS = 10**9 + 66_000_000 * np.arange(IMAGES)
 
 
-def sightings(points: np.ndarray, images: range = range(IMAGES)) -> Sightings:
+def sightings(points: np.ndarray, images: range = range(IMAGES)) -> MapObservations:
     rows, which = (
         grid.ravel() for grid in np.meshgrid(images, np.arange(len(points)), indexing="ij")
     )
     local = np.einsum("nji,nj->ni", ROTATIONS[rows], points[which] - POSITIONS[rows])
-    return Sightings(STAMPS, rows, which, CAMERA.project(local))
+    return MapObservations(STAMPS, rows, which, CAMERA.project(local))
 
 
 def test_the_start_moves_into_the_markers_frame() -> None:
     start = Start(POINTS, ROTATIONS, POSITIONS)
     places = TO_MARKERS(CORNERS)
-    seen, moved, freedom = tied(CAMERA, sightings(POINTS), start, sightings(CORNERS), places)
+    seen, moved, freedom = marker_constraints(
+        CAMERA, sightings(POINTS), start, sightings(CORNERS), places
+    )
     assert np.allclose(moved.points, np.concatenate([TO_MARKERS(POINTS), places]), atol=1e-6)
     assert np.allclose(moved.positions, TO_MARKERS(POSITIONS), atol=1e-6)
     assert np.allclose(moved.rotations, TURN @ ROTATIONS, atol=1e-6)
@@ -60,7 +62,7 @@ def test_markers_that_are_hardly_seen_hold_nothing() -> None:
     start = Start(POINTS, ROTATIONS, POSITIONS)
     given = sightings(POINTS)
     corners = sightings(CORNERS[:3])
-    seen, moved, freedom = tied(CAMERA, given, start, corners, TO_MARKERS(CORNERS))
+    seen, moved, freedom = marker_constraints(CAMERA, given, start, corners, TO_MARKERS(CORNERS))
     assert seen is given
     assert moved is start
     assert freedom.deviations is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.trajectory.model import Freedom, State
@@ -20,7 +21,9 @@ ANGULAR_VELOCITY, LINEAR_VELOCITY = 2.0, 1.0
 """Of images that stand alone, a hand that walks: rad/s, m/s."""
 
 
-def first_motion(times: Array, rotations: Array, positions: Array, readout_time: float) -> Spline:
+def initial_trajectory(
+    times: Array, rotations: Array, positions: Array, readout_time: float
+) -> Spline:
     """A spline near poses (g,3,3), (g,3), map_from_camera, at rising times (g,), s.
 
     Images that follow each other are one stretch; one that stands alone has a piece of its own.
@@ -33,7 +36,24 @@ def first_motion(times: Array, rotations: Array, positions: Array, readout_time:
     return spline_through(parts, times, rotations, positions, spacing, margin)
 
 
-def calm(state: State, freedom: Freedom) -> Freedom | None:
+def usual_accelerations(times: Array, rotations: Array, positions: Array) -> tuple[float, float]:
+    """Of images (g,) that follow each other, rms: rad/s^2, m/s^2 (0: no three do)."""
+    steps = np.diff(times)
+    near = (steps[1:] <= LONGEST_GAP) & (steps[:-1] <= LONGEST_GAP)
+    if not near.any():
+        return 0.0, 0.0
+    relative = np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]
+    turns = Rotation.from_matrix(relative).as_rotvec() / steps[:, None]
+    speeds = np.diff(positions, axis=0) / steps[:, None]
+    between = 0.5 * (steps[1:] + steps[:-1])[:, None]
+    angular, linear = (
+        float(np.sqrt(np.mean(np.square(np.diff(of, axis=0) / between)[near])))
+        for of in (turns, speeds)
+    )
+    return angular, linear
+
+
+def acceleration_prior(state: State, freedom: Freedom) -> Freedom | None:
     """With a prior of the accelerations as large as the motion's own, where stretches are long
     enough to tell them.
     """

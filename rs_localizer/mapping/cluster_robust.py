@@ -1,4 +1,4 @@
-"""How much worse all is known because errors of keypoints that follow each other are alike.
+"""How much less is known because errors of keypoints that follow each other are correlated.
 
 The corners of a marker, or the features of a surface, look nearly the same from image to image, and
 so do their errors: a hundred of them say less than a hundred independent ones. Errors of a second
@@ -17,9 +17,47 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.mapping.border_rows import border_rows
+from rs_localizer.core.simd.jit import kernel
 from rs_localizer.trajectory.fit import Fit, steepness
+from rs_localizer.trajectory.normal_kernels import border_of
 from rs_localizer.trajectory.problem import Problem
+from rs_localizer.trajectory.sight_kernels import Curve, Sights, Terms, differentiate, make_row
+from rs_localizer.trajectory.spline_kernels import CONTROL, LOCAL
+
+
+@kernel
+def border_rows(
+    curve: Curve, sights: Sights, terms: Terms, lifted: Array, first: int, out: Array
+) -> None:
+    """Fill the rows of as many keypoints as there is room for, from one on; zeros for those that
+    do not count.
+
+    Args:
+        lifted: (6 n, b) H^-1 C of the bordered system: how the controls follow the border.
+        out: (k,2,b + 1) derivatives by the border, the controls following, and the error.
+    """
+    row = make_row(sights, terms)
+    shared = lifted.shape[1]
+    most = row.by_shared.shape[1] + 6
+    columns, border = np.empty(most, np.int64), np.empty((2, most))
+    out[:] = 0.0
+    for k in range(len(out)):
+        n = first + k
+        weight, _ = differentiate(curve, sights, terms, n, row)
+        if weight == 0.0:
+            continue
+        scale, base = np.sqrt(weight), CONTROL * sights.first[n]
+        count = border_of(sights, terms, n, row, columns, border)
+        for r in range(2):
+            mine = out[k, r]
+            mine[shared] = scale * row.error[r]
+            for j in range(count):
+                mine[columns[j]] += scale * border[r, j]
+            for a in range(LOCAL):
+                x = scale * row.by_controls[r, a]
+                for j in range(shared):
+                    mine[j] -= x * lifted[base + a, j]
+
 
 SECONDS = 1.0
 """Errors farther apart than this are taken for independent."""
@@ -41,7 +79,7 @@ class Pull:
         return max(share, independent)
 
 
-def with_alike_errors(problem: Problem, found: Fit) -> Fit:
+def cluster_robust(problem: Problem, found: Fit) -> Fit:
     """The estimate with covariances as large as its own errors show.
 
     Args:

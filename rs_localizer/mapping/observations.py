@@ -1,0 +1,237 @@
+"""What a map is refined from: keypoints of known landmarks and a first guess of all, as views or a
+recording of correspondences have them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.types import Estimate
+from rs_localizer.io.clouds import Correspondences
+from rs_localizer.io.maps.landmarks import Map, make_map
+from rs_localizer.trajectory.observe import Observed, localize_each
+
+# A part of the map hangs together with another by at least so many landmarks.
+_LEAST_IMAGES, _LEAST_SHARED = 3, 3
+# Fewer observations hold a landmark on one ray, nearly.
+_LEAST_OBSERVATIONS = 3
+# An image with fewer keypoints does not know where it is.
+LEAST_KEYPOINTS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapObservations:
+    """Keypoints of g images.
+
+    Raises:
+        ValueError: for arrays that do not go together.
+    """
+
+    stamps_ns: IntArray  # (g,) ns, of the images' headers; rising
+    images: IntArray  # (n,) rows of ``stamps_ns``
+    landmarks: IntArray  # (n,) rows of ``Start.points``
+    pixels: Array  # (n,2) raw
+
+    def __post_init__(self) -> None:
+        count = len(self.images)
+        if self.landmarks.shape != (count,) or self.pixels.shape != (count, 2):
+            raise ValueError(
+                f"images (n,), landmarks (n,) and pixels (n,2) must be of one length, got "
+                f"{self.images.shape}, {self.landmarks.shape} and {self.pixels.shape}"
+            )
+        if not np.all(np.diff(self.stamps_ns) > 0):
+            raise ValueError("the images' stamps must rise")
+        if count and not 0 <= self.images.min() <= self.images.max() < len(self.stamps_ns):
+            raise ValueError("keypoints are of images without a stamp")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A first guess: a map and where each image was taken."""
+
+    points: Array  # (p,3) m, map frame
+    rotations: Array  # (g,3,3) map_from_camera, of the middle row or of the whole image
+    positions: Array  # (g,3) m, of the camera's centre in the map
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapFreedom:
+    """What is estimated beside landmarks and motion, and what is known of them."""
+
+    readout_time: bool = False
+    lens: bool = False
+    deviations: Array | None = None  # (p,) m, of the landmarks; infinite: not known at all
+    angular_acceleration: float = 20.0  # rad/s^2, of the motion at first
+    linear_acceleration: float = 10.0  # m/s^2
+    # Standard deviations of the lens: focal lengths and centre by focal length, distortion.
+    lens_deviations: tuple[float, float] = (0.02, 0.1)
+
+
+def shared_landmarks(observations: MapObservations) -> BoolArray:
+    """Which landmarks (up to the last one that is seen) two images or more see."""
+    pairs = np.unique(np.column_stack([observations.landmarks, observations.images]), axis=0)
+    return np.bincount(pairs[:, 0]) > 1
+
+
+def check(observations: MapObservations, points: int) -> None:
+    """Raise ValueError when the images do not make one map of so many points, and say why."""
+    rows = observations.landmarks
+    if len(rows) and not 0 <= rows.min() <= rows.max() < points:
+        raise ValueError(f"keypoints are of landmarks that are not among the {points} of the map")
+    if len(observations.stamps_ns) < _LEAST_IMAGES:
+        raise ValueError(
+            f"{len(observations.stamps_ns)} images show the map, at least {_LEAST_IMAGES} are "
+            "needed"
+        )
+    shared = shared_landmarks(observations) if len(observations.images) else np.zeros(0, np.bool_)
+    if not shared.any():
+        raise ValueError("no overlap: no landmark is seen by two images")
+    sizes = _parts(observations, shared[observations.landmarks])
+    if len(sizes) > 1:
+        listed = ", ".join(str(size) for size in sizes[:6]) + (", ..." if len(sizes) > 6 else "")
+        raise ValueError(
+            f"the images fall into {len(sizes)} parts that share fewer than {_LEAST_SHARED} "
+            f"landmarks (of {listed} images): refine each by itself, or record what joins them"
+        )
+
+
+def _parts(observations: MapObservations, usable: BoolArray) -> list[int]:
+    """Numbers of images that hang together, largest first."""
+    images, landmarks = observations.images[usable], observations.landmarks[usable]
+    ones = np.ones(len(images))
+    sees = coo_array((ones, (images, landmarks))).tocsr()
+    sees.data[:] = 1.0
+    common = (sees @ sees.T).tocsr()
+    common.data = np.where(common.data >= _LEAST_SHARED, common.data, 0.0)
+    common.eliminate_zeros()
+    _, labels = connected_components(common, directed=False)
+    present = np.unique(images)
+    return sorted(np.unique(labels[present], return_counts=True)[1].tolist(), reverse=True)
+
+
+def most_observed(landmarks: IntArray, images: IntArray, wanted: int) -> BoolArray:
+    """Which landmarks (up to the last one) to adjust: those that are observed most often, each if
+    half of its images need more.
+
+    Args:
+        landmarks, images: (n,) of each keypoint.
+        wanted: keypoints of each image.
+    """
+    order = np.argsort(landmarks, kind="stable")
+    count = int(landmarks.max(initial=-1)) + 1
+    starts = np.searchsorted(landmarks[order], np.arange(count + 1))
+    counts = np.zeros(int(images.max(initial=-1)) + 1, np.int64)
+    chosen = np.zeros(count, np.bool_)
+    for landmark in np.argsort(-np.diff(starts), kind="stable").tolist():
+        at = images[order[starts[landmark] : starts[landmark + 1]]]
+        if len(at) < _LEAST_OBSERVATIONS:
+            break
+        if np.mean(counts[at] < wanted) >= 0.5:
+            chosen[landmark] = True
+            counts[at] += 1
+    return chosen
+
+
+# A landmark in the wrong place is no outlier: keypoints count up to so many px beside the pose.
+_MOST_RESIDUAL = 12.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedMap:
+    """A map, and what the images of a recording show of it."""
+
+    landmarks: Map
+    seen: MapObservations
+    start: Start
+    images: int  # of the recording
+
+
+def from_recording(
+    camera: Camera, clouds: Sequence[Correspondences], landmarks: Map | None = None,
+    done: Callable[[], object] = lambda: None,
+) -> RecordedMap:  # fmt: skip
+    """Images with a pose, and the landmarks that they show.
+
+    Args:
+        camera: with its readout time, where it is known.
+        clouds: of the recording, one an image.
+        landmarks: the map; None: that of the recording, by the points that it shows.
+        done: called after each image.
+
+    Raises:
+        ValueError: when points are not of the map, or no image has a pose.
+    """
+    once = {cloud.stamp_ns: cloud for cloud in clouds if len(cloud.points)}
+    images = [once[stamp] for stamp in sorted(once)]
+    if landmarks is None:
+        landmarks = _own_map(images)
+    rows = [_rows_of(landmarks, cloud) for cloud in images]
+    observed = [Observed(cloud.stamp_ns, cloud.points, cloud.pixels) for cloud in images]
+    results = localize_each(camera, observed, done)
+    posed = [k for k, result in enumerate(results) if isinstance(result, Estimate)]
+    if not posed:
+        raise ValueError(f"none of {len(images)} images has a pose; of the last one, {results[-1]}")
+    found = [result for result in results if isinstance(result, Estimate)]
+    near = [estimate.residuals < _MOST_RESIDUAL for estimate in found]
+    counts = [int(np.count_nonzero(of)) for of in near]
+    seen = MapObservations(
+        np.array([images[k].stamp_ns for k in posed], np.int64),
+        np.repeat(np.arange(len(posed)), counts),
+        np.concatenate([rows[k][of] for k, of in zip(posed, near, strict=True)]),
+        np.concatenate([images[k].pixels[of] for k, of in zip(posed, near, strict=True)]),
+    )
+    start = Start(
+        landmarks.points,
+        np.array([estimate.rotation.T for estimate in found]),
+        np.array([estimate.position for estimate in found]),
+    )
+    return RecordedMap(landmarks, seen, start, len(images))
+
+
+def _own_map(clouds: Sequence[Correspondences]) -> Map:
+    """The points of all clouds, with their ids if they have any."""
+    points = np.concatenate([cloud.points for cloud in clouds])
+    ids = None
+    if all("id" in (cloud.table.dtype.names or ()) for cloud in clouds):
+        every = np.concatenate([cloud.table["id"].astype(np.int64) for cloud in clouds])
+        ids, firsts = np.unique(every, return_index=True)
+        points = points[firsts]
+    else:
+        points = np.unique(points, axis=0)
+    return make_map(points, ids, None, clouds[0].frame)
+
+
+def _rows_of(landmarks: Map, cloud: Correspondences) -> IntArray:
+    """The landmarks (n,) that the rows of a cloud show: by their ids, else by their places."""
+    names = cloud.table.dtype.names or ()
+    if landmarks.ids is not None and "id" in names:
+        wanted: NDArray[Any] = cloud.table["id"].astype(np.int64)
+        known: NDArray[Any] = landmarks.ids
+    else:
+        # A cloud may hold its points in single precision.
+        wanted, known = _keys(cloud.points), _keys(landmarks.points)
+    order = np.argsort(known)
+    places = np.minimum(np.searchsorted(known[order], wanted), len(known) - 1)
+    rows: IntArray = order[places]
+    missing = int(np.count_nonzero(known[rows] != wanted))
+    if missing:
+        raise ValueError(
+            f"{missing} of {len(wanted)} points of the image at {cloud.stamp_ns} ns are not in the "
+            "map; is it the map of this recording?"
+        )
+    return rows
+
+
+def _keys(points: Array) -> NDArray[Any]:
+    """Something that points (n,3) are the same by, (n,)."""
+    single = np.ascontiguousarray(points, np.float32) + np.float32(0.0)
+    return single.view([("", np.float32)] * 3).ravel()

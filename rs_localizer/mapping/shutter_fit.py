@@ -1,0 +1,136 @@
+"""A map refined with the shutter that its images show: rolling along one axis or the other, or
+global, where nobody knows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.mapping.observations import MapFreedom, MapObservations, Start
+from rs_localizer.mapping.refine import RefinedMap, refine
+from rs_localizer.trajectory.problem import LIMIT
+
+# A readout time is believed beyond so many deviations: two axes with two directions each are tried,
+# four chances together one in 8,000, and deviations, which few seconds tell, may be too small by a
+# third.
+_SIGNIFICANT = 4.0
+# And where the images' gains are so by chance less often than this: a wrong model that absorbs
+# something else helps some images and harms others.
+_CHANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterFit:
+    """What an unknown shutter was found to be."""
+
+    readout_time: float  # s, of the rolling shutter that fits best
+    deviation: float  # s
+    direction: ScanDirection
+    noise: float  # px, that it leaves
+    global_noise: float  # px, that the global shutter leaves which fits best
+    better_images: float  # share of the images that fit it better than a global shutter
+    chance: float  # that the images' gains over a global shutter are so by chance
+    axis_chance: float  # likewise, over a shutter along the other axis; 0: not tried
+    interval: float  # s, between the images
+
+    @property
+    def possible(self) -> bool:
+        """Whether a camera can read an image out so slowly."""
+        return self.readout_time < self.interval
+
+    @property
+    def visible(self) -> bool:
+        """Whether the images show a rolling shutter."""
+        significant = self.readout_time > _SIGNIFICANT * self.deviation
+        return significant and self.chance < _CHANCE and self.possible
+
+    @property
+    def axis_known(self) -> bool:
+        """Whether they show along which axis it goes."""
+        return self.axis_chance < _CHANCE
+
+
+def likely_axes(size: tuple[int, int]) -> list[ScanDirection]:
+    """Scan directions to try, their reverses included, the likelier first: the rows of sensors lie
+    along their longer side, also where a driver or a phone has turned the images.
+    """
+    axes = [ScanDirection.TOP_TO_BOTTOM, ScanDirection.LEFT_TO_RIGHT]
+    return axes if size[0] >= size[1] else axes[::-1]
+
+
+def fit_shutter(
+    camera: Camera,
+    observations: MapObservations,
+    start: Start,
+    freedom: MapFreedom,
+    directions: Sequence[ScanDirection],
+    done: Callable[[str], object],
+) -> tuple[RefinedMap, ShutterFit | None]:
+    """The map refined with the shutter that explains the images best.
+
+    A shutter that does not explain them significantly better than a global one is not believed.
+
+    Args:
+        camera: its lens; the shutter does not matter.
+        observations, start, freedom: as of :func:`refine`.
+        directions: to try, each with its reverse; the first is preferred where they fit alike.
+        done: called with each part of the work that is done.
+
+    Returns:
+        the map, and what the shutter was found to be; None: too few images follow each other.
+
+    Raises:
+        ValueError: as :func:`refine`.
+    """
+    camera = replace(camera, readout_time=0.0, scan_direction=directions[0])
+    still = refine(camera, observations, start, freedom, done=done)
+    if not still.tells_readout:
+        return still, None
+    freedom = replace(freedom, readout_time=True)
+    fits = [
+        refine(
+            replace(still.camera, scan_direction=direction), observations, start, freedom, done=done
+        )
+        for direction in directions
+    ]
+    costs = [_costs(of, still, observations) for of in (still, *fits)]
+    best, axis_chance = 0, 0.0
+    if len(fits) > 1:
+        first, second = (_chance(costs[3 - k] - costs[k]) for k in (1, 2))
+        best, axis_chance = int(second < _CHANCE), min(first, second)
+    gains, chosen = costs[0] - costs[1 + best], fits[best]
+    shutter = ShutterFit(
+        readout_time=chosen.camera_as_found.readout_time,
+        deviation=chosen.readout_time_deviation,
+        direction=ScanDirection(chosen.camera_as_found.scan_direction),
+        noise=chosen.after,
+        global_noise=still.after,
+        better_images=float(np.mean(gains > 0.0)),
+        chance=_chance(gains),
+        axis_chance=axis_chance,
+        interval=1e-9 * float(np.median(np.diff(observations.stamps_ns))),
+    )
+    return (chosen if shutter.visible else still), shutter
+
+
+def _costs(fit: RefinedMap, still: RefinedMap, observations: MapObservations) -> Array:
+    """Squared errors of the images (g,), those of outliers cut off: alike in all fits."""
+    limit = (LIMIT * still.deviation) ** 2
+    squared = np.minimum(np.where(np.isfinite(fit.squared_errors), fit.squared_errors, 0.0), limit)
+    sums = np.bincount(observations.images, squared, len(observations.stamps_ns))
+    return np.asarray(sums, np.float64)
+
+
+def _chance(gains: Array) -> float:
+    """Probability that the images' gains (g,) are so large by chance (Wilcoxon's signed-rank test:
+    images at rest gain nothing, those of a quick turn much).
+    """
+    from scipy.stats import wilcoxon  # takes a second
+
+    return float(wilcoxon(gains, alternative="greater").pvalue)

@@ -1,0 +1,146 @@
+"""COLMAP in a process of its own: what it is given, and what becomes of one that dies."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.core.camera import Camera, Roi
+from rs_localizer.io.calibration import colmap_camera, colmap_parameters
+from rs_localizer.mapping import MappingError, colmap
+from rs_localizer.mapping.colmap import Effort, build_structure, image_name, pairs_of
+from rs_localizer.simulation.walls import collage
+
+K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
+
+
+def test_few_images_are_matched_each_with_each() -> None:
+    assert len(pairs_of(20)) == 20 * 19 // 2
+
+
+def test_of_many_images_neighbours_are_matched_and_some_with_all() -> None:
+    pairs = set(pairs_of(300))
+    assert len(pairs) < 300 * 20
+    assert all((i, i + step) in pairs for i in range(200) for step in (1, 5, 10, 64))
+    # Any two times that are far apart have a pair near them, so that loops close.
+    assert all(
+        any((a, b) in pairs for a in range(i - 5, i + 6) for b in range(j - 5, j + 6))
+        for i, j in ((30, 280), (17, 171), (99, 205))
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "D"),
+    [
+        ("plumb_bob", [0.1, -0.02, 1e-3, -2e-3, 0.0]),
+        ("plumb_bob", [0.1, -0.02, 1e-3, -2e-3, 0.01]),
+        ("plumb_bob", []),
+        ("rational_polynomial", [0.1, -0.02, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.04]),
+        ("equidistant", [0.1, -0.02, 1e-3, -2e-3]),
+    ],
+)
+def test_the_lens_is_the_same_for_colmap(model: str, D: list[float]) -> None:
+    """There and back, as it sees points."""
+    camera = Camera(320, 240, K, np.array(D), model)
+    known = colmap_parameters(camera)
+    line = " ".join(map(repr, known["params"]))
+    back = colmap_camera(f"1 {known['model']} 320 240 {line}", None)
+    points = np.random.default_rng(0).uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.5], (50, 3))
+    np.testing.assert_allclose(back.project(points), camera.project(points), atol=1e-9)
+
+
+def test_the_lens_of_a_part_of_the_sensor() -> None:
+    part = Camera(
+        640, 480, np.diag([2.0, 2.0, 1.0]) @ K, binning=(2, 2), roi=Roi(100, 50, 400, 300)
+    )
+    fx, fy, cx, cy = colmap_parameters(part)["params"][:4]
+    point = np.array([[0.1, -0.05, 1.0]])
+    np.testing.assert_allclose(
+        part.project(point)[0], [fx * 0.1 + cx - 0.5, fy * -0.05 + cy - 0.5], atol=1e-9
+    )
+
+
+def test_a_lens_that_colmap_does_not_know() -> None:
+    with pytest.raises(ValueError, match="the lens has 12"):
+        colmap_parameters(Camera(320, 240, K, np.full(12, 1e-3), "rational_polynomial"))
+
+
+def build(images: Path, folder: Path, count: int) -> colmap.Structure:
+    folder.mkdir()
+    return build_structure(
+        images, np.arange(count), None, folder, Effort(), lambda *_: nullcontext(lambda count: None)
+    )
+
+
+def test_a_process_that_dies_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dying = tmp_path / "dying.py"
+    dying.write_text(
+        "import os, sys\nsys.stderr.write('free(): invalid pointer\\n')\n"
+        "sys.stderr.flush()\nos.abort()\n"
+    )
+    monkeypatch.setattr(colmap, "_SCRIPT", dying)
+    with pytest.raises(MappingError, match=r"ended with signal SIGABRT: free\(\): invalid pointer"):
+        build(tmp_path, tmp_path / "out", 3)
+
+
+def test_pycolmap_stays_out_of_this_process() -> None:
+    """OpenCV is in it; both together abort on some machines."""
+    pytest.importorskip("pycolmap")
+    code = (
+        "import sys, cv2, rs_localizer.mapping.build, rs_localizer.mapping.colmap as c\n"
+        "c.require()\nassert 'pycolmap' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_plane_and_a_box_are_mapped_without_a_calibration(tmp_path: Path) -> None:
+    """Two textured planes at different depths: COLMAP finds poses, points and the focal length."""
+    pytest.importorskip("pycolmap")
+    images = tmp_path / "images"
+    images.mkdir()
+    count, size, focal = 9, (480, 360), 420.0
+    M = np.array([[focal, 0.0, 239.5], [0.0, focal, 179.5], [0.0, 0.0, 1.0]])
+    rng = np.random.default_rng(0)
+    planes = [(collage(1100, 900, rng), 5.0, 0.008), (collage(300, 300, rng), 3.0, 0.004)]
+    centres = []
+    for k in range(count):
+        angle = 0.09 * (k - 4)
+        turn = cv2.Rodrigues(np.array([0.01 * k, angle, 0.0]))[0]
+        centre = np.array([4.0 * np.sin(angle), 0.1 * k, 4.0 - 4.0 * np.cos(angle)])
+        centres.append(centre)
+        image = np.full(size[::-1], 90, np.uint8)
+        for texture, depth, pixel in planes:
+            h, w = texture.shape
+            # Texture's pixels -> the plane at this depth -> the image.
+            plane = np.diag([pixel, pixel, 0.0])
+            plane[:, 2] = np.array([-pixel * w / 2, -pixel * h / 2, depth]) - centre
+            H = M @ turn @ plane
+            there = cv2.warpPerspective(texture, H, size, flags=cv2.INTER_AREA)
+            mask = cv2.warpPerspective(np.full_like(texture, 255), H, size)
+            image[mask > 250] = there[mask > 250]
+        cv2.imwrite(str(images / image_name(k)), image, [cv2.IMWRITE_JPEG_QUALITY, 97])
+    structure = build(images, tmp_path / "out", count)
+    assert structure.parts == (count,)
+    assert structure.camera.K[0, 0] == pytest.approx(focal, rel=0.03)
+    assert structure.error < 0.7
+    assert structure.descriptors.shape == (len(structure.points), 128)
+    # Positions have the true shape.
+    true, found = np.array(centres), structure.positions
+    steps = [np.linalg.norm(of - of[0], axis=1)[1:] for of in (true, found)]
+    ratios = steps[1] / steps[0]
+    assert np.ptp(ratios) < 0.05 * np.median(ratios)
+    # Observations are where the points project to.
+    k = np.searchsorted(structure.views, structure.seen_views)
+    local = np.einsum(
+        "nji,nj->ni",
+        structure.rotations[k],
+        structure.points[structure.seen_points] - structure.positions[k],
+    )
+    errors = np.linalg.norm(structure.camera.project(local) - structure.pixels, axis=1)
+    assert np.mean(errors) == pytest.approx(structure.error, rel=0.05)

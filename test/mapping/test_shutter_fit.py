@@ -1,0 +1,51 @@
+"""Which shutter images show where nobody knows it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import READOUT, camera, walk
+
+from rs_localizer.core.scanning import ScanDirection
+from rs_localizer.mapping.observations import MapFreedom
+from rs_localizer.mapping.refine import RefinedMap
+from rs_localizer.mapping.shutter_fit import ShutterFit, fit_shutter, likely_axes
+
+VIDEO = np.arange(0.0, 1.2, 1.0 / 30.0)
+# The wrong axis first.
+BOTH = [ScanDirection.LEFT_TO_RIGHT, ScanDirection.TOP_TO_BOTTOM]
+
+
+def fit(readout: float, stamps: np.ndarray = VIDEO) -> tuple[RefinedMap, ShutterFit | None]:
+    scene = walk(np.random.default_rng(1), stamps, readout=readout)
+    return fit_shutter(camera(0.0), scene.seen, scene.start, MapFreedom(), BOTH, lambda text: None)
+
+
+def test_a_rolling_shutter_is_found_along_its_axis() -> None:
+    refined, shutter = fit(READOUT)
+    assert shutter is not None
+    assert shutter.visible
+    assert shutter.axis_known
+    assert shutter.direction == ScanDirection.TOP_TO_BOTTOM
+    assert refined.readout_time == pytest.approx(READOUT, abs=4.0 * shutter.deviation)
+    assert shutter.deviation < 1e-3
+    assert shutter.noise < 0.7 * shutter.global_noise
+    assert shutter.better_images > 0.9
+
+
+def test_a_global_shutter_is_left_alone() -> None:
+    refined, shutter = fit(0.0)
+    assert shutter is not None
+    assert not shutter.visible
+    assert refined.readout_time == 0.0
+
+
+def test_images_on_their_own_tell_no_readout_time() -> None:
+    refined, shutter = fit(READOUT, np.arange(0.0, 6.0, 0.5))
+    assert shutter is None
+    assert refined.readout_time == 0.0
+
+
+def test_the_rows_of_sensors_lie_along_the_longer_side() -> None:
+    assert likely_axes((640, 480))[0] == ScanDirection.TOP_TO_BOTTOM
+    assert likely_axes((450, 800))[0] == ScanDirection.LEFT_TO_RIGHT
