@@ -2,6 +2,7 @@
 root finder that looks for the row which sees a point."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
-from rs_localizer.solvers.table import SOLVERS
+from rs_localizer.solvers.table import SOLVERS, find_solver
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 590.0, 239.5], [0.0, 0.0, 1.0]])
 D = np.array([-0.1, 0.02, 0.001, 0.001, 0.0])
@@ -128,6 +129,19 @@ def test_p3p_is_a_global_shutter_and_knows_no_motion():
     lost = localizer.localize(points, pixels)
     assert not lost or lost.inliers.sum() < 0.5 * inliers.sum()
     assert rsl.Localizer(cam).localize(points, pixels).inliers.sum() > 0.95 * inliers.sum()
+
+
+def test_another_solver_of_a_global_shutter_is_the_one_that_is_asked(monkeypatch):
+    p3p, sizes = find_solver("p3p"), set()
+
+    def solve(points, rays, tau, samples, *rest):
+        sizes.add(samples.shape[1])
+        p3p.solve(points, rays, tau, np.ascontiguousarray(samples[:, :3]), *rest)
+
+    p4p = replace(p3p, solve=solve, sample_size=4)
+    monkeypatch.setattr("rs_localizer.localizer.find_solver", lambda name: p4p)
+    assert rsl.Localizer(camera(), solver="p3p").localize(*frame(camera(), Path(3, 0, 0), 60)[:2])
+    assert sizes == {4}
 
 
 def test_same_seed_same_bits_and_no_memory_of_earlier_frames():

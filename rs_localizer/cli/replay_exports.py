@@ -17,7 +17,9 @@ from rs_localizer.config import PoseTime
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import BagReader
+from rs_localizer.io.gsplat import exposed_rows, write_gsplat
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.nerfstudio import View, middle_of_image, transforms
 from rs_localizer.io.outputs import Localized
@@ -50,6 +52,14 @@ def add_export_arguments(parser: argparse._ActionsContainer) -> None:
         action="store_true",
         help=f"also write {TRANSFORMS}, with velocities and rolling-shutter time, and to "
         f"{IMAGES}/ the compressed images of the recording",
+    )
+
+    parser.add_argument(
+        "--gsplat",
+        type=Path,
+        metavar="DIR",
+        help="also make a directory for gsplat: poses at the first and the last row as viewmats, "
+        "intrinsics, a text model of COLMAP, and the compressed images of the recording",
     )
 
 
@@ -126,14 +136,23 @@ class Exports:
         self._localizer, self._out = localizer, out
         self._named: dict[str, float] = dict(args.rows)
         self._wants_views: bool = args.nerfstudio
+        self._gsplat: Path | None = args.gsplat
         self._smoothed: bool = args.smooth
         self._rows = {name: Track() for name in self._named}
         self._views: dict[int, View] = {}
+        self._rolling: dict[int, Array] = {}  # (3,4,4) at the first, middle and last row
 
     def add(self, frame: Localized) -> None:
         """Take a frame."""
-        if not (self._named or self._wants_views):
-            return
+        if self._gsplat is not None:
+            first, last = exposed_rows(self._camera)
+            poses = [self._of_camera(frame, tau).pose for tau in (first, 0.0, last)]
+            self._rolling[frame.input_stamp_ns] = np.stack(
+                [
+                    np.block([[pose.rotation, pose.position[:, None]], [np.eye(4)[3:]]])
+                    for pose in poses
+                ]
+            )
         for name, tau in self._named.items():
             then = self._localizer.mounted(self._of_camera(frame, tau))
             if isinstance(then, Localized):
@@ -160,6 +179,19 @@ class Exports:
                 )
         if self._views:
             self._write_transforms(bag)
+        if self._gsplat is not None and self._rolling:
+            images, landmarks = sorted(self._rolling), self._localizer.map
+            with atomic_directory(self._gsplat) as folder:
+                folder.mkdir()
+                files = _write_images(bag, set(images), folder)
+                write_gsplat(
+                    folder,
+                    self._camera,
+                    [files.get(stamp, f"{IMAGES}/{stamp}.jpg") for stamp in images],
+                    np.stack([self._rolling[stamp] for stamp in images]),
+                    np.zeros((0, 3)) if landmarks is None else landmarks.points,
+                )
+            print(f"written to {self._gsplat}: poses of {len(images)} images for gsplat")
 
     @property
     def _camera(self) -> Camera:

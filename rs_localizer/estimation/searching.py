@@ -42,6 +42,8 @@ class MotionSearch:
     def __init__(self, camera: Camera, config: LocalizerConfig, solver: Solver) -> None:
         self._config = config
         self._solver = solver
+        # Of a rolling shutter the pose of one instant that explains it roughly; any would do.
+        self._start_solver = find_solver("p3p") if solver.rolling_shutter else solver
         self._focal_length = camera.focal_length
 
     def find(self, observed: Observed) -> tuple[Candidate, Candidate]:
@@ -86,7 +88,7 @@ class MotionSearch:
         inliers.
         """
         share = float(np.mean(inliers))
-        chance = (1.0 - share ** find_solver("p3p").sample_size) ** samples
+        chance = (1.0 - share**self._start_solver.sample_size) ** samples
         return chance > 1.0 - self._config.confidence
 
     def _largest_group(
@@ -122,7 +124,7 @@ class MotionSearch:
     def _global_shutter(
         self, observed: Observed, among: IntArray, most: int, before: Candidate = NOTHING
     ) -> Candidate:
-        """A pose that fits all rows roughly, by P3P on some points and a wide threshold."""
+        """A pose that fits all rows: roughly, by a wide threshold, where the shutter rolls."""
         threshold = self._config.inlier_threshold
         wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
         if self._solver.rolling_shutter:
@@ -130,7 +132,7 @@ class MotionSearch:
         else:
             score_scale, final_scale = _SCORE_SCALE * threshold, threshold
         hypotheses = self._hypotheses(
-            find_solver("p3p"), _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
+            self._start_solver, _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
         )
         pools = _pools(observed, among)
         draws = Draws([np.eye(3)], pools, self._config.confidence, most, observed.random)

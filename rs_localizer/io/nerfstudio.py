@@ -51,6 +51,17 @@ def middle_of_image(camera: Camera) -> float:
     return float(camera.row_time(np.array([[0.0, (height - 1) / 2]]))[0])
 
 
+def pixel_intrinsics(camera: Camera) -> tuple[Array, Array]:
+    """Focal lengths (2,) and principal point (2,) in pixels of the delivered image, the corner of
+    whose first pixel is at 0, 0.
+    """
+    binning = np.array(camera.binning, float)
+    offset = np.zeros(2)
+    if camera.roi is not None:
+        offset[:] = camera.roi.x_offset, camera.roi.y_offset
+    return np.diag(camera.K)[:2] / binning, (camera.K[:2, 2] - offset) / binning + _HALF
+
+
 def transforms(camera: Camera, views: Sequence[View]) -> dict[str, Any]:
     """What ``transforms.json`` holds.
 
@@ -69,12 +80,7 @@ def transforms(camera: Camera, views: Sequence[View]) -> dict[str, Any]:
         )
     name, coefficients = _MODELS[model]
     width, height = camera.size
-    binning = np.array(camera.binning, float)
-    offset = np.zeros(2)
-    if camera.roi is not None:
-        offset[:] = camera.roi.x_offset, camera.roi.y_offset
-    focal = np.diag(camera.K)[:2] / binning
-    centre = (camera.K[:2, 2] - offset) / binning + _HALF
+    focal, centre = pixel_intrinsics(camera)
     lens = dict.fromkeys(coefficients, 0.0) | dict(
         zip(coefficients, camera.D.tolist(), strict=False)
     )

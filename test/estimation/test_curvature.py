@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.frames.conditions import named
@@ -66,6 +67,7 @@ def test_steps_from_one_state_are_told_from_another() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.bench
 def test_regions_before_a_small_tilted_plane_hold_under_motion() -> None:
     """Along the ellipsoid's own axes they held in half of the frames."""
     found = judge(named("planes/0.6m/tilt 30/10deg/1px"), 40, 2, {})

@@ -233,15 +233,6 @@ def test_without_a_readout_time_there_is_a_pose_but_no_twist(
     assert np.allclose(frame.pose.position, -rotation.T @ translation)
 
 
-@pytest.mark.usefixtures("mock")
-def test_a_solver_that_sees_no_motion_gives_no_twist(
-    cloud: SimpleNamespace, make_camera_info: Make
-) -> None:
-    frames = FrameLocalizer(NodeConfig(solver="p3p", readout_time=READOUT_TIME))
-    frames.calibrate(read_camera_info(make_camera_info()))
-    assert localized(frames.localize(cloud)).twist is None
-
-
 def test_a_new_camera_counts_from_the_next_frame_on(
     cloud: SimpleNamespace, make_camera_info: Make, mock: type[MockLocalizer]
 ) -> None:
@@ -314,19 +305,6 @@ def test_a_jump_of_time_and_another_map_start_afresh(
     frames.reset()  # who asks for it is not told
     assert not tracked(1, 0, "map")
     assert len(notices) == 2
-
-
-def test_points_in_the_frame_of_the_camera_are_said(
-    mock: type[MockLocalizer], cloud: SimpleNamespace, make_camera_info: Make
-) -> None:
-    notices: list[tuple[str, str]] = []
-    frames = FrameLocalizer(NodeConfig(), lambda *words: notices.append(words))
-    frames.calibrate(read_camera_info(make_camera_info()))
-    localized(frames.localize(cloud))
-    assert notices == []
-    cloud.header.frame_id = frames.camera_frame  # a header that was copied from the image
-    localized(frames.localize(cloud))
-    assert [name for name, _ in notices] == ["map_changed", "map_is_camera"]
 
 
 def simulated(direction: str, **settings: Any) -> list[tuple[Any, Any]]:
