@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,19 +16,23 @@ from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lens import LensError, with_lens
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import step_between
+from rs_localizer.core.state import POSE, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.assumptions import (
     assumptions,
     known_terms,
+    told_speed,
     turn_seen,
     with_experience,
 )
+from rs_localizer.estimation.calibration import NO_EFFECT, calibration_effect
+from rs_localizer.estimation.frame_posterior import frame_posterior
 from rs_localizer.estimation.inputs import checked, unfit
-from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, told_of_lens
+from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, refuted, told_of_lens
+from rs_localizer.estimation.medians import median_depth
 from rs_localizer.estimation.observing import Observed, Sighted, find_usable, packed
-from rs_localizer.estimation.posterior import Posterior
+from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior import Prior, state_in
 from rs_localizer.estimation.prior_terms import PriorTerms, with_motion
 from rs_localizer.estimation.ransac import Candidate
@@ -35,15 +40,18 @@ from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.estimation.result import estimate_of
 from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import MotionSearch
-from rs_localizer.estimation.settling import settle
 from rs_localizer.estimation.warm_up import compile_rare
-from rs_localizer.solvers.table import find_solver
+from rs_localizer.solvers.table import find_solver, start_solver
 
 # A prediction may be off by this multiple of the inlier threshold.
 _PREDICTION_SCALE = 16.0
 # Squared Mahalanobis distance of a prediction; a chi-squared variable of 18 degrees of freedom
 # exceeds this once in a million.
 _MOST_INNOVATION = 62.0
+# Points whose places are off by a standard deviation in either direction lie within so many of them
+# (95 % of Rayleigh's distribution).
+_MAP_GATE = 2.45
+_NEAREST = 1e-6  # m
 # Points that agree with a prediction's optimum, as a share of those that agreed before.
 _STILL_TRACKED = 0.7
 
@@ -81,7 +89,7 @@ class Localizer:
         self.config = config or localizer_config(settings)
         self.camera = camera
         self._solver = find_solver(self.config.solver)
-        self._search = MotionSearch(camera, self.config, self._solver)
+        self._search = MotionSearch(camera, self.config, self._solver, start_solver(self._solver))
         self._terms, self._assumed = assumptions(camera, self.config, self._solver)
 
     def warm_up(self) -> None:
@@ -103,6 +111,8 @@ class Localizer:
         # And with one that shakes, rows to and fro.
         swing = 2.0 * self.config.inlier_threshold * np.sin(12.0 * self.camera.row_time(pixels))
         self.localize(points, pixels + np.outer(swing, self.camera.row_time_gradient[::-1] != 0.0))
+        # Errors that are smooth over the image.
+        self.localize(points, pixels + 2.0 * np.outer((rays**2).sum(axis=1), [1.0, 1.0]))
         # And through a lens that is off.
         bent = with_lens(self.camera, np.array([-0.02, 0.0]))
         self.localize(points, bent.distort(rays)[0], prior=Prior(asks_lens=True))
@@ -146,7 +156,7 @@ class Localizer:
         return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn))
 
     def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
-        """The same, or a :class:`Failure` where the orientation is too uncertain."""
+        """The same, or a :class:`Failure` where the points tell too little of the orientation."""
         if not found:
             return found
         failure = uncertain(found, self.config.max_orientation_deviation)
@@ -169,14 +179,19 @@ class Localizer:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
         given = _Given(points, pixels, scores, prior, expected_share, turn)
         if prior is not None and prior.lens is not None:
-            found = self._found(given, prior.lens)
-            if found:
+            found, plain = self._found(given, prior.lens), self._found(given, None)
+            threshold = self.config.inlier_threshold
+            if found and not (plain and refuted(found.residuals, plain.residuals, threshold)):
                 return found
+            return plain
         return self._found(given, None)
 
     def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
         """What there is to find by a lens that other frames tell of, or by the calibration's."""
         points, pixels, scores, prior, expected_share, turn = given
+        terms, prior = (
+            told_speed(self._terms, prior) if self._assumed.may_rest else (self._terms, prior)
+        )
         camera = self.camera if lens is None else lens.mended(self.camera)
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
         usable = find_usable(camera, points, pixels, turn)
@@ -189,7 +204,7 @@ class Localizer:
             len(points),
             usable.centre,
             None if scores is None else np.argsort(-scores[usable.indices], kind="stable"),
-            known_terms(self._terms, prior, turn),
+            known_terms(terms, prior, turn),
             generator(self.config.seed),
             with_experience(self._assumed, prior, turn_seen(self._terms, turn)),
             Sighted(camera, points, pixels, usable, turn),
@@ -208,7 +223,7 @@ class Localizer:
         # 4. Maximum a posteriori on the inliers; rest or motion; the mirrored pose of a plane.
         posterior = self._settle(observed, best, observed.terms)
         # 5. Nothing rather than a wrong pose.
-        found = self._accept(observed, start, best, posterior)
+        found = self._accept(observed, start, best, posterior, observed.terms)
         return self._by_lens(observed, start, best, posterior, found)
 
     def _by_lens(
@@ -230,9 +245,13 @@ class Localizer:
             observed, observations=mended.observations, sighted=mended.sighted, lens=mended.lens
         )
         settled = self._settle(again, Candidate(mended.state, 0.0), observed.terms)
-        if not decided(posterior, settled, mended.lens, threshold):
+        # Beside a motion alone: a smooth error explains what a lens that is off leaves, too.
+        plain = maximum_a_posteriori(
+            observed.observations, posterior.state, observed.terms, threshold
+        )
+        if not decided(plain, settled, mended.lens, threshold):
             return found
-        result = self._accept(again, start, best, settled)
+        result = self._accept(again, start, best, settled, observed.terms)
         return result or found
 
     def _track(self, observed: Observed, prior: Prior, expected_share: float) -> Estimate | Failure:
@@ -251,7 +270,7 @@ class Localizer:
         if known and innovation @ terms.informations[-1] @ innovation > _MOST_INNOVATION:
             # A jump: the points know better.
             posterior = self._settle(observed, best, observed.terms)
-        result = self._accept(observed, start, best, posterior)
+        result = self._accept(observed, start, best, posterior, self._own_terms(observed, prior))
         if result and np.count_nonzero(result.inliers) < (
             _STILL_TRACKED * expected_share * len(observed.usable)
         ):
@@ -268,28 +287,63 @@ class Localizer:
         assumed = observed.assumed
         if may_rest != assumed.may_rest:
             assumed = replace(assumed, may_rest=may_rest)
-        threshold = self.config.inlier_threshold
-        sighted = observed.sighted
+        gate, sighted = self._gate(observed, best.state), observed.sighted
         observations = relinearized(sighted.camera, observed.observations, best.state, sighted.turn)
-        return settle(observations, best.state, terms, threshold, assumed)
+        return frame_posterior(observations, best.state, terms, gate, assumed)
+
+    def _gate(self, observed: Observed, state: Array) -> float:
+        """Inlier threshold (px) with room for what the map is known to be off."""
+        threshold, deviation = self.config.inlier_threshold, self.config.map_deviation
+        if not deviation > 0.0:
+            return threshold
+        points = observed.observations.points
+        depth = median_depth(state, points, np.ones(len(points), dtype=np.bool_))
+        focal = observed.assumed.focal_length
+        return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, _NEAREST))
+
+    def _own_terms(self, observed: Observed, prior: Prior) -> PriorTerms:
+        """What is known of a frame by its own and by the velocities of those before.
+
+        Their poses, and so the predicted one, are off by the same calibration as this one.
+        """
+        if prior.covariance is None:
+            return observed.terms
+        covariance = np.array(prior.covariance, float)
+        covariance[POSE] = covariance[:, POSE] = 0.0
+        np.fill_diagonal(covariance[POSE, POSE], np.inf)
+        of_velocities = replace(prior, covariance=covariance)
+        turned = observed.sighted.turn is not None
+        return with_motion(observed.terms, of_velocities, observed.centre, turned)
 
     def _accept(
-        self, observed: Observed, start: Candidate, best: Candidate, posterior: Posterior
-    ) -> Estimate | Failure:
+        self, observed: Observed, start: Candidate, best: Candidate, posterior: Posterior,
+        own_terms: PriorTerms,
+    ) -> Estimate | Failure:  # fmt: skip
         """Accept the motion or say what is wrong with it."""
+        effect = NO_EFFECT
+        enough = np.count_nonzero(posterior.inliers) >= self.config.min_inliers
+        if enough and posterior.determined and np.all(np.isfinite(posterior.state)):
+            effect = calibration_effect(observed, posterior, own_terms, self.config.calibration)
+        known = math.hypot(posterior.declared, effect.residual)  # px, of map and calibration
         failure = refusal(
             observed.observations,
-            posterior,
+            replace(posterior, declared=known),
             best.samples,
             min_inliers=self.config.min_inliers,
-            threshold=self.config.inlier_threshold,
+            threshold=self._gate(observed, posterior.state),
             rolling=self._solver.rolling_shutter,
         )
         if failure is not None:
             return failure
         still = self._search.global_shutter_inliers(observed, start)
-        if observed.lens is None and not observed.asks_lens:
-            return estimate_of(observed, posterior, still, best.samples)
-        posterior, lens = told_of_lens(observed, posterior)
+        lens = None
+        if observed.lens is not None or observed.asks_lens:
+            posterior, lens = told_of_lens(observed, posterior)
         estimate = estimate_of(observed, posterior, still, best.samples)
-        return replace(estimate, lens=observed.lens, of_lens=lens)
+        return replace(
+            estimate,
+            calibration_covariance=effect.covariance,
+            still_deviation=effect.still_deviation,
+            lens=observed.lens,
+            of_lens=lens,
+        )

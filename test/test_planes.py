@@ -150,7 +150,8 @@ def test_orientations_that_the_points_hardly_tell_are_not_published(small_planes
     for result, points, pixels, _ in small_planes[:20]:
         if result:
             told = localizer.localize(points, pixels)
-            assert bool(told) == (result.orientation_deviation <= 0.07)
+            open_to = 0.21 if result.still_deviation <= 0.07 else 0.07
+            assert bool(told) == (result.orientation_deviation <= open_to)
             assert told or told.reason == "uncertain"
 
 
@@ -162,7 +163,7 @@ def test_a_track_begins_with_an_orientation_that_is_not_published():
     rng = np.random.default_rng(3)
     frames = [exact + rng.normal(size=exact.shape) for _ in range(12)]
     alone = rsl.Localizer(camera, max_orientation_deviation=1.0).localize(points, frames[0])
-    most = 0.7 * alone.orientation_deviation
+    most = alone.orientation_deviation / 3.2
     tracker = rsl.Tracker(rsl.Localizer(camera, max_orientation_deviation=most))
     results = [
         tracker.localize(33_333_333 * (1 + k), points, frame) for k, frame in enumerate(frames)
@@ -170,7 +171,7 @@ def test_a_track_begins_with_an_orientation_that_is_not_published():
     assert results[0].reason == "uncertain"
     assert results[-1]
     assert results[-1].tracked
-    assert results[-1].orientation_deviation <= most
+    assert results[-1].orientation_deviation <= 3.0 * most
 
 
 def test_gravity_levels_a_camera_at_rest():

@@ -16,6 +16,8 @@ from rs_localizer.estimation.refine import apply_step
 
 READOUT = 0.03
 FADING = 0.1  # s
+# Of the cosines and sines of an in-frame turn: the faster, the smaller.
+SIZES = (1.0 / np.arange(1, 15)[:, None] ** np.array([1.0, 2.0])).ravel()
 ACCELERATIONS = np.array([0.02, -0.01, 0.015, 0.004, 0.003, -0.002])
 
 
@@ -143,7 +145,8 @@ def test_new_accelerations_take_over_from_those_that_fade():
 
 def shaking(seed=0, size=0.003):
     rng = np.random.default_rng(seed)
-    factor = 0.003 * rng.normal(size=(30, 30))
+    sizes = np.concatenate([np.ones(18), np.repeat(SIZES, 3)])
+    factor = 0.003 * sizes[:, None] * rng.normal(size=(102, 102)) / 3.0
     vector, nothing = start(ACCELERATIONS), np.zeros(0)
     motion = motion_of(vector)
     return Estimate(
@@ -151,24 +154,22 @@ def shaking(seed=0, size=0.003):
         angular_acceleration=motion.angular_acceleration,
         linear_acceleration=motion.linear_acceleration,
         inliers=nothing > 0, residuals=nothing, joint_covariance=factor @ factor.T,
-        global_shutter_inliers=0, iterations=0, shake=size * rng.normal(size=(4, 3)),
+        global_shutter_inliers=0, iterations=0,
+        shake=size * SIZES[:, None] * rng.normal(size=(28, 3)),
     )  # fmt: skip
 
 
-def whole_polynomials(estimate):
-    """Value (3,) and slope (3,) at the middle of the shaking that nothing was taken from."""
-    sizes = (3.0 / np.arange(2, 2 + len(estimate.shake))) ** 2
-    coefficients = np.vstack([np.zeros((2, 3)), sizes[:, None] * estimate.shake])
-    slope = 2.0 * legendre.legval(0.0, legendre.legder(coefficients))
-    return legendre.legval(0.0, coefficients), slope
+def whole_waves(estimate):
+    """Value (3,) and slope (3,) in the middle of the waves that nothing was taken from."""
+    return np.sum(estimate.shake[::2], axis=0), np.pi * np.arange(1, 15) @ estimate.shake[1::2]
 
 
 def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
-    """Whole polynomials vanish on average; those of a frame are taken from the middle row."""
+    """Whole waves vanish on average; those of a frame are taken from the middle row."""
     estimate = shaking()
     motion, _, swing = unshaken(estimate)
-    value, slope = whole_polynomials(estimate)
-    # The camera at tau = 0 is the motion's, turned by the polynomials in its own axes.
+    value, slope = whole_waves(estimate)
+    # The camera at tau = 0 is the motion's, turned by the waves in its own axes.
     turned = motion.rotation.T @ Rotation.from_rotvec(value).as_matrix()
     np.testing.assert_allclose(turned, estimate.rotation.T, atol=1e-12)
     np.testing.assert_allclose(
@@ -178,12 +179,11 @@ def test_without_its_shaking_a_motion_is_what_the_shaking_goes_around():
     np.testing.assert_allclose(motion.angular_velocity + slope, estimate.angular_velocity)
     np.testing.assert_array_equal(motion.linear_velocity, estimate.linear_velocity)
     np.testing.assert_array_equal(motion.linear_acceleration, estimate.linear_acceleration)
-    for part, at in ((slice(0, 3), legendre.legval), (slice(6, 9), None)):
-        size = 0.0
-        for degree, row in enumerate(estimate.shake, start=2):
-            series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
-            amount = at(0.0, series) if at else 2 * legendre.legval(0.0, legendre.legder(series))
-            size += amount**2 * np.mean(row**2)
+    squares = np.mean(estimate.shake**2, axis=1)
+    rates = np.pi * np.arange(1, 15)
+    for part, size in (
+        (slice(0, 3), squares[::2].sum()), (slice(6, 9), rates**2 @ squares[1::2])
+    ):  # fmt: skip
         np.testing.assert_allclose(swing[part, part], size * np.eye(3), atol=1e-15)
         swing[part, part] = 0.0
     assert not swing.any()
@@ -206,7 +206,7 @@ def test_without_its_shaking_the_covariance_knows_of_it():
         )  # fmt: skip
         return step_between(state(motion), state(unshaken(changed)[0]))
 
-    jacobian = derivatives(moved, 30)
+    jacobian = derivatives(moved, 102)
     expected = jacobian @ estimate.joint_covariance @ jacobian.T
     scale = np.sqrt(np.diag(expected))
     # The turn back is of first order in the shaking, its part in the errors is left out.

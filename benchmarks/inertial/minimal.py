@@ -40,7 +40,7 @@ from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import MotionSearch
-from rs_localizer.solvers.table import Solver, find_solver
+from rs_localizer.solvers.table import Solver, find_solver, start_solver
 
 _FEW = (6, 8, 12)  # right matches, and as many wrong ones
 _SHAKING = ((0.3, 60.0), (0.1, 120.0))  # degrees, hertz
@@ -173,7 +173,7 @@ def _found(
         with_experience(assumed, prior, turn_seen(terms, turn)),
         Sighted(camera, *given, usable, turn),
     )
-    start, best = MotionSearch(camera, config, solver).find(observed)
+    start, best = MotionSearch(camera, config, solver, start_solver(solver)).find(observed)
     if not start.found:
         return np.diag([1.0, -1.0, -1.0]), best.samples
     threshold = config.inlier_threshold

@@ -9,6 +9,7 @@ from rs_localizer.config.declared import (
 )
 from rs_localizer.config.method import (
     Acceleration,
+    CalibrationErrors,
     LocalizerConfig,
     VelocityPrior,
     localizer_config,
@@ -33,6 +34,7 @@ from rs_localizer.config.nodes import (
 __all__ = [
     "LONGEST_READOUT_TIME",
     "Acceleration",
+    "CalibrationErrors",
     "DetectorConfig",
     "FeatureConfig",
     "FeatureKind",

@@ -133,7 +133,7 @@ class LocalizerConfig:
     max_orientation_deviation: float = setting(
         0.07,
         "Largest standard deviation of the orientation of a pose that is accepted, in rad, about "
-        "the axis known worst",
+        "the axis known worst, of a camera at rest; three times as much of one that may move",
         minimum=0.001,
         maximum=10.0,
     )
@@ -146,7 +146,7 @@ class LocalizerConfig:
     map_deviation: float = setting(
         0.0,
         "How well the points of the map are known, in m (one standard deviation; neighbours are "
-        "assumed to be off together)",
+        "assumed to be off together); it widens covariances and gates",
         minimum=0.0,
         maximum=1000.0,
     )

@@ -10,7 +10,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.known_turn import Turning, find_turn, late_at
 from rs_localizer.core.rate_spline import change_at
-from rs_localizer.core.shake import shake_basis
+from rs_localizer.core.shake import FUNCTIONS, shake_basis
 from rs_localizer.core.shutter import Numbers
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
@@ -142,9 +142,9 @@ def _shaken(shake: Array, tau: float, count: int) -> tuple[Array, Array, Array, 
     Before the first and after the last row the camera stays as it was.
     """
     here = min(max(tau, -0.5), 0.5)
-    values, rates = np.zeros(count), np.zeros(count)
+    values, rates = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
     if count:
-        shake_basis(here, count + 1, values, rates)
+        shake_basis(here, values, rates)
     if tau != here:
         rates[:] = 0.0
     turn, rate = np.zeros(3), np.zeros(3)

@@ -1,60 +1,53 @@
-"""Shaking: a turn of the camera beside its motion, as polynomials of the row time."""
+"""In-frame turn: what the camera turns beside a motion of constant acceleration.
+
+A sum of cosines and sines of the row time at fixed frequencies, half a cycle per readout apart:
+vibration of any spectrum, as a Gaussian process in row time. Value and slope at the middle row are
+taken away, so that pose and velocities there are the motion's own.
+"""
 
 from __future__ import annotations
-
-from functools import cache
 
 import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.simd.jit import kernel
 
-# Polynomials of the row time, from the second degree: the motion has a constant and a linear part.
-FIRST_DEGREE = 2
-_WHOLE_SIZE = 3.0  # the degree that counts as it is
+CYCLES = 0.5 * np.arange(1.0, 15.0)
+"""Cycles per readout. With a readout of 30 ms up to 233 Hz; half a cycle apart is what a window of
+one readout resolves (twice the Rayleigh spacing of cosine and sine together)."""
+FUNCTIONS = 2 * len(CYCLES)
+RATES = 2.0 * np.pi * CYCLES
+"""rad per unit of row time."""
 
 
 @kernel
-def legendre(x: float, values: Array) -> None:
-    """Fill in the Legendre polynomials of degree 0, 1, ... at x."""
-    values[0] = 1.0
-    values[1] = x
-    for k in range(2, len(values)):
-        values[k] = ((2 * k - 1) * x * values[k - 1] - (k - 1) * values[k - 2]) / k
+def shake_basis(tau: float, values: Array, rates: Array) -> None:
+    """Fill in ``cos(w tau) - 1`` and ``sin(w tau) - w tau`` of each frequency, and their rates.
 
-
-@kernel
-def shake_basis(tau: float, degrees: int, values: Array, rates: Array) -> None:
-    """Fill in the polynomials of the shaking at a row time, and their rates.
-
-    Legendre polynomials of ``2 tau`` of degree 2 to ``degrees``, less their value and slope at the
-    middle row: there, pose and velocities are the motion's own. They are the smaller the faster
-    they change, because what is slow swings farther.
+    By the recurrence of the half-cycle: frequencies are its multiples.
     """
-    x = 2.0 * tau
-    # Polynomials of two degrees, here and at the middle row, and their derivatives by x.
-    at, at_before, middle, middle_before = x, 1.0, 0.0, 1.0
-    slope_at = 1.0
-    for k in range(FIRST_DEGREE, degrees + 1):
-        slope_at = k * at + x * slope_at
-        slope = k * middle
-        at, at_before = ((2 * k - 1) * x * at - (k - 1) * at_before) / k, at
-        middle, middle_before = -(k - 1) * middle_before / k, middle
-        size = (_WHOLE_SIZE / k) ** 2
-        values[k - FIRST_DEGREE] = size * (at - middle - x * slope)
-        rates[k - FIRST_DEGREE] = size * 2.0 * (slope_at - slope)
+    step = RATES[0] * tau
+    cosine, sine = np.cos(step), np.sin(step)
+    c, s = 1.0, 0.0
+    for k in range(len(RATES)):
+        c, s = c * cosine - s * sine, s * cosine + c * sine
+        values[2 * k], values[2 * k + 1] = c - 1.0, s - RATES[k] * tau
+        rates[2 * k], rates[2 * k + 1] = -RATES[k] * s, RATES[k] * (c - 1.0)
 
 
 @kernel
 def shake_at(tau: Array, coefficients: Array) -> Array:
-    """Turn of the camera beside its motion, and its rate, (n,6) at row times (n,)."""
+    """Turn of the camera beside its motion, and its rate, (n,6) at row times (n,).
+
+    ``coefficients`` (k,3) rad, of :func:`shake_basis`; none: the camera does not shake.
+    """
     count = len(coefficients)
-    values, rates = np.empty(count), np.empty(count)
+    values, rates = np.empty(FUNCTIONS), np.empty(FUNCTIONS)
     shake = np.zeros((len(tau), 6))
     if count == 0:
         return shake
     for i in range(len(tau)):
-        shake_basis(tau[i], count + FIRST_DEGREE - 1, values, rates)
+        shake_basis(tau[i], values, rates)
         for k in range(count):
             for axis in range(3):
                 shake[i, axis] += values[k] * coefficients[k, axis]
@@ -67,18 +60,8 @@ def within_rows(tau: float) -> float:
     return min(max(tau, -0.5), 0.5)
 
 
-def basis_sizes(degrees: int) -> Array:
-    """Sizes (degrees - 1,) of the polynomials of :func:`shake_basis`."""
-    sizes: Array = (_WHOLE_SIZE / np.arange(FIRST_DEGREE, degrees + 1)) ** 2
-    return sizes
-
-
-@cache
 def shake_in_the_middle(count: int) -> tuple[Array, Array]:
     """Values and slopes (count,) at the middle row that :func:`shake_basis` takes away."""
-    degrees = np.arange(FIRST_DEGREE, count + FIRST_DEGREE)
-    polynomials = [np.polynomial.Legendre.basis(k) for k in degrees]
-    sizes = basis_sizes(count + FIRST_DEGREE - 1)
-    values = sizes * np.array([p(0.0) for p in polynomials])
-    slopes = sizes * np.array([2.0 * p.deriv()(0.0) for p in polynomials])
-    return values, slopes
+    values, slopes = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
+    values[::2], slopes[1::2] = 1.0, RATES
+    return values[:count].copy(), slopes[:count].copy()

@@ -13,6 +13,7 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import MOTION_PARAMETERS, TURN
@@ -25,7 +26,8 @@ class Estimate(Motion):
     ``covariance`` orders its 12 rows: rotation (the camera turns by exp of it, in its own axes),
     camera position in camera axes, angular velocity, linear velocity; units as the fields.
     Accelerations and shaking are averaged out of it; ``joint_covariance`` has them behind, in the
-    order of ``rs_localizer.core.state`` and of ``shake``.
+    order of ``rs_localizer.core.state`` and of ``shake``. The former has the errors of the
+    calibration, which are the same in all frames; the latter is what the frames tell.
     """
 
     inliers: BoolArray  # (n,)
@@ -33,16 +35,15 @@ class Estimate(Motion):
     joint_covariance: Array  # (18 + 3 k, 18 + 3 k)
     global_shutter_inliers: int  # of the best global-shutter pose, at the same threshold
     iterations: int  # minimal samples drawn
-    # (k,3) rad: what the camera turns beside the motion, polynomials of the row time (see
-    # rs_localizer.estimation.model_error); most of it is vibration
+    # (12,12) of what calibration and declared map may be off, a part of ``covariance``
+    calibration_covariance: Array = field(
+        default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
+    )
+    still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
+    # (k,3) rad: what the camera turns beside the motion (rs_localizer.core.shake): vibration
     shake: Array = field(default_factory=lambda: np.zeros((0, 3)))
     model_error: float = 0.0  # px, rms of what map, lens and motion leave beside the noise
-    # What the frame says of how large shaking and model error are: logarithms of the odds of
-    # the sizes that rs_localizer.estimation.settling tries.
-    of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
-    of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
-    # Logarithm of the likelihood (m,s) of each tone, less that of none; empty where not asked.
-    of_tones: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     tracked: bool = False  # found near a prior motion, without a search
     # How a gyroscope says that the camera turned; velocities and accelerations are those of both
     turn: KnownTurn | None = None
@@ -55,12 +56,13 @@ class Estimate(Motion):
     @property
     def covariance(self) -> Array:
         """Covariance (12,12) of pose and velocities at tau = 0."""
-        return self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+        own = self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
+        return own + self.calibration_covariance
 
     @property
     def orientation_deviation(self) -> float:
         """Standard deviation (rad) of the orientation at tau = 0, about the axis known worst."""
-        return math.sqrt(np.linalg.eigvalsh(self.joint_covariance[TURN, TURN])[-1])
+        return math.sqrt(np.linalg.eigvalsh(self.covariance[TURN, TURN])[-1])
 
     def shake_at(self, tau: float) -> tuple[Array, Array]:
         """Turn (3,) of the camera beside the motion, and its rate (3,), at row time ``tau``.

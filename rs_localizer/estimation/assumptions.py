@@ -8,15 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.estimation.prior_terms import (
     PriorTerms,
     held_terms,
     motion_terms,
+    slower_terms,
     with_measurements,
     with_turn,
 )
@@ -24,18 +25,6 @@ from rs_localizer.solvers.table import Solver
 
 # Where the readout time is unknown, that of a slow camera: its motion per readout is the largest.
 _UNKNOWN_READOUT_TIME = 0.03
-# Accelerations change at the pace of two hertz, rad/s.
-_JERK_RATE = 4.0 * math.pi
-# Third derivative of the cubic among the polynomials of the shaking.
-_JERK_OF_CUBIC = 120.0
-# Sizes to try, as multiples of the least, and their probabilities.
-SHAKE_SIZES = 10.0 ** np.arange(0.0, 5.1)
-SHAKE_PRIOR = np.array([0.6, 0.15, 0.12, 0.09, 0.03, 0.01])
-FIELD_SIZES = 10.0 ** np.arange(0.0, 2.1, 0.5)
-# Lenses and maps are never better than this, px: a hundredth. Careful ones, surveyed tags before a
-# calibrated lens, have errors of 0.1 to 0.2; whose errors are a pixel, are rare.
-_LEAST_FIELD = 0.01
-FIELD_PRIOR = np.array([0.4, 0.25, 0.26, 0.088, 0.002])
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,23 +45,13 @@ class TurnSeen:
 class Assumed:
     """What is assumed of a camera and its map, beside the prior of the motion."""
 
-    shake: float  # rad, of each polynomial: as much as the jerk of an ordinary motion
     map_deviation: float  # m
     focal_length: float  # px
-    # Logarithms of the odds of each size beside those of any camera: what its last frames said.
-    of_shake_sizes: Array
-    of_field_sizes: Array
     may_rest: bool  # nothing speaks for a motion but the points
     rolling: bool  # velocities are estimated
-    of_tones: Array | None = None  # of each against none, by the last frames
+    scales: Scales  # of shaking, smooth errors and speed, as the frames before tell
     of_rest: float = 0.0  # logarithm of the odds for rest, beside those of any camera
     turn: TurnSeen | None = None  # by a gyroscope
-
-    def field_sizes(self, depth: float) -> Array:
-        """Standard deviations (k,) of the field to try, px, of points so far away (m)."""
-        least = math.hypot(_LEAST_FIELD, self.map_deviation * self.focal_length / depth)
-        sizes: Array = least * FIELD_SIZES
-        return sizes
 
 
 def assumptions(
@@ -89,16 +68,33 @@ def assumptions(
         if solver.rolling_shutter
         else held_terms()
     )
-    jerk = acceleration.angular * _JERK_RATE * readout_time**3
     return terms, Assumed(
-        shake=jerk / _JERK_OF_CUBIC,
         map_deviation=config.map_deviation,
         focal_length=camera.focal_length,
-        of_shake_sizes=np.zeros(len(SHAKE_SIZES)),
-        of_field_sizes=np.zeros(len(FIELD_SIZES)),
         may_rest=solver.rolling_shutter and min(velocity.angular, velocity.linear) > 0.0,
         rolling=solver.rolling_shutter,
+        scales=Scales.nothing(),
     )
+
+
+# Logarithm of the odds at which frames deny a typical speed.
+_DENIED = -4.0
+# What is denied never leaves less than this part of the configured speed: cameras start to move.
+_SLOWEST = 0.1
+
+
+def told_speed(terms: PriorTerms, prior: Prior | None) -> tuple[PriorTerms, Prior | None]:
+    """The prior of the fastest motion that frames before leave possible, and what else they say."""
+    if prior is None or prior.motion is not None or prior.scales is None:
+        return terms, prior
+    possible = [
+        part for part, odds in zip(SPEEDS, prior.scales.speeds, strict=True) if odds > _DENIED
+    ]
+    part = max(possible, default=1.0)
+    if part == 1.0:
+        return terms, prior
+    scales = prior.scales._replace(speeds=np.zeros(len(SPEEDS)))
+    return slower_terms(terms, max(part, _SLOWEST)), replace(prior, scales=scales)
 
 
 def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None) -> Assumed:
@@ -111,13 +107,9 @@ def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None
         return assumed
     if prior.of_rest != 0.0:
         assumed = replace(assumed, of_rest=prior.of_rest)
-    if prior.of_tones is not None:
-        assumed = replace(assumed, of_tones=prior.of_tones)
-    if prior.of_shake_sizes is None or prior.of_field_sizes is None:
-        return assumed
-    return replace(
-        assumed, of_shake_sizes=prior.of_shake_sizes, of_field_sizes=prior.of_field_sizes
-    )
+    if prior.scales is not None:
+        assumed = replace(assumed, scales=prior.scales)
+    return assumed
 
 
 def known_terms(terms: PriorTerms, prior: Prior | None, turn: KnownTurn | None) -> PriorTerms:

@@ -57,9 +57,11 @@ _SMALL = 0.2  # of a step, in standard deviations
 # the motion, in inlier thresholds, or a smooth field, whatever else explains it (logarithm of the
 # odds; shaking alone leaves less).
 _BY_LENS = (Reason.MODEL_ERROR, Reason.RESIDUAL)
-_MUCH_NOISE, _MUCH_MODEL_ERROR, _FIELD_ODDS = 0.6, 0.1, 12.0
+_MUCH_NOISE, _MUCH_MODEL_ERROR, _SMOOTH_EXCESS = 0.6, 0.1, 5.0
 # Logarithm of the odds by which the lens must explain the points better than what was refused.
 _DECIDED = 20.0
+# Likewise, by which a frame must be explained better without a lens that others told of.
+_REFUTED = 5.0
 # Smooth errors that it may leave, in parts of the noise: a bent map leaves more.
 _MOST_LEFT = 1.0
 # Swing of the points by shaking, likewise, beyond which a frame says nothing of a lens.
@@ -88,7 +90,7 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
     axis, before a camera that comes nearer, looks like one that a lens bends about its middle.
     """
     sighted, terms = observed.sighted, observed.terms
-    if is_plane(observed.observations.points, refused.inliers):
+    if is_plane(observed.observations.points, refused.inliers) or _too_few(sighted, refused):
         return None
     camera, state = sighted.camera, refused.state
     coefficients = np.zeros(coefficients_of(camera))
@@ -127,6 +129,7 @@ def told_of_lens(observed: Observed, posterior: Posterior) -> tuple[Posterior, L
     silent = (
         posterior.model_error > _MOST_LEFT * posterior.noise
         or is_plane(observed.observations.points, posterior.inliers)
+        or _too_few(observed.sighted, posterior)
         or _shakes(observed, posterior)
     )
     if silent and believed is None:
@@ -144,6 +147,12 @@ def told_of_lens(observed: Observed, posterior: Posterior) -> tuple[Posterior, L
     return replace(posterior, covariance=covariance), says
 
 
+def _too_few(sighted: Sighted, posterior: Posterior) -> bool:
+    """Whether points give less than two equations for each number of motion and lens."""
+    needed = PARAMETERS + coefficients_of(sighted.camera)
+    return int(np.count_nonzero(posterior.inliers)) < needed
+
+
 def _shakes(observed: Observed, posterior: Posterior) -> bool:
     """Whether the points swing by more than a part of the noise."""
     turns = shake_at(observed.observations.tau, posterior.shake)[:, :3]
@@ -155,9 +164,7 @@ def may_be_lens(found: Estimate | Failure, posterior: Posterior, threshold: floa
     """Whether a lens that is off may be why a frame was refused, or nearly so."""
     if not found:
         return found.reason in _BY_LENS
-    return _odd(posterior, threshold) or bool(
-        posterior.of_field_sizes.max(initial=0.0) > _FIELD_ODDS
-    )
+    return _odd(posterior, threshold) or bool(posterior.scales.excess[-1] > _SMOOTH_EXCESS)
 
 
 def _odd(posterior: Posterior, threshold: float) -> bool:
@@ -179,10 +186,32 @@ def decided(before: Posterior, after: Posterior, lens: LensError, threshold: flo
     now = after.squared_errors[chosen].sum()
     freedom = 2.0 * np.count_nonzero(chosen) - PARAMETERS
     left_over = _odd(after, threshold) or after.model_error > _MOST_LEFT * after.noise
-    if left_over or not credible(lens) or not (freedom > 0.0 and now > 0.0):
+    if (
+        left_over
+        or not credible(lens)
+        or not (freedom > 0.0 and left > 0.0 and 0.0 < now < math.inf)
+    ):
         return False
     gain = freedom * math.log(left / now) - _known(lens, 1.0)
     return bool(0.5 * gain > _DECIDED)
+
+
+def refuted(by_lens: Array, by_calibration: Array, threshold: float) -> bool:
+    """Whether a frame contradicts the lens that frames before it told of.
+
+    Args:
+        by_lens, by_calibration: residuals (n,), px, by that lens and by the calibration.
+        threshold: px, beyond which all are the same.
+    """
+    both = np.isfinite(by_lens) & np.isfinite(by_calibration)
+    squares = [
+        float(np.sum(np.minimum(residuals[both], threshold) ** 2))
+        for residuals in (by_lens, by_calibration)
+    ]
+    if not min(squares) > 0.0:
+        return False
+    gain = float(np.count_nonzero(both)) * math.log(squares[0] / squares[1])
+    return gain > _REFUTED
 
 
 def credible(lens: LensError) -> bool:
@@ -225,6 +254,16 @@ def _known(lens: LensError, part: float) -> float:
     return float(np.linalg.slogdet(within)[1] - np.linalg.slogdet(part**-2 * beforehand)[1])
 
 
+def rays_of_lens(sighted: Sighted, tau: Array, rays: Array) -> Array:
+    """Rays (n,2) as they come in at row times (n,), out of which a known turn was taken."""
+    if sighted.turn is None:
+        return rays
+    turned = sighted.turn.at_rows(tau)[0]
+    local = np.einsum("nij,nj->ni", turned, np.column_stack([rays, np.ones(len(rays))]))
+    seen: Array = local[:, :2] / local[:, 2:]
+    return seen
+
+
 def _told(
     sighted: Sighted, observations: Observations, best: Posterior, terms: PriorTerms,
     coefficients: Array,
@@ -244,11 +283,8 @@ def _told(
         observations.row_time_gradient,
         shake_at(observations.tau, best.shake),
     )
-    seen, camera = lines.image[chosen], sighted.camera
-    if sighted.turn is not None:  # out of which the rays were turned
-        turned = sighted.turn.at_rows(observations.tau[chosen])[0]
-        local = np.einsum("nij,nj->ni", turned, np.column_stack([seen, np.ones(len(seen))]))
-        seen = local[:, :2] / local[:, 2:]
+    camera = sighted.camera
+    seen = rays_of_lens(sighted, observations.tau[chosen], lines.image[chosen])
     columns = by_lens(camera, seen).reshape(-1, len(coefficients))
     dense, left = lines.by_motion[chosen].reshape(-1, PARAMETERS), lines.errors[chosen].ravel()
     variance = best.noise**2

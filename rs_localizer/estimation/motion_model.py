@@ -26,6 +26,8 @@ from rs_localizer.estimation.refine import inverted
 FADING = 0.1
 # Below this part of the time of fading the closed form of the noise is rounding errors.
 _SHORT = 0.03
+# Part of a variance that rounding may take.
+_ROUNDING = 1e-9
 # Where the parts of a step begin (see :mod:`rs_localizer.core.state`).
 _TURN, _MOVE, _ANGULAR, _LINEAR, _CHANGE, _ACCELERATION = range(0, PARAMETERS, 3)
 
@@ -172,7 +174,15 @@ def _unshaken(
         turned @ rotation, turned @ translation, angular - rate, linear.copy(), change.copy(),
         acceleration.copy(),
     )  # fmt: skip
-    return beside, jacobian @ joint @ jacobian.T, swing
+    covariance = jacobian @ joint @ jacobian.T
+    # Pose and turn cancel: what rounding leaves of the difference of two large variances.
+    for i in range(PARAMETERS):
+        for j in range(i):
+            covariance[i, j] = 0.5 * (covariance[i, j] + covariance[j, i])
+            covariance[j, i] = covariance[i, j]
+        if len(joint) > PARAMETERS:
+            covariance[i, i] += _ROUNDING * joint[i, i]
+    return beside, covariance, swing
 
 
 def with_mean_turn(motion: Motion, covariance: Array, turn: KnownTurn) -> tuple[Motion, Array]:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
@@ -66,17 +67,14 @@ class Posterior:
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2
     mirror: Mirror | None = None
-    # Likewise the pose of a plane that faces the camera; covered: it is no other one
-    facing: Mirror | None = None
     shake: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
     agreement: float = 0.0  # of neighbouring rows, standard deviations
-    strangers: int = 0  # points just beyond the gate, where they are too many to be chance
-    exhausted: bool = False  # tones shake the camera, and the points are too few for all of them
-    # What the frame says of the sizes of shaking and field, logarithms of odds; empty: nothing.
-    of_shake_sizes: Array = field(default_factory=lambda: np.zeros(0))
-    of_field_sizes: Array = field(default_factory=lambda: np.zeros(0))
-    of_tones: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    declared: float = 0.0  # px, the part of it that the map is known to be off
+    # Probabilities of the typical speeds; empty: the configured one
+    speeds: Array = field(default_factory=lambda: np.zeros(0))
+    near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
+    scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
 
     @property
     def determined(self) -> bool:

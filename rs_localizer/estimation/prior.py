@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lens import LensError
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.shutter import Motion
 from rs_localizer.estimation.prior_checks import check_covariance, check_motion
 
@@ -26,10 +27,7 @@ class Prior:
             ``Estimate.joint_covariance``; infinite variances leave a parameter free.
         angular_velocity, angular_velocity_deviation: a gyroscope's body rate (3,) in camera axes
             times the readout time (rad per readout), and its standard deviation.
-        of_shake_sizes, of_field_sizes: what the frames before say of shaking and model error, as
-            the fields of ``Estimate`` of these names.
-        of_tones: logarithm of the odds of each tone against none, see
-            :mod:`rs_localizer.estimation.tone_memory`.
+        scales: what the frames before say of shaking, smooth errors and speed.
         of_rest: logarithm of the odds that the camera does not move within the image, beside
             those of any camera.
         lens: what the calibration lacks, by other frames; None: nothing.
@@ -49,9 +47,7 @@ class Prior:
     gravity: ArrayLike | None = None
     gravity_deviation: float = math.nan
     gravity_in_map: ArrayLike = (0.0, 0.0, -1.0)
-    of_shake_sizes: Array | None = None
-    of_field_sizes: Array | None = None
-    of_tones: Array | None = None
+    scales: Scales | None = None
     of_rest: float = 0.0
     lens: LensError | None = None
     asks_lens: bool = False

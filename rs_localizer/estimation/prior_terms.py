@@ -27,7 +27,8 @@ from rs_localizer.estimation.prior import Prior, state_in
 _HOLDING = 1e18
 # A tenth of the speed goes with the accelerations of the whole.
 _JOLTS = 10.0
-_WALKING = 0.1
+WALKING = 0.1
+"""Least part of the configured linear velocity that goes with a slower turn."""
 # What a gyroscope knows: turn rate and its change.
 _TURNING = np.ix_(np.r_[ANGULAR, ANGULAR_ACCELERATION], np.r_[ANGULAR, ANGULAR_ACCELERATION])
 
@@ -69,7 +70,7 @@ def slower_terms(terms: PriorTerms, part: float, turn_known: bool = False) -> Pr
     """
     informations = terms.informations.copy()
     informations[0, ANGULAR] /= part**2
-    informations[0, LINEAR] /= max(part, _WALKING) ** 2
+    informations[0, LINEAR] /= max(part, WALKING) ** 2
     informations[0, ACCELERATIONS] /= min(_JOLTS * part, 1.0) ** 2
     if turn_known:
         informations[0][_TURNING] = terms.informations[0][_TURNING]

@@ -16,7 +16,7 @@ from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses
 from rs_localizer.estimation.refine import EXPECTED_NOISE
 from rs_localizer.estimation.sampling import Pool
 from rs_localizer.estimation.scoring import descend, optimize
-from rs_localizer.solvers.table import Solver, find_solver
+from rs_localizer.solvers.table import Solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
 # of the image; it only has to be right to some degrees. In focal lengths.
@@ -39,11 +39,12 @@ _SECOND_LOOK_SAMPLES = 96
 class MotionSearch:
     """Finds the motion that most points of a frame agree on."""
 
-    def __init__(self, camera: Camera, config: LocalizerConfig, solver: Solver) -> None:
+    def __init__(
+        self, camera: Camera, config: LocalizerConfig, solver: Solver, start: Solver
+    ) -> None:
         self._config = config
         self._solver = solver
-        # Of a rolling shutter the pose of one instant that explains it roughly; any would do.
-        self._start_solver = find_solver("p3p") if solver.rolling_shutter else solver
+        self._start = start  # a global-shutter solver
         self._focal_length = camera.focal_length
 
     def find(self, observed: Observed) -> tuple[Candidate, Candidate]:
@@ -88,7 +89,7 @@ class MotionSearch:
         inliers.
         """
         share = float(np.mean(inliers))
-        chance = (1.0 - share**self._start_solver.sample_size) ** samples
+        chance = (1.0 - share**self._start.sample_size) ** samples
         return chance > 1.0 - self._config.confidence
 
     def _largest_group(
@@ -124,7 +125,7 @@ class MotionSearch:
     def _global_shutter(
         self, observed: Observed, among: IntArray, most: int, before: Candidate = NOTHING
     ) -> Candidate:
-        """A pose that fits all rows: roughly, by a wide threshold, where the shutter rolls."""
+        """A pose that fits all rows roughly, from some points and with a wide threshold."""
         threshold = self._config.inlier_threshold
         wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
         if self._solver.rolling_shutter:
@@ -132,7 +133,7 @@ class MotionSearch:
         else:
             score_scale, final_scale = _SCORE_SCALE * threshold, threshold
         hypotheses = self._hypotheses(
-            self._start_solver, _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
+            self._start, _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
         )
         pools = _pools(observed, among)
         draws = Draws([np.eye(3)], pools, self._config.confidence, most, observed.random)

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from rs_localizer.estimation import (
-    averaging,
-    lookalike,
-    motion_model,
-    packing,
-    scoring,
-    tone_search,
-)
+from rs_localizer.estimation import averaging, frame_fit, motion_model, packing, scoring
 
 
 def compile_rare() -> None:
     """Compile what the frames of :meth:`Localizer.warm_up` do not come to, or load it."""
-    for part in (averaging, lookalike, motion_model, packing, scoring, tone_search):
+    for part in (averaging, frame_fit, motion_model, packing, scoring):
         part.warm_up()

@@ -9,6 +9,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.scales import Scales
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, TURN, step_between
 from rs_localizer.core.types import Estimate, Failure
@@ -46,8 +47,7 @@ class Before:
     covariance: Array  # (18,18)
     added: Array  # (18,18) that the prediction gets, but for the rotation
     fading: float  # of accelerations, in readouts
-    of_shake_sizes: Array  # as of the fields of a :class:`Prior`
-    of_field_sizes: Array
+    scales: Scales  # as of a :class:`Prior`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,8 +215,7 @@ class GyroscopeAid:
         prior = Prior(
             motion=predicted.motion,
             covariance=predicted.covariance,
-            of_shake_sizes=last.of_shake_sizes,
-            of_field_sizes=last.of_field_sizes,
+            scales=last.scales,
         )
         return GyroPrediction(middle_ns, within, prior, predicted)
 

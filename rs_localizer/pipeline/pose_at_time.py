@@ -40,6 +40,7 @@ from rs_localizer.core.known_turn import NO_TURN, Turning
 from rs_localizer.core.moment_kernels import pose_of, twist_of
 from rs_localizer.core.shake import shake_at, within_rows
 from rs_localizer.core.shutter import Numbers, numbers_of
+from rs_localizer.core.state import MOTION_PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.outputs import Pose, Twist
 
@@ -68,7 +69,8 @@ def twist_at(estimate: Estimate, tau: float, readout_time: float) -> Twist:
 def _numbers(estimate: Estimate, tau: float) -> tuple[Numbers, Array, Array, Turning, float]:
     """An estimate at a row time, as kernels take it."""
     turn = NO_TURN if estimate.turn is None else estimate.turn.numbers
-    joint = np.ascontiguousarray(estimate.joint_covariance)
+    joint = np.ascontiguousarray(estimate.joint_covariance.copy())
+    joint[:MOTION_PARAMETERS, :MOTION_PARAMETERS] = estimate.covariance
     return numbers_of(estimate), np.ascontiguousarray(estimate.shake), joint, turn, float(tau)
 
 

@@ -49,12 +49,13 @@ REASONS: dict[str, Meaning] = {
         "the motion would be faster than a camera moves", f"mostly chance matches; {_TURNED}"
     ),
     Reason.MIRRORED: Meaning(
-        "planar pose ambiguity: two poses fit equally well, mirrored or tilted and frontoparallel",
+        "planar pose ambiguity: two poses, mirrored about the line of sight, fit equally well",
         "come nearer, look from an angle, use a larger board or markers on several walls",
     ),
     Reason.MODEL_ERROR: Meaning(
-        "the errors of neighbouring points agree, or few points shake out of the gate: vibration "
-        "that the rows cannot tell, or a map or calibration that is too far off for any pose",
+        "neighbouring rows share errors, many points lie just beyond the inlier gate, or errors "
+        "are large and smooth over the image: vibration that the rows cannot tell, or a map or "
+        "calibration that is too far off for any pose",
         f"a stiffer mounting, the calibration (before a plane no frame tells its lens from a bent "
         f"map: show points at several depths), the map; {_TURNED}",
     ),

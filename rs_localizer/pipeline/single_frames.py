@@ -39,6 +39,7 @@ class SingleFrames:
         self.of_rest = 0.0
         self.remembers = remembers
         self._experience: Experience | None = None
+        self._last: tuple[Estimate, int] | None = None  # and its time, ns
         self._aid: GyroscopeAid | None = None
         if inertial is not None:
             fixed = replace(inertial, estimate_time_offset=False)
@@ -52,7 +53,7 @@ class SingleFrames:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._experience = None
+        self._experience, self._last = None, None
 
     def localize(
         self,
@@ -70,7 +71,7 @@ class SingleFrames:
             imu: samples around the exposure; None: the camera goes alone.
         """
         if self._aid is None:
-            return self._without_imu(points, pixels, scores)
+            return self._without_imu(time_ns, points, pixels, scores)
 
         def localized(foreseen: GyroPrediction | None) -> tuple[Estimate | Failure, Prior | None]:
             prior = None if foreseen is None else foreseen.prior
@@ -84,13 +85,19 @@ class SingleFrames:
         return self._aid.localize(imu, time_ns, lambda: None, localized)[0]
 
     def _without_imu(
-        self, points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None
+        self, time_ns: int, points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None
     ) -> Estimate | Failure:
         if not self.remembers:
             return self._localizer.localize(points, pixels, scores, Prior(of_rest=self.of_rest))
-        before = self._experience
-        prior = None if before is None else before.prior
-        result = self._localizer.localize(points, pixels, scores, prior)
+        before, last = self._experience, self._last
+        result = self._localizer.find(
+            points, pixels, scores, None if before is None else before.prior
+        )
         if result:
-            self._experience = Experience.of(result) if before is None else before.and_of(result)
-        return result
+            after = Experience.of(result) if before is None else before.and_of(result)
+            if before is not None and last is not None:
+                seconds = 1e-9 * (time_ns - last[1])
+                typical = self._localizer.config.velocity_prior
+                after = after.moving(before.scales.speeds, last[0], result, seconds, typical)
+            self._experience, self._last = after, (result, time_ns)
+        return self._localizer.accepted(result)

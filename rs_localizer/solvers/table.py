@@ -37,6 +37,9 @@ SOLVERS = {
 }
 
 
+_START = "p3p"
+
+
 @dataclass(frozen=True, slots=True)
 class Solver:
     """A minimal solver: its batch kernel (see :mod:`rs_localizer.solvers.batch`) and sizes."""
@@ -66,3 +69,8 @@ def find_solver(name: str) -> Solver:
         module.SOLUTIONS,
         row.rolling_shutter,
     )
+
+
+def start_solver(solver: Solver) -> Solver:
+    """The global-shutter solver whose pose a search begins with: a global-shutter one itself."""
+    return find_solver(_START) if solver.rolling_shutter else solver

@@ -132,7 +132,7 @@ def test_a_recording_of_everything(
             1,
             "map_file: nowhere.npz cannot be read: No",
         ),
-        (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth and -p are for offline replay"),
+        (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth, -p are for offline replay"),
         (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),
         (["all", "--keypoints", "/nowhere"], 1, "topic /nowhere does not exist"),
         (["all", "--keypoints", "/ids", "--map-points", "/x"], 1, "topic /x does not exist"),

@@ -4,7 +4,6 @@ A motion is a dictionary of what stands in a state, and the shaking's coefficien
 """
 
 import numpy as np
-from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
 # Skewed and with a lens, so that the derivative of a pixel by its ray is no diagonal matrix.
@@ -14,21 +13,15 @@ AXIS = {"top_to_bottom": (1, 1), "bottom_to_top": (1, -1),
         "left_to_right": (0, 1), "right_to_left": (0, -1)}  # fmt: skip
 
 
-def polynomials(tau, count):
-    """(n,count): Legendre's of 2 tau from the second degree, less value and slope at 0.
-
-    Those of higher degrees are smaller.
-    """
-    columns = []
-    for degree in range(2, count + 2):
-        series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
-        value, slope = legendre.legval(0.0, series), legendre.legval(0.0, legendre.legder(series))
-        columns.append(legendre.legval(2 * tau, series) - value - slope * 2 * tau)
-    return np.array(columns).T.reshape(len(tau), count)
+def waves(tau, count):
+    """(n,count): a cosine and a sine per half-cycle of the readout, less value and slope at 0."""
+    angle = np.pi * np.arange(1, count // 2 + 1) * np.asarray(tau)[:, None]
+    pairs = np.stack([np.cos(angle) - 1.0, np.sin(angle) - angle], axis=-1)
+    return pairs.reshape(len(tau), -1)[:, :count]
 
 
 def shake(tau, coefficients):
-    return polynomials(tau, len(coefficients)) @ coefficients
+    return waves(tau, len(coefficients)) @ coefficients
 
 
 def disturbed(state, step):

@@ -1,20 +1,46 @@
-"""What is the same, or would become it."""
+"""One Gaussian of many."""
 
 import numpy as np
 import pytest
 
-from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.averaging import on_the_way
+from rs_localizer.core.state import PARAMETERS, step_between
+from rs_localizer.estimation.averaging import averaged, longest_axis
 from rs_localizer.estimation.refine import apply_step
 
+STATE = np.concatenate([np.eye(3).ravel(), [0.0, 0.0, 2.0], np.zeros(12)])
 
-@pytest.mark.parametrize(("deviations", "ends_there"), [(0.9, True), (1.1, False)])
-def test_within_a_standard_deviation_a_state_ends_at_the_best_one(deviations, ends_there):
-    rng = np.random.default_rng(0)
-    best = np.concatenate([np.eye(3).ravel(), [0.0, 0.0, 2.0], np.zeros(12)])
-    # Radians and metres, known to very different parts; and velocities that a prior holds.
-    sizes = np.repeat([1e-3, 1e-5, 1e-2, 1e-9, 1e-9, 1e-9], 3)
-    factor = sizes[:, None] * (np.eye(PARAMETERS) + 0.1 * rng.normal(size=(PARAMETERS, PARAMETERS)))
-    direction = rng.normal(size=PARAMETERS)
-    step = factor @ direction * (deviations / np.linalg.norm(direction))
-    assert on_the_way(apply_step(best, step), best, factor @ factor.T) == ends_there
+
+def gaussians(seed=0, apart=1e-3):
+    rng = np.random.default_rng(seed)
+    states = np.array([apply_step(STATE, apart * rng.normal(size=PARAMETERS)) for _ in range(3)])
+    roots = 1e-3 * rng.normal(size=(3, PARAMETERS, PARAMETERS + 4))
+    return states, roots @ np.swapaxes(roots, 1, 2)
+
+
+def test_mean_and_covariance_are_those_of_the_mixture():
+    states, covariances = gaussians()
+    weights = np.array([0.5, 0.3, 0.2])
+    mean, covariance, steps = averaged(states, covariances, 0, weights, weights)
+    expected = np.array([step_between(states[0], state) for state in states])
+    np.testing.assert_allclose(steps, expected, atol=1e-15)
+    centre = weights @ expected
+    np.testing.assert_allclose(step_between(states[0], mean), centre, atol=1e-9)
+    off = expected - centre
+    moments = np.einsum("k,ki,kj->ij", weights, off, off) + np.tensordot(weights, covariances, 1)
+    scale = np.sqrt(np.diag(moments))
+    np.testing.assert_allclose(
+        covariance / np.outer(scale, scale), moments / np.outer(scale, scale), atol=0.01
+    )
+
+
+def test_one_alone_stays_as_it_is():
+    states, covariances = gaussians()
+    alone = np.array([0.0, 1.0, 0.0])
+    mean, covariance, _ = averaged(states, covariances, 1, alone, alone)
+    np.testing.assert_allclose(mean, states[1], atol=1e-15)
+    np.testing.assert_allclose(covariance, covariances[1], atol=1e-18)
+
+
+def test_the_longest_axis_of_the_orientation():
+    covariance = np.diag(np.square(np.arange(1.0, 19.0)))
+    assert longest_axis(covariance) == pytest.approx(3.0)

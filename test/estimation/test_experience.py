@@ -1,32 +1,111 @@
+"""What frames say that goes to the next one."""
+
+from itertools import pairwise
+
 import numpy as np
 
+from rs_localizer.config import LocalizerConfig, VelocityPrior
+from rs_localizer.core import so3
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.scales import SCALES, SPEEDS, Scales, joined
 from rs_localizer.core.types import Estimate
+from rs_localizer.estimation.assumptions import assumptions, told_speed
 from rs_localizer.estimation.experience import Experience
+from rs_localizer.estimation.prior import Prior
+from rs_localizer.solvers.table import find_solver
 
 
-def seen(shake, field):
-    """An estimate of a frame that says so much of one size of either."""
+def says(mean, excess=0.0):
+    every = np.ones(SCALES)
+    return Scales(mean * every, 2.0 * every, excess * every, np.zeros(len(SPEEDS)))
+
+
+def seen(scales):
+    """An estimate of a frame that says so much."""
     return Estimate(
         rotation=np.eye(3), translation=np.zeros(3), angular_velocity=np.zeros(3),
         linear_velocity=np.zeros(3), inliers=np.ones(12, bool), residuals=np.zeros(12),
-        joint_covariance=np.eye(18), global_shutter_inliers=12, iterations=0,
-        of_shake_sizes=np.array([0.0, shake]), of_field_sizes=np.array([0.0, field]),
+        joint_covariance=np.eye(18), global_shutter_inliers=12, iterations=0, scales=scales,
     )  # fmt: skip
 
 
-def test_what_frames_say_adds_up_and_fades():
-    experience = Experience.of(seen(1.0, -2.0))
-    np.testing.assert_array_equal(experience.of_field_sizes, [0.0, -2.0])
-    experience = experience.and_of(seen(2.0, 4.0))
-    np.testing.assert_allclose(experience.of_shake_sizes, [0.0, 0.95 * 1.0 + 0.3 * 2.0])
-    np.testing.assert_allclose(experience.of_field_sizes, [0.0, 0.95 * -2.0 + 0.3 * 4.0])
-    # A constant message settles at six times itself: 0.3 / (1 - 0.95).
-    for _ in range(400):
-        experience = experience.and_of(seen(2.0, 4.0))
-    np.testing.assert_allclose(experience.of_shake_sizes, [0.0, 12.0], atol=1e-6)
+def test_what_frames_say_of_scales_is_joined():
+    first, second = says(-6.0), says(-4.0, 1.0)
+    experience = Experience.of(seen(first))
+    assert experience.scales is first
+    found = experience.and_of(seen(second)).scales
+    for part, expected in zip(found, joined(first, second), strict=True):
+        np.testing.assert_array_equal(part, expected)
 
 
 def test_a_prior_says_it_and_nothing_of_the_motion():
-    prior = Experience.of(seen(3.0, 4.0)).prior
+    prior = Experience.of(seen(says(-6.0))).prior
     assert prior.motion is None
-    assert (prior.of_shake_sizes[1], prior.of_field_sizes[1]) == (3.0, 4.0)
+    np.testing.assert_array_equal(prior.scales.means, -6.0)
+
+
+def test_smooth_errors_in_excess_ask_for_the_lens():
+    asked = [Experience.of(seen(says(-6.0, excess))).prior.asks_lens for excess in (0.0, 3.0)]
+    assert asked == [False, True]
+
+
+NOTHING = np.zeros(5)
+
+
+def estimate_at(position, deviation=1e-3, turn=0.0):
+    nothing = np.zeros(3)
+    rotation = so3.exp(np.array([0.0, turn, 0.0]))
+    return Estimate(
+        rotation, -rotation @ position, nothing, nothing, inliers=np.ones(12, dtype=bool),
+        residuals=np.zeros(12), joint_covariance=deviation**2 * np.eye(18),
+        global_shutter_inliers=12, iterations=0,
+    )  # fmt: skip
+
+
+def speeds_after(metres, radians, deviation=1e-3):
+    """Odds of typical speeds after ten images, each so much farther than the one before."""
+    images = [
+        estimate_at(np.array([k * metres, 0.0, 0.0]), deviation, k * radians) for k in range(10)
+    ]
+    experience = Experience.of(images[0])
+    for before, after in pairwise(images):
+        experience = experience.moving(
+            experience.scales.speeds, before, after, 1.0 / 30.0, VelocityPrior()
+        )
+    return experience
+
+
+def test_images_tell_how_fast_cameras_move_within_them():
+    calm, drone = speeds_after(0.003, 0.005), speeds_after(0.1, 0.2)  # 0.15 and 6 rad/s
+    assert calm.scales.speeds.max() == 0.0
+    assert np.argmax(calm.scales.speeds[1:]) == 0
+    assert calm.scales.speeds[4] == -6.0  # not less: a camera may start to move
+    assert np.argmax(drone.scales.speeds) == 4
+    assert drone.scales.speeds[0] == drone.scales.speeds[1] < -3.0
+    # A shutter may be a global one, and poses that are hardly known tell nothing.
+    assert calm.scales.speeds[0] == calm.scales.speeds[1]
+    assert np.abs(speeds_after(0.003, 0.005, 1.0).scales.speeds).max() < 0.3
+    np.testing.assert_array_equal(calm.prior.scales.speeds, calm.scales.speeds)
+
+
+def test_they_forget_it():
+    calm = speeds_after(0.003, 0.005)
+    step = [estimate_at(np.zeros(3)), estimate_at(np.array([0.1, 0.0, 0.0]), turn=0.2)]
+    faster = calm
+    for _ in range(5):
+        faster = faster.moving(faster.scales.speeds, *step, 1.0 / 30.0, VelocityPrior())
+    assert np.argmax(faster.scales.speeds) == 4
+    assert calm.moving(NOTHING, *step, 2.0, VelocityPrior()) is calm  # too long ago
+
+
+def test_what_frames_deny_is_no_prior_of_the_next():
+    camera = Camera(640, 480, np.diag([500.0, 500.0, 1.0]), readout_time=0.02)
+    terms, _ = assumptions(camera, LocalizerConfig(), find_solver("r6p_vcwt"))
+    calm = speeds_after(0.003, 0.005).prior
+    slow, prior = told_speed(terms, calm)
+    own, told = (one.informations[0].diagonal()[6:12] for one in (terms, slow))
+    np.testing.assert_allclose(np.sqrt(told / own), 10.0)
+    assert prior is not None
+    np.testing.assert_array_equal(prior.scales.speeds, 0.0)
+    for same in (speeds_after(0.1, 0.2).prior, Prior(), None):
+        assert told_speed(terms, same) == (terms, same)

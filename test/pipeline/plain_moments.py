@@ -8,7 +8,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.known_turn import late_at
 from rs_localizer.core.rate_spline import change_at
-from rs_localizer.core.shake import shake_basis, within_rows
+from rs_localizer.core.shake import within_rows
 from rs_localizer.core.state import (
     ANGULAR,
     ANGULAR_ACCELERATION,
@@ -95,9 +95,13 @@ def late_of(estimate: Estimate, tau: float) -> tuple[Array, Array]:
 
 
 def shaking(estimate: Estimate, tau: float) -> tuple[Array, Array]:
-    """Polynomials (k,) at a row time, and their rates (k,)."""
+    """Cosines and sines (k,) at a row time, less value and slope in the middle, and their rates.
+
+    As many as the covariance is of: two per half-cycle of the readout.
+    """
     count = (len(estimate.joint_covariance) - PARAMETERS) // 3
-    values, rates = np.empty(count), np.empty(count)
-    if count:
-        shake_basis(within_rows(tau), count + 1, values, rates)
-    return values, rates
+    rate = np.pi * np.arange(1, count // 2 + 1)
+    angle = rate * within_rows(tau)
+    values = np.column_stack([np.cos(angle) - 1.0, np.sin(angle) - angle])
+    rates = rate[:, None] * np.column_stack([-np.sin(angle), np.cos(angle) - 1.0])
+    return values.ravel(), rates.ravel()

@@ -27,6 +27,7 @@ from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, Pose, Twist, messages
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree, read_transform
+from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -169,7 +170,7 @@ class Panning(Chain):
         return np.linalg.inv(chain)
 
 
-class KnowsTheMotion:
+class KnowsTheMotion(Localizer):
     """Stands in for the localizer."""
 
     def __init__(self, camera: Camera, config: LocalizerConfig) -> None:

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import Acceleration
@@ -24,9 +23,11 @@ TAUS = [-0.5, 0.0, 0.3, -7.0]
 RATES = [0.0, 1e-6, 0.5, 3.0]
 
 
-# Polynomials of the shaking.
-SHAKING = 3
-DEVIATIONS = [0.003, 0.01, 0.02, 0.05, 0.01, 0.02, *[0.002] * SHAKING]
+# Cosines and sines of the in-frame turn: the faster, the smaller.
+SHAKING = 28
+SIZES = 1.0 / np.arange(1, 15)[:, None] ** np.array([1.0, 2.0])
+SIZES = SIZES.ravel()[:, None]
+DEVIATIONS = [0.003, 0.01, 0.02, 0.05, 0.01, 0.02, *0.001 * SIZES[:, 0]]
 
 
 def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float = 0.0) -> Estimate:
@@ -41,7 +42,7 @@ def estimate(rate: float, seed: int = 0, acceleration: float = 0.0, shake: float
         linear_velocity=rate * rng.normal(size=3),
         angular_acceleration=acceleration * rng.normal(size=3),
         linear_acceleration=acceleration * rng.normal(size=3),
-        shake=shake * rng.normal(size=(SHAKING, 3)),
+        shake=shake * SIZES * rng.normal(size=(SHAKING, 3)),
         inliers=np.ones(20, dtype=bool),
         residuals=np.ones(20),
         joint_covariance=root @ root.T,
@@ -69,15 +70,12 @@ def disturbed(motion: Estimate, error: Array) -> Estimate:
 
 
 def shake(motion: Estimate, tau: float) -> Array:
-    """Legendre polynomials of 2 tau, the smaller the higher, less value and slope at 0."""
+    """A cosine and a sine per half-cycle of the readout, less value and slope at 0."""
     if abs(tau) > 0.51:  # beyond the rows it stays as it was; differences reach a little beyond
         tau = 0.5 if tau > 0.0 else -0.5
-    turn = np.zeros(3)
-    for degree, coefficients in enumerate(motion.shake, start=2):
-        series = (3.0 / degree) ** 2 * np.eye(degree + 1)[degree]
-        value, slope = legendre.legval(0.0, series), legendre.legval(0.0, legendre.legder(series))
-        turn += (legendre.legval(2 * tau, series) - value - slope * 2 * tau) * coefficients
-    return turn
+    angles = 0.5 * 2.0 * np.pi * np.arange(1, len(motion.shake) // 2 + 1) * tau
+    cosines, sines = np.cos(angles) - 1.0, np.sin(angles) - angles
+    return cosines @ motion.shake[::2] + sines @ motion.shake[1::2]
 
 
 def pose(motion: Estimate, tau: float) -> tuple[Array, Array]:
@@ -158,7 +156,7 @@ def test_pose_covariance(rate: float, tau: float) -> None:
 @pytest.mark.parametrize("rate", RATES)
 def test_twist_covariance(rate: float, tau: float) -> None:
     motion = estimate(rate)
-    # Polynomials far outside the readout are no shaking.
+    # Far outside the readout there is no shaking.
     covariance = motion.joint_covariance[:18, :18]
     motion = replace(motion, shake=np.zeros((0, 3)), joint_covariance=covariance)
     jacobian = numerical_jacobian(lambda error: twist(disturbed(motion, error), tau), 1e-4, 18)
@@ -188,7 +186,9 @@ def test_covariances_cover_what_is_published() -> None:
     # No derivative at all: the scatter of poses and twists of many disturbed motions.
     motion, tau = estimate(0.5, acceleration=0.01, shake=0.003), -0.5
     rng = np.random.default_rng(3)
-    errors = rng.multivariate_normal(np.zeros(27), 0.01 * motion.joint_covariance, size=4000)
+    errors = rng.multivariate_normal(
+        np.zeros(3 * len(DEVIATIONS)), 0.01 * motion.joint_covariance, size=4000
+    )
     poses = np.array([pose_error(motion, tau, error) for error in errors])
     now = twist(motion, tau)
     twists = np.array([twist(disturbed(motion, error), tau) - now for error in errors])
@@ -242,13 +242,13 @@ def test_an_uncertain_readout_time_enters_both_covariances():
 
 @pytest.mark.parametrize("tau", [-0.67, -2.5, 0.7])
 def test_nothing_runs_away_beyond_the_rows(tau: float) -> None:
-    # A stamp outside the exposure, as of cameras that stamp its start; shaking of high degrees, and
-    # a gyroscope whose samples end with the rows.
+    # A stamp outside the exposure, as of cameras that stamp its start; shaking of high
+    # frequencies, and a gyroscope whose samples end with the rows.
     rng = np.random.default_rng(0)
-    shaking = 0.002 * rng.normal(size=(12, 3))
+    shaking = 0.002 * SIZES * rng.normal(size=(SHAKING, 3))
     samples = np.linspace(-0.6, 0.6, 25)
     rates = 0.02 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]))
-    motion = replace(estimate(0.1), shake=shaking, joint_covariance=1e-8 * np.eye(18 + 36))
+    motion = replace(estimate(0.1), shake=shaking, joint_covariance=1e-10 * np.eye(18 + 84))
     for seen in (motion, motion.turned(KnownTurn.of(samples, rates), (0.0, np.inf))):
         edge = 0.5 if tau > 0.0 else -0.5
         before, after = pose_at(seen, edge), pose_at(seen, tau)

@@ -9,16 +9,17 @@ import numpy as np
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.scales import SCALES, Scales
 from rs_localizer.core.types import Failure
 from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
 from rs_localizer.pipeline.single_frames import SingleFrames
 
-SIZES = np.array([0.0, -1.0])
+SAID = Scales.nothing()._replace(means=np.full(SCALES, -6.0), precisions=np.ones(SCALES))
 
 
 def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset() -> None:
     priors: list[Any] = []
-    said = {"of_shake_sizes": SIZES, "of_field_sizes": 2.0 * SIZES, "lens": None, "of_lens": None}
+    said = {"scales": SAID, "lens": None, "of_lens": None}
     results: list[Any] = [SimpleNamespace(**said)] * 3
     results.insert(1, Failure(Reason.NO_HYPOTHESIS, ""))
 
@@ -26,14 +27,16 @@ def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset() -
         priors.append(prior)
         return results[len(priors) - 1]
 
-    localizer: Any = SimpleNamespace(localize=localize)
+    localizer: Any = SimpleNamespace(find=localize, accepted=lambda found: found,
+                                     config=NodeConfig())  # fmt: skip
     frames = SingleFrames(localizer, remembers=True)
     for _ in range(3):
         frames.localize(0, [], [])
     assert priors[0] is None
     for prior in priors[1:]:
         assert prior.motion is None
-        np.testing.assert_array_equal(prior.of_field_sizes, 2.0 * SIZES)
+        np.testing.assert_allclose(prior.scales.means, -6.0)
+        assert prior.scales.precisions.min() >= 1.0
     frames.reset()
     frames.localize(0, [], [])
     assert priors[3] is None

@@ -216,7 +216,7 @@ def test_an_imu_that_is_late_is_not_waited_for(
     alone = offline(recording, tmp_path / "alone", "--no-imu")
     for name in TYPES:
         assert robot.bytes_of(name) == alone[name]
-    node.wait_for_log("imu_late: the IMU is not used: the messages of the exposure come later")
+    node.wait_for_log("imu_late: the IMU is not used: IMU messages arrive later than imu.wait")
     assert robot.peer.spin_until(lambda: "IMU not used: imu_late" in robot.values)
     assert "older than the last row" in robot.values["IMU"]
     assert "imu.wait" in robot.values["Odd: imu"]

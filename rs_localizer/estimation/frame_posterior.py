@@ -1,0 +1,598 @@
+"""The posterior of a frame: one model, its modes, and one Gaussian of them all.
+
+docs/estimator.md is the page. The discrete alternatives of a frame, {rest, typical speeds} x {this
+lean of a plane, the mirrored one}, are starts of one fit (:mod:`.frame_fit`); each becomes a
+Gaussian (Laplace approximation) with its evidence; the mixture's mean and covariance go out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import norm
+
+from rs_localizer.core.arrays import Array, BoolArray
+from rs_localizer.core.scales import SCALES, SPEEDS, Scales
+from rs_localizer.core.shake import CYCLES, FUNCTIONS, shake_basis
+from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest, step_between
+from rs_localizer.estimation.assumptions import Assumed
+from rs_localizer.estimation.averaging import averaged
+from rs_localizer.estimation.curvature import along_arcs
+from rs_localizer.estimation.frame_fit import (
+    SMOOTH_TERMS,
+    FrameFit,
+    extent,
+    fit_frame,
+    log_determinant_of_inverse,
+    smooth_terms,
+)
+from rs_localizer.estimation.medians import median_depth
+from rs_localizer.estimation.mirror import farthest, mirrored
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.packing import weighted
+from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
+from rs_localizer.estimation.prior_kernels import add_prior
+from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
+from rs_localizer.estimation.refine import apply_step, inverted, refine
+from rs_localizer.estimation.residual_tests import neighbours_agree
+from rs_localizer.estimation.residuals import linearized, squared_errors
+
+# An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
+# hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
+# twenty. Standard normal, of 14 frequencies and of the smooth error.
+_ASKS_TURNS, _ASKS_SMOOTH = float(norm.isf(0.3 / len(CYCLES))), float(norm.isf(0.05))
+# What chance explains in one frame of ten thousand may have moved points out of the gate.
+_WIDENS = float(norm.isf(1e-4 / len(CYCLES)))
+# Coefficients of each.
+_COEFFICIENTS = np.append(np.full(len(CYCLES), 6.0), 2.0 * SMOOTH_TERMS)
+# Likewise of the frames before (standard normal): one track in a thousand.
+_ASKS_REMEMBERED = 3.3
+# Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
+_LARGEST_SHAKE = 0.035
+# Points just outside of the gate that are no chance: shaking may have moved them there.
+_NEAR_OUTLIERS, _NEAR_PART, _NEAR_GATE = 5, 0.2, 8.0
+# Hyperprior of the scales where no frame says more: an ordinary vibration of 0.02 deg at a cycle
+# per readout, less the faster, a decade up or down within one deviation; a map and a lens of
+# 0.03 px, to a factor of e: surveyed tags before a calibrated lens have 0.2 (two deviations).
+_TURN_SCALES = np.log(3e-4 / np.sqrt(CYCLES))
+_SMOOTH_SCALE, _PRECISION, _SMOOTH_PRECISION = math.log(0.03), 1.0 / 2.3**2, 1.0
+# What is declared of a map is known to a factor of e within two deviations: a motion that makes a
+# bent board look flat is less probable than one before a board that is as bent as boards are.
+_DECLARED_PRECISION = 4.0
+# Scales from which a fit starts: those that it does not need shrink fast, those that it needs grow
+# slowly.
+_FIRST_TURN, _FIRST_SMOOTH = math.log(5e-3), math.log(0.3)
+_STEPS = 25
+# A mode that loses more inliers than this part leaves is another group of points.
+_KEPT = 0.9
+# No frame says more than this to the next ones (standard normal).
+_CLIPPED = 6.0
+# Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
+_MOST_BETTER = 0.01
+# Probability that does not count.
+_NO_PART = 1e-4
+# More points than this only take time.
+_MOST_POINTS = 2500
+# Logarithms of the odds of rest against each typical speed, and of none against an in-frame turn,
+# before any frame: errors of maps that no polynomial of the image follows look like motion, and a
+# hundred to one is what surveyed tags ask for (benchmarks.honesty tags).
+_REST_ODDS, _STEADY_ODDS = math.log(100.0), math.log(100.0)
+# Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
+_FAR_LESS_PROBABLE = 9.0
+# The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
+# this power, about the same mean: it holds for a camera that moves so little that rest is more
+# probable (1 would hold on average over all cameras, and not for that one). The odds against an
+# in-frame turn have no part in it.
+TEMPER = 0.25
+# Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
+# which the prior knows less than this part: typical speeds are not weighed.
+_CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
+_FITS, _FINE = 4, 1e-6
+_NO_SCALE, _ITERATIONS = 1e6, 50
+_NEAREST = 1e-6  # m; points nearer than this would make any map useless
+
+
+class Asked(NamedTuple):
+    """How a frame with an in-frame turn is fitted."""
+
+    smooth: bool  # a smooth error, too
+    wide: bool  # from a gate that is as wide as shaking moves points
+
+
+class Hyperprior(NamedTuple):
+    """Of the logarithms (15,) of the scales."""
+
+    mean: Array
+    precision: Array
+    first: Array  # where a fit starts
+
+
+class _Frame(NamedTuple):
+    """The inliers of a frame and what is the same for all modes."""
+
+    observations: Observations
+    best: Posterior
+    terms: PriorTerms
+    threshold: float
+    assumed: Assumed
+    hyper: Hyperprior
+    smooth: bool  # beside a smooth error
+    planar: bool
+
+
+class Mode(NamedTuple):
+    """A Gaussian about an optimum, and its evidence."""
+
+    state: Array  # (24,)
+    covariance: Array  # (18,18)
+    evidence: float
+    cost: float  # noise variances
+    speed: int  # index of SPEEDS
+    smooth: float = 0.0  # px
+
+
+def frame_posterior(
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed
+) -> Posterior:
+    """What the points leave possible, near a first motion.
+
+    Args:
+        observations: the points; of very many a part is enough, evenly taken.
+        start: state (24,).
+        terms: what is known of the motion beside the points.
+        threshold: px, of inliers.
+        assumed: of the camera.
+    """
+    if len(observations) > _MOST_POINTS:
+        part = _of_points(observations.thinned(_MOST_POINTS), start, terms, threshold, assumed)
+        gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
+        errors = observations.squared_errors(part.state)
+        return replace(part, squared_errors=errors, inliers=errors <= gate**2)
+    return _of_points(observations, start, terms, threshold, assumed)
+
+
+def _of_points(
+    observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed
+) -> Posterior:
+    best = maximum_a_posteriori(observations, start, terms, threshold)
+    if not best.determined:
+        return best
+    other = mirrored(observations.points, best.inliers, best.state)
+    if other is not None:
+        again = maximum_a_posteriori(observations, other, terms, threshold)
+        if (
+            again.determined
+            and again.cost < best.cost - best.noise**2
+            and (np.count_nonzero(again.inliers) >= np.count_nonzero(best.inliers))
+        ):
+            best, other = again, mirrored(observations.points, again.inliers, again.state)
+    explained, agreement = _look(
+        observations.packed, len(observations), best.state, observations.row_time_gradient,
+        best.inliers, terms, best.noise, assumed.rolling,
+    )  # fmt: skip
+    excess, remembered = _standard(explained, best.freedom), assumed.scales
+    near = _near_outliers(best, threshold) if assumed.rolling else 0
+    most = excess[:-1].max()
+    known = remembered.excess[:-1].max() > _ASKS_REMEMBERED
+    wide = assumed.rolling and bool(most > _WIDENS or near > 0)
+    # What a gyroscope leaves of the turn tells the offset of its stamps.
+    hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
+    turns = assumed.rolling and (wide or hidden)
+    depth = max(median_depth(best.state, observations.points, best.inliers), _NEAREST)
+    declared = assumed.map_deviation * assumed.focal_length / depth  # px
+    # What a gyroscope that comes too late leaves is smooth, too.
+    smooth = declared > 0.1 * best.noise or (
+        assumed.turn is None
+        and bool(excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
+    )
+    best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
+    hyper = _hyperprior(assumed, declared)
+    # What turns within the frame would explain, errors of map and lens may explain as well.
+    frame = _Frame(observations, best, terms, threshold, assumed, hyper, smooth, other is not None)
+    shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
+    weighed = frame.smooth or frame.planar
+    if weighed or (assumed.may_rest and not _clearly_moving(best, terms, assumed)):
+        posterior, evidence = _merged(frame)
+    else:
+        covariance = along_arcs(best.inflation * best.covariance, best.state[9:12])
+        posterior, evidence = replace(best, covariance=covariance), -math.inf
+        if shaken is not None:
+            evidence = _mode(frame, best.state, terms, len(SPEEDS) - 1, 0.0).evidence
+    if shaken is not None:
+        posterior = _either(posterior, evidence, *shaken)
+    return replace(posterior, scales=posterior.scales._replace(excess=excess))
+
+
+def _near_outliers(best: Posterior, threshold: float) -> int:
+    """Points just beyond the gate, where they are too many to be chance; else 0."""
+    inliers = int(np.count_nonzero(best.inliers))
+    within = best.squared_errors < (_NEAR_GATE * threshold) ** 2
+    count = int(np.count_nonzero(within & ~best.inliers))
+    return count if count >= max(_NEAR_OUTLIERS, _NEAR_PART * inliers) else 0
+
+
+def _standard(explained: Array, freedom: float) -> Array:
+    """How much more than chance columns explain (15,), standard normal where there is nothing.
+
+    An F test, because the noise is of the same errors (Rao 1948), by Paulson's approximation
+    (1942).
+
+    Args:
+        explained: (15,) squares in noise variances.
+        freedom: of the errors.
+    """
+    own, rest = _COEFFICIENTS, freedom - _COEFFICIENTS
+    enough = rest >= 1.0
+    rest = np.maximum(rest, 1.0)
+    left = np.maximum(freedom - explained, 1e-3 * max(freedom, 1.0))
+    ratio = explained / own * rest / left
+    cube, a, b = np.cbrt(ratio), 2.0 / (9.0 * own), 2.0 / (9.0 * rest)
+    standard = ((1.0 - b) * cube - (1.0 - a)) / np.sqrt(b * cube**2 + a)
+    return np.where(enough, np.clip(standard, -_CLIPPED, _CLIPPED), -_CLIPPED)
+
+
+def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
+    """What is known of the scales of a frame; ``declared``: px, of the map."""
+    mean = np.append(_TURN_SCALES, _SMOOTH_SCALE)
+    precision = np.append(np.full(SCALES - 1, _PRECISION), _SMOOTH_PRECISION)
+    if declared > 0.0:
+        mean[-1], precision[-1] = math.log(declared), _DECLARED_PRECISION
+    first = np.full(SCALES, _FIRST_TURN)
+    first[-1] = max(_FIRST_SMOOTH, mean[-1])
+    known = assumed.scales
+    both = precision + known.precisions
+    mean = (precision * mean + known.precisions * known.means) / both
+    first = np.where(known.precisions > 1.0, mean, first)
+    return Hyperprior(mean, both, first)
+
+
+def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior, float] | None:
+    """The posterior of a camera that turns within the frame, and its evidence; None: no such."""
+    observations, best, terms, threshold, assumed, hyper, _, _ = frame
+    mean, precision, first = hyper
+    gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
+    if asked.wide:
+        gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
+        noise = threshold
+    fits: list[FrameFit] = []
+    for state in (best.state,) if other is None else (best.state, other):
+        fit = fit_frame(
+            observations.packed, len(observations), state, observations.row_time_gradient, terms,
+            threshold, gate, noise, first, mean, precision,
+            True, asked.smooth, _STEPS,
+        )  # fmt: skip
+        if fit.finite:
+            fits.append(fit)
+    if not fits:
+        return None
+    most = max(np.count_nonzero(fit.inliers) for fit in fits)
+    fits = [fit for fit in fits if np.count_nonzero(fit.inliers) >= _KEPT * most]
+    fit = max(fits, key=lambda one: one.evidence)
+    inliers = np.count_nonzero(fit.inliers)
+    if inliers < _KEPT * np.count_nonzero(best.inliers):
+        return None
+    if asked.wide and fit.freedom < inliers:
+        return None  # every second equation went into coefficients: wrong points would, too
+    own = 2.0 * fit.decided  # precision of the frame alone
+    total = fit.log_scales * (own + precision)
+    said = np.where(own > 0.1, (total - precision * mean) / np.maximum(own, 0.1), 0.0)
+    scales = Scales.nothing()._replace(means=said, precisions=np.where(own > 0.1, own, 0.0))
+    fitted = replace(
+        best,
+        state=fit.state,
+        covariance=fit.covariance,
+        noise=fit.noise,
+        freedom=fit.freedom,
+        inliers=fit.inliers,
+        squared_errors=fit.squared_errors,
+        shake=fit.turns,
+        model_error=fit.smooth,
+        agreement=fit.agreement,
+        scales=scales,
+        near_outliers=0,
+    )
+    covariance = along_arcs(fitted.inflation * fit.covariance, fit.state[9:12])
+    near = _near_outliers(fitted, threshold)
+    fitted = replace(fitted, covariance=covariance, near_outliers=near)
+    return fitted, _evidence_of_fit(frame, fit, terms)
+
+
+def _clearly_moving(best: Posterior, terms: PriorTerms, assumed: Assumed) -> bool:
+    """Whether neither rest nor another typical speed would change anything."""
+    chosen = LINEAR if assumed.turn is not None else VELOCITIES  # of the others a gyroscope knows
+    spread = best.covariance[chosen, chosen]
+    information = inverted(np.ascontiguousarray(spread))
+    velocities = best.state[6:][chosen]  # behind the pose a state is longer by six
+    part = float(np.diag(terms.informations[0])[chosen] @ np.diag(spread))
+    return bool(
+        part < _LITTLE_OF_THE_PRIOR and velocities @ information @ velocities > _CLEARLY_MOVING
+    )
+
+
+def _merged(frame: _Frame) -> tuple[Posterior, float]:
+    """The mixture of all modes as one Gaussian, and its evidence."""
+    best, modes = frame.best, _modes(frame)
+    evidence = np.array([mode.evidence for mode in modes])
+    if not np.any(evidence > -math.inf):
+        return replace(best, smallest_eigenvalue=0.0), -math.inf
+    resting = np.array([SPEEDS[mode.speed] == 0.0 for mode in modes])
+    with_odds = evidence + _REST_ODDS * resting
+    probable = np.exp(with_odds - with_odds.max())
+    weights = probable**TEMPER
+    probable, weights = probable / probable.sum(), weights / weights.sum()
+    first = int(np.argmax(probable))
+    state, covariance, steps = averaged(
+        np.array([mode.state for mode in modes]),
+        np.array([mode.covariance for mode in modes]),
+        first, probable, weights,
+    )  # fmt: skip
+    costs = np.array([mode.cost for mode in modes])
+    by_speed = np.full(len(SPEEDS), -math.inf)
+    for mode in modes:
+        by_speed[mode.speed] = np.logaddexp(by_speed[mode.speed], mode.evidence)
+    by_speed -= frame.assumed.scales.speeds
+    by_speed[0] -= frame.assumed.of_rest
+    by_speed = np.maximum(by_speed - by_speed.max(), -10.0)
+    posterior = replace(
+        best,
+        state=state,
+        covariance=covariance,
+        squared_errors=frame.observations.squared_errors(state),
+        # Beside a motion that is free: at rest, what moves looks like an error of the map.
+        model_error=modes[-1].smooth,
+        speeds=np.eye(len(SPEEDS))[[mode.speed for mode in modes]].T @ weights,
+        scales=Scales.nothing()._replace(speeds=by_speed),
+        mirror=farthest(costs, evidence, steps, covariance) if frame.planar else None,
+    )
+    return posterior, float(np.logaddexp.reduce(evidence)) - math.log(len(SPEEDS))
+
+
+def _either(
+    steady: Posterior, evidence: float, shaken: Posterior, evidence_of_shaking: float
+) -> Posterior:
+    """The mixture of a camera that does not turn within its frame, and of one that does."""
+    better = evidence - evidence_of_shaking
+    probable = 1.0 / (1.0 + math.exp(min(-better - _STEADY_ODDS, 700.0)))  # that it is steady
+    weight = 1.0 / (1.0 + math.exp(min(-TEMPER * better, 700.0)))
+    if weight < _NO_PART:
+        return shaken
+    if weight > 1.0 - _NO_PART:
+        return steady
+    # From the one that shakes: steps of motion and coefficients.
+    steps = np.zeros(len(shaken.covariance))
+    steps[:PARAMETERS] = step_between(shaken.state, steady.state)
+    steps[PARAMETERS:] = -shaken.shake.ravel()
+    mean = probable * steps
+    away = np.outer(steps - mean, steps - mean)
+    covariance = (1.0 - weight) * (shaken.covariance + np.outer(mean, mean)) + weight * away
+    covariance[:PARAMETERS, :PARAMETERS] += weight * steady.covariance
+    likely = steady if probable > 0.5 else shaken
+    return replace(
+        likely,
+        state=apply_step(shaken.state, mean[:PARAMETERS]),
+        covariance=covariance,
+        shake=(1.0 - probable) * shaken.shake,
+        scales=shaken.scales._replace(speeds=steady.scales.speeds),
+    )
+
+
+def _modes(frame: _Frame) -> list[Mode]:
+    """A Gaussian for each typical speed and each lean of a plane."""
+    best, assumed = frame.best, frame.assumed
+    turn_known = assumed.turn is not None
+    speeds = range(len(SPEEDS)) if assumed.may_rest else (len(SPEEDS) - 1,)
+    near = at_rest(best.state) if assumed.may_rest else best.state
+    odds = assumed.scales.speeds
+    modes: list[Mode] = []
+    twin: Array | None = None
+    for speed in speeds:
+        chosen = terms_at(frame.terms, SPEEDS[speed], turn_known)
+        extra = float(odds[speed]) + (assumed.of_rest if SPEEDS[speed] == 0.0 else 0.0)
+        if assumed.turn is not None:
+            extra += assumed.turn.evidence(SPEEDS[speed])
+        mode = _mode(frame, near, chosen, speed, extra)
+        modes.append(mode)
+        near = mode.state
+        lean = twin
+        if frame.planar and twin is None:
+            lean = mirrored(frame.observations.points, best.inliers, near)
+        if lean is not None:
+            second = _mode(frame, lean, chosen, speed, extra)
+            twin = None
+            if _apart(mode, second):
+                modes.append(second)
+                twin = second.state
+        here = max(mode.evidence for mode in modes if mode.speed == speed)
+        if here < max(mode.evidence for mode in modes) - _FAR_LESS_PROBABLE / TEMPER:
+            break
+    return modes
+
+
+def _apart(mode: Mode, other: Mode) -> bool:
+    """Whether two modes are not the same optimum."""
+    between = math.sqrt(max(0.0, _angle(mode.state, other.state)))
+    spread = math.sqrt(max(float(np.trace(mode.covariance[:3, :3])), 0.0))
+    return bool(between > 1e-2 * spread)
+
+
+def _angle(state: Array, other: Array) -> float:
+    """Squared angle between two orientations, rad^2, for small ones; larger for large ones."""
+    difference = state[:9] - other[:9]
+    return 0.5 * float(difference @ difference)
+
+
+def _mode(frame: _Frame, start: Array, terms: PriorTerms, speed: int, odds: float) -> Mode:
+    """The Gaussian about the optimum near a state (24,)."""
+    observations, best = frame.observations, frame.best
+    data, gradient = weighted(observations.packed, best.inliers), observations.row_time_gradient
+    state, cost, covariance, volume = _laplace(data, start, gradient, terms, best.noise)
+    cost, smooth = cost / best.noise**2, 0.0
+    evidence = _evidence(frame, volume, cost)
+    if frame.smooth and math.isfinite(evidence):
+        fit = fit_frame(
+            observations.packed, len(observations), state, gradient, terms, frame.threshold,
+            WIDEST_GATE * frame.threshold, best.noise, frame.hyper.first, frame.hyper.mean,
+            frame.hyper.precision, False, True, _STEPS,
+        )  # fmt: skip
+        if fit.finite:
+            state, covariance, smooth = fit.state, fit.covariance, fit.smooth
+            cost, evidence = fit.left + fit.prior_cost, _evidence_of_fit(frame, fit, terms)
+    if not math.isfinite(evidence) or not np.all(np.isfinite(covariance)):
+        return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -math.inf, math.inf, speed)
+    covariance = along_arcs(best.inflation * covariance, state[9:12])
+    return Mode(state, covariance, evidence + odds, cost, speed, smooth)
+
+
+def _evidence_of_fit(frame: _Frame, fit: FrameFit, terms: PriorTerms) -> float:
+    """Logarithm of the probability of the pixels under a fit, but for a constant of the frame."""
+    volume = 0.5 * fit.log_determinant + known_volume(terms)
+    cost = fit.left + fit.prior_cost
+    return volume - 0.5 * cost + _of_pixels(frame, fit.inliers, fit.noise)
+
+
+def _evidence(frame: _Frame, volume: float, cost: float) -> float:
+    """The same of a motion alone, from its volume and cost (variances of the best one's noise).
+
+    Of unknown noise (Student): what it leaves beyond the best motion tells the less, the fewer the
+    points.
+    """
+    best = frame.best
+    freedom, least = max(best.freedom, 6.0), best.cost / best.noise**2
+    beyond = freedom * math.log1p(max((cost - least) / freedom, _MOST_BETTER - 1.0))
+    return volume - 0.5 * (least + beyond) + _of_pixels(frame, best.inliers, best.noise)
+
+
+def _of_pixels(frame: _Frame, inliers: BoolArray, noise: float) -> float:
+    """Logarithm of the density of all pixels: inliers about the motion at their best, others
+    anywhere in an image of a focal length squared.
+    """
+    count = np.count_nonzero(inliers)
+    others = len(inliers) - count
+    return -count * math.log(2.0 * math.pi * noise**2) - 2.0 * others * math.log(
+        frame.assumed.focal_length
+    )
+
+
+@kernel
+def _laplace(
+    data: Array, start: Array, gradient: Array, terms: PriorTerms, noise: float
+) -> tuple[Array, float, Array, float]:
+    """State, cost (px^2), covariance and the volume part of the log evidence of an optimum."""
+    state, information, cost = start, np.empty((PARAMETERS, PARAMETERS)), 0.0
+    for _ in range(_FITS):
+        state, information, cost, converged = refine(
+            data, state, gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
+        )
+        if converged:
+            break
+    covariance = noise * noise * inverted(information)
+    volume = 0.5 * log_determinant_of_inverse(covariance) + known_volume(terms)
+    return state, cost, covariance, volume
+
+
+@kernel
+def known_volume(terms: PriorTerms) -> float:
+    """Half the logarithm of the determinant of what a prior knows of the motion."""
+    known = 0.0
+    for k in range(PARAMETERS):
+        if terms.informations[0, k, k] > 0.0:
+            known += 0.5 * np.log(terms.informations[0, k, k])
+    return known
+
+
+@kernel
+def _look(
+    data: Array, count: int, state: Array, gradient: Array, inliers: BoolArray, prior: PriorTerms,
+    noise: float, turns: bool,
+) -> tuple[Array, float]:  # fmt: skip
+    """What each frequency of an in-frame turn, and a smooth error, would explain of the errors.
+
+    Score statistics at the best motion without them, chi-squared of 6 and 20 degrees of freedom
+    where there is nothing (Rao 1948).
+
+    Returns:
+        (15,) of the 14 frequencies and the smooth error; and how much neighbouring rows agree.
+    """
+    statistic = np.zeros(SCALES)
+    lines = linearized(data, count, state, gradient, np.zeros((count, 6)))
+    front = squared_errors(data, count, state, gradient)
+    variance = noise * noise
+    information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    add_prior(
+        prior.informations, prior.references, prior.gravity, state, variance, information, slope
+    )
+    frequencies = len(CYCLES)
+    crossed = np.zeros((frequencies, 6, PARAMETERS))
+    own, along = np.zeros((frequencies, 6, 6)), np.zeros((frequencies, 6))
+    across = np.zeros((2 * SMOOTH_TERMS, PARAMETERS))
+    within, beside = np.zeros((2 * SMOOTH_TERMS, 2 * SMOOTH_TERMS)), np.zeros(2 * SMOOTH_TERMS)
+    values, rates = np.empty(FUNCTIONS), np.empty(FUNCTIONS)
+    terms, column = np.empty(SMOOTH_TERMS), np.empty(6)
+    low, high = extent(lines, inliers)
+    for i in range(count):
+        if not inliers[i] or not np.isfinite(front[i]):
+            continue
+        shake_basis(lines.tau[i], values, rates)
+        smooth_terms(lines.image[i], low, high, terms)
+        for side in range(2):
+            row, turn = lines.by_motion[i, side], lines.by_turn[i, side]
+            error, first = lines.errors[i, side], SMOOTH_TERMS * side
+            for a in range(PARAMETERS):
+                for b in range(PARAMETERS):
+                    information[a, b] += row[a] * row[b]
+            for f in range(frequencies if turns else 0):
+                for axis in range(3):
+                    column[axis] = values[2 * f] * turn[axis]
+                    column[3 + axis] = values[2 * f + 1] * turn[axis]
+                _accumulate(column, row, error, own[f], crossed[f], along[f])
+            last = first + SMOOTH_TERMS
+            _accumulate(
+                terms, row, error, within[first:last, first:last], across[first:last],
+                beside[first:last],
+            )  # fmt: skip
+    inverse = inverted(information)
+    if turns:
+        for f in range(frequencies):
+            statistic[f] = _explained(own[f], crossed[f], inverse, along[f]) / variance
+    statistic[frequencies] = _explained(within, across, inverse, beside) / variance
+    return statistic, neighbours_agree(lines.errors, lines.tau, lines.image, inliers)
+
+
+@kernel
+def _accumulate(
+    column: Array, row: Array, error: float, own: Array, crossed: Array, along: Array
+) -> None:
+    """Add the products of columns with themselves (below the diagonal), motion and error."""
+    for a in range(len(column)):
+        along[a] -= column[a] * error
+        for b in range(PARAMETERS):
+            crossed[a, b] += column[a] * row[b]
+        for b in range(a + 1):
+            own[a, b] += column[a] * column[b]
+
+
+@kernel
+def _explained(own: Array, crossed: Array, inverse: Array, along: Array) -> float:
+    """Squares that columns explain beside the motion: h^T (N - X M^-1 X^T)^-1 h."""
+    size = len(along)
+    left = np.empty((size, size))
+    pulled = crossed @ inverse
+    for i in range(size):
+        for j in range(i + 1):
+            total = own[i, j]
+            for k in range(PARAMETERS):
+                total -= pulled[i, k] * crossed[j, k]
+            left[i, j] = total
+            left[j, i] = total
+        # What the motion mimics wholly explains nothing.
+        left[i, i] += 1e-6 * own[i, i] + 1e-12
+    inverse_left = inverted(left)
+    explained = 0.0
+    for i in range(size):
+        for j in range(size):
+            explained += along[i] * inverse_left[i, j] * along[j]
+    return explained if np.isfinite(explained) else 0.0

@@ -1,0 +1,54 @@
+"""Frames of a box of points, made by the tests' own projection, and what is assumed of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.config import LocalizerConfig
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.state import step_between
+from rs_localizer.estimation.assumptions import assumptions
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.solvers.table import find_solver
+
+from .projection import gradient, in_camera, jacobian_of, pixels_of, row_time
+
+READOUT = 0.03
+CAMERA = Camera(640, 480, np.diag([590.0, 590.0, 1.0]), readout_time=READOUT)
+PRIOR, ASSUMED = assumptions(CAMERA, LocalizerConfig(), find_solver("r6p_vcwt"))
+DIRECTION = "top_to_bottom"
+
+
+def observe(state, points, noise, rng, swing=lambda tau: np.zeros((len(tau), 3)), seen_as=None):
+    """Observations of points, each seen by its own row, in a map that says ``seen_as``."""
+    tau = np.zeros(len(points))
+    for _ in range(100):
+        seen = in_camera(state, tau, points, swing(tau))
+        pixels = pixels_of(seen[:, :2] / seen[:, 2:])
+        tau = row_time(pixels, DIRECTION)
+    measured = pixels + noise * rng.normal(size=pixels.shape)
+    rays = seen[:, :2] / seen[:, 2:]
+    for _ in range(20):  # Newton's method undoes the lens
+        rays -= np.linalg.solve(jacobian_of(rays), (pixels_of(rays) - measured)[..., None])[..., 0]
+    return Observations.of(
+        points if seen_as is None else seen_as, rays, row_time(measured, DIRECTION),
+        jacobian_of(rays), gradient(DIRECTION),
+    )  # fmt: skip
+
+
+def frame(seed, speed, noise, count=60, acceleration=0.0, **more):
+    """A box of points 4 m away, and a state that sees it."""
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(random_state=seed).as_matrix()
+    state = np.concatenate(
+        [rotation.ravel(), [0.0, 0.0, 4.0], speed * rng.normal(size=6),
+         acceleration * rng.normal(size=6)]
+    )  # fmt: skip
+    points = rng.uniform([-1.5, -1.2, -1.0], [1.5, 1.2, 1.0], (count, 3)) @ rotation
+    return observe(state, points, noise, rng, **more), state
+
+
+def distance(posterior, truth, parts):
+    error = step_between(posterior.state, truth)[parts]
+    return error @ np.linalg.solve(posterior.covariance[parts, parts], error)

@@ -1,0 +1,112 @@
+"""What errors of the calibration do to poses, and that their covariances say so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import rs_localizer as rsl
+from rs_localizer.config import CalibrationErrors
+from rs_localizer.core import so3
+from rs_localizer.core.shutter import Motion, project_rolling
+from rs_localizer.core.state import POSE
+
+CAMERA = rsl.Camera(
+    640, 480, np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]]),
+    readout_time=0.02,
+)  # fmt: skip
+EXACT = CalibrationErrors(0.0, 0.0, 0.0)
+
+
+def off(principal_point: float = 0.0, focal_length: float = 0.0) -> rsl.Camera:
+    """The camera as a calibration has it that is off by so much."""
+    K = CAMERA.K.copy()
+    K[:2, 2] += principal_point
+    K[(0, 1), (0, 1)] *= 1.0 + focal_length
+    return replace(CAMERA, K=K)
+
+
+def frame(seed: int, depth: float) -> tuple[np.ndarray, np.ndarray, Motion]:
+    """Points of a room 3 m away, so many metres deep, and their pixels."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-2.0, -1.5, 0.0], [2.0, 1.5, depth], (100, 3))
+    rotation = so3.exp(rng.normal(scale=0.15, size=3))
+    motion = Motion(
+        rotation, [0.0, 0.0, 3.0], rng.normal(scale=0.01, size=3), rng.normal(scale=0.01, size=3)
+    )
+    pixels, _ = project_rolling(CAMERA, motion.at_rows, points)
+    inside = np.all((pixels > 0.0) & (pixels < [639.0, 479.0]), axis=1)
+    pixels = pixels[inside] + rng.normal(scale=0.3, size=(np.count_nonzero(inside), 2))
+    return points[inside], pixels, motion
+
+
+def inside(localizer: rsl.Localizer, depth: float, frames: int = 40) -> float:
+    """Share of poses within their 95 % regions."""
+    held = []
+    for seed in range(frames):
+        points, pixels, true = frame(seed, depth)
+        found = localizer.localize(points, pixels)
+        assert found, str(found)
+        centre = -true.rotation.T @ true.translation
+        turn = so3.log(np.ascontiguousarray(found.rotation @ true.rotation.T))
+        error = np.concatenate([turn, found.rotation @ (centre - found.position)])
+        squared = error @ np.linalg.solve(found.covariance[POSE, POSE], error)
+        held.append(squared < chi2.ppf(0.95, 6))
+    return float(np.mean(held))
+
+
+@pytest.mark.parametrize("depth", [2.0, 0.0], ids=["room", "wall"])
+@pytest.mark.parametrize("errors", [{"principal_point": 1.0}, {"focal_length": 0.003}], ids=str)
+def test_regions_hold_with_an_ordinary_calibration(depth, errors):
+    camera = off(**errors)
+    assert inside(rsl.Localizer(camera), depth) >= 0.9
+    assert inside(rsl.Localizer(camera, calibration=EXACT), depth, 15) < 0.6
+
+
+def test_the_next_frame_is_told_nothing_of_it():
+    """Pose and own covariance, which a tracker goes on from, stay as they are."""
+    points, pixels, _ = frame(1, 2.0)
+    found, exact = (
+        rsl.Localizer(CAMERA, **settings).localize(points, pixels)
+        for settings in ({}, {"calibration": EXACT})
+    )
+    np.testing.assert_array_equal(found.rotation, exact.rotation)
+    np.testing.assert_array_equal(found.joint_covariance, exact.joint_covariance)
+    np.testing.assert_array_equal(exact.calibration_covariance, 0.0)
+    more = found.covariance - exact.covariance
+    np.testing.assert_allclose(more, found.calibration_covariance)
+    assert np.linalg.eigvalsh(more).min() > -1e-12
+    # To first order as far as the camera turns for a principal point that is off by a pixel.
+    assert np.sqrt(more[0, 0]) == pytest.approx(1.0 / 450.0, rel=0.3)
+
+
+def test_tracking_does_not_average_it_away():
+    tracker = rsl.Tracker(rsl.Localizer(CAMERA))
+    points, pixels, motion = frame(2, 2.0)
+    still = replace(motion, angular_velocity=np.zeros(3), linear_velocity=np.zeros(3))
+    pixels, _ = project_rolling(CAMERA, still.at_rows, points)
+    rng = np.random.default_rng(0)
+    spread = []
+    for k in range(15):
+        noisy = pixels + rng.normal(scale=0.3, size=pixels.shape)
+        found = tracker.localize(33_000_000 * (k + 1), points, noisy)
+        spread.append((found.covariance[0, 0], found.joint_covariance[0, 0]))
+    (first, first_own), (last, last_own) = spread[0], spread[-1]
+    assert last_own < first_own
+    assert last > 0.9 * first
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.01])
+def test_a_declared_error_of_the_map_refuses_nothing(deviation):
+    localizer = rsl.Localizer(CAMERA, map_deviation=0.01)
+    published = 0
+    for seed in range(20):
+        points, pixels, _ = frame(seed, 0.0)
+        # As a printer stretches paper and a wall is bent: neighbours are off together.
+        x, y = points[:, 0], points[:, 1]
+        bent = deviation * np.column_stack([np.sin(2.0 * y), np.cos(3.0 * x), np.sin(x + y)])
+        published += bool(localizer.localize(points + bent, pixels))
+    assert published >= 19

@@ -1,0 +1,366 @@
+"""One fit of motion, in-frame turn and smooth error, against plain NumPy."""
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+from scipy.spatial.transform import Rotation
+
+from rs_localizer.core.scales import SCALES
+from rs_localizer.core.shake import CYCLES, FUNCTIONS, shake_at
+from rs_localizer.estimation.frame_fit import (
+    SMOOTH_TERMS,
+    TURNS,
+    fit_frame,
+    full_prior,
+    log_determinant_of_inverse,
+    products_of,
+    smooth_at,
+    smooth_terms,
+    with_scales,
+)
+from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.posterior import maximum_a_posteriori
+from rs_localizer.estimation.prior_terms import motion_terms
+from rs_localizer.estimation.refine import apply_step
+from rs_localizer.estimation.residuals import Lines
+
+from .frames import PRIOR, distance, frame
+from .projection import gradient, jacobian_of, pixels_of, project, row_time, scene, shake, waves
+
+COUNT, NOISE = 60, 0.3  # px
+# Polynomials of the image, from the constant to the cubic ones, and the sizes of each degree.
+PLACES = [(i, degree - i) for degree in range(4) for i in range(degree + 1)]
+DEGREE_SIZES = np.array([1.0, 1.0, 0.5, 0.25])
+TERMS = motion_terms((0.2, 0.1), (0.05, 0.03))
+STATE = np.concatenate([np.eye(3).ravel(), np.zeros(3), 0.002 * np.arange(12)])
+GROUPS = np.concatenate([np.repeat(np.arange(SCALES - 1), 6), np.full(2 * SMOOTH_TERMS, 14)])
+
+
+def lines_of(seed=0, count=COUNT):
+    """Random lines of a frame, and the inliers."""
+    rng = np.random.default_rng(seed)
+    lines = Lines(
+        NOISE * rng.normal(size=(count, 2)),
+        rng.normal(size=(count, 2, 18)) * 10.0 ** rng.uniform(0, 3, 18),
+        600.0 * rng.normal(size=(count, 2, 3)),
+        rng.uniform(-0.5, 0.5, count),
+        rng.uniform(-0.5, 0.6, (count, 2)),
+    )
+    return lines, rng.uniform(size=count) < 0.9
+
+
+def polynomials(rays, inliers):
+    """(n,10) over the part of the image that the inliers fill."""
+    low, high = rays[inliers].min(axis=0), rays[inliers].max(axis=0)
+    x, y = ((2 * rays - low - high) / (high - low)).T
+    orders = np.array(PLACES)
+    sizes = DEGREE_SIZES[orders.sum(axis=1)] * np.sqrt(np.prod(2 * orders + 1, axis=1))
+    series = np.eye(4)[:, orders.T]  # (4, 2, 10)
+    terms = sizes * legendre.legval(x, series[:, 0]).T * legendre.legval(y, series[:, 1]).T
+    return terms / np.sqrt(np.sum((1 + np.arange(4)) * DEGREE_SIZES**2))
+
+
+def design(lines, inliers, turns=True, smooth=True):
+    """All columns of the inliers as a plain matrix (2 n, m), and the errors (2 n,)."""
+    errors, by_motion, by_turn, tau, rays = lines
+    parts = [by_motion]
+    if turns:
+        turned = np.einsum("nk,nca->ncka", waves(tau, FUNCTIONS), by_turn)
+        parts.append(turned.reshape(len(tau), 2, -1))
+    if smooth:
+        each = np.einsum("nk,cd->ncdk", polynomials(rays, inliers), np.eye(2))
+        parts.append(each.reshape(len(tau), 2, -1))
+    whole = np.concatenate(parts, axis=2)[inliers]
+    return whole.reshape(-1, whole.shape[2]), errors[inliers].ravel()
+
+
+@pytest.mark.parametrize(("turns", "smooth"), itertools.product([False, True], repeat=2))
+def test_products_are_those_of_a_plain_design_matrix(turns, smooth):
+    lines, inliers = lines_of()
+    found = products_of(lines, inliers, lines.errors, turns, smooth)
+    matrix, errors = design(lines, inliers, turns, smooth)
+    scale = np.sqrt(np.sum(matrix**2, axis=0))
+    np.testing.assert_allclose(
+        found.products / np.outer(scale, scale), (matrix / scale).T @ (matrix / scale), atol=1e-12
+    )
+    np.testing.assert_allclose(found.with_errors / scale, -errors @ (matrix / scale), atol=1e-12)
+    assert found.squared_errors == pytest.approx(errors @ errors)
+
+
+def test_a_smooth_error_has_a_mean_square_of_its_scale_over_the_image():
+    """The terms are orthogonal over a square."""
+    grid = np.linspace(-1.0, 1.0, 201)
+    image = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    terms, mean = np.empty(SMOOTH_TERMS), np.zeros((SMOOTH_TERMS, SMOOTH_TERMS))
+    for ray in image:
+        smooth_terms(ray, np.array([-1.0, -1.0]), np.array([1.0, 1.0]), terms)
+        mean += np.outer(terms, terms) / len(image)
+    assert np.trace(mean) == pytest.approx(1.0, rel=0.03)
+    np.testing.assert_allclose(mean - np.diag(np.diag(mean)), 0.0, atol=0.01)
+
+
+def test_the_smooth_error_of_all_points_is_that_of_its_polynomials():
+    lines, inliers = lines_of(1)
+    coefficients = np.random.default_rng(2).normal(size=(2, SMOOTH_TERMS))
+    found = smooth_at(lines, inliers, coefficients.ravel())
+    expected = polynomials(lines.image, inliers) @ coefficients.T
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_a_log_determinant():
+    root = np.random.default_rng(0).normal(size=(7, 9))
+    matrix = root @ root.T
+    assert log_determinant_of_inverse(matrix) == pytest.approx(np.linalg.slogdet(matrix)[1])
+
+
+def test_the_prior_is_of_the_motion_without_its_turn():
+    """Slope and information against finite differences of the cost, by motion and coefficients."""
+    rng = np.random.default_rng(3)
+    turns = 1e-4 * rng.normal(size=(FUNCTIONS, 3))
+    whole, along, cost = full_prior(TERMS, STATE, turns, 18 + TURNS)
+
+    def cost_at(step):
+        other = turns + step[18:].reshape(FUNCTIONS, 3)
+        return full_prior(TERMS, apply_step(STATE, step[:18]), other, 18 + TURNS)[2]
+
+    # What the frame calls its velocity in the middle row is the motion's and the waves'.
+    rate = STATE[12:15] - (np.pi * np.arange(1, 15)) @ turns[1::2]
+    velocities = np.concatenate([rate, STATE[15:]])
+    deviations = np.repeat([0.2, 0.1, 0.05, 0.03], 3)
+    assert cost == pytest.approx(np.sum((velocities / deviations) ** 2))
+    h = 1e-4
+    units = np.eye(18 + TURNS)
+    slope = np.array([(cost_at(h * e) - cost_at(-h * e)) / (4.0 * h) for e in units])
+    np.testing.assert_allclose(along, slope, atol=1e-6 * np.abs(slope).max())
+    chosen = rng.choice(18 + TURNS, 40, replace=False)
+    chosen[:3] = 6, 18 + 3, 18 + 9  # rate about x, and two sines about x
+    for i, j in itertools.product(chosen[:12], chosen):
+        step = 1e-3 * units[i], 1e-3 * units[j]
+        second = sum(
+            a * b * cost_at(a * step[0] + b * step[1])
+            for a, b in itertools.product((1, -1), repeat=2)
+        )
+        assert whole[i, j] == pytest.approx(second / 8e-6, abs=1e-4 * np.abs(whole).max())
+
+
+def test_without_turns_the_prior_is_that_of_the_motion():
+    whole, along, _ = full_prior(TERMS, STATE, np.zeros((0, 3)), 18 + 20)
+    precisions = np.diag(TERMS.informations[0])
+    np.testing.assert_allclose(whole[:18, :18], np.diag(precisions))
+    np.testing.assert_allclose(along[6:18], precisions[6:] * STATE[12:])
+    assert not whole[18:].any()
+    assert not along[18:].any()
+
+
+HYPER_MEAN, HYPER_PRECISION = np.full(SCALES, np.log(3e-4)), np.full(SCALES, 0.2)
+HYPER_MEAN[-1] = np.log(0.03)
+
+
+def solved(lines, inliers, log_scales, rounds, coefficients=None, hyper=HYPER_PRECISION):
+    normal = products_of(lines, inliers, lines.errors, True, True)
+    information, slope, _ = full_prior(TERMS, STATE, np.zeros((FUNCTIONS, 3)), 18 + TURNS + 20)
+    coefficients = np.zeros(TURNS + 20) if coefficients is None else coefficients
+    result = with_scales(
+        normal, information, slope, coefficients, log_scales, HYPER_MEAN, hyper, NOISE,
+        2 * int(inliers.sum()), rounds,
+    )  # fmt: skip
+    return result, information, slope
+
+
+def posterior(matrix, errors, information, slope, scales):
+    """Mean and covariance of all parameters, by whole matrices."""
+    ridge = np.zeros(matrix.shape[1])
+    ridge[18:] = np.exp(-2.0 * scales[GROUPS])
+    covariance = np.linalg.inv(matrix.T @ matrix / NOISE**2 + information + np.diag(ridge))
+    return covariance @ (-matrix.T @ errors / NOISE**2 - slope), covariance
+
+
+def test_at_held_scales_it_is_the_gaussian_posterior():
+    lines, inliers = lines_of(4)
+    scales = np.random.default_rng(0).uniform(np.log(1e-4), np.log(1e-2), SCALES)
+    scales[-1] = np.log(0.5)
+    found, information, slope = solved(lines, inliers, scales, 1)
+    matrix, errors = design(lines, inliers)
+    mean, covariance = posterior(matrix, errors, information, slope, scales)
+    deviations = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.values / deviations, mean / deviations, atol=1e-5)
+    np.testing.assert_allclose(
+        found.covariance / np.outer(deviations, deviations),
+        covariance / np.outer(deviations, deviations), atol=1e-5,
+    )  # fmt: skip
+    ridge = np.exp(-2.0 * scales[GROUPS])
+    of_points = [np.sum((1.0 - ridge * np.diag(covariance)[18:])[g == GROUPS]) for g in range(15)]
+    np.testing.assert_allclose(found.decided, of_points, atol=1e-4)
+    left = errors + matrix @ mean
+    assert found.left == pytest.approx(left @ left, rel=1e-6)
+    assert found.prior_cost == pytest.approx(np.sum(ridge * mean[18:] ** 2), rel=1e-5)
+    used = np.trace(covariance @ matrix.T @ matrix) / NOISE**2
+    assert found.freedom == pytest.approx(max(len(errors) - used, 1.0), rel=1e-5)
+
+
+def test_it_does_not_matter_about_which_coefficients_errors_are_linearized():
+    """But for the prior of the motion, whose slope is taken where the coefficients are."""
+    lines, inliers = lines_of(4)
+    scales = np.full(SCALES, np.log(1e-3))
+    about = 1e-3 * np.random.default_rng(1).normal(size=TURNS + 20)
+    about[:TURNS] = 0.0
+    first, *_ = solved(lines, inliers, scales, 1)
+    smooth = polynomials(lines.image, inliers) @ about[TURNS:].reshape(2, -1).T
+    moved = lines._replace(errors=lines.errors + smooth)
+    second, *_ = solved(moved, inliers, scales, 1, about)
+    deviations = np.sqrt(np.diag(first.covariance))
+    np.testing.assert_allclose(second.values / deviations, first.values / deviations, atol=1e-6)
+    assert second.left == pytest.approx(first.left)
+
+
+def shaken_lines(seed):
+    """Lines with an in-frame turn at two frequencies and a smooth error in them."""
+    lines, inliers = lines_of(seed, 120)
+    matrix, _ = design(lines, inliers)
+    coefficients, rng = np.zeros(matrix.shape[1]), np.random.default_rng(seed)
+    coefficients[18 + 12 : 18 + 18] = 3e-3 * rng.normal(size=6)
+    coefficients[18 + 48 : 18 + 54] = 1e-3 * rng.normal(size=6)
+    coefficients[18 + TURNS :] = 0.5 * rng.normal(size=20)
+    lines.errors[inliers] -= (matrix @ coefficients).reshape(-1, 2)
+    return lines, inliers, coefficients[18:]
+
+
+def test_scales_are_where_their_probability_is_largest():
+    """The slope of the dense Gaussian's log evidence and of the hyperprior is zero there."""
+    lines, inliers, _ = shaken_lines(5)
+    found, information, slope = solved(lines, inliers, np.full(SCALES, np.log(5e-3)), 200)
+    matrix, errors = design(lines, inliers)
+
+    def log_probability(scales):
+        mean, covariance = posterior(matrix, errors, information, slope, scales)
+        left = errors + matrix @ mean
+        step = np.concatenate([mean[:18], mean[18:]])
+        prior = step @ information @ step + 2.0 * slope @ step
+        prior += np.sum(mean[18:] ** 2 * np.exp(-2.0 * scales[GROUPS]))
+        volume = np.linalg.slogdet(covariance)[1] - 2.0 * np.sum(scales[GROUPS])
+        hyper = np.sum(HYPER_PRECISION * (scales - HYPER_MEAN) ** 2)
+        hyper += np.sum(np.diff(scales[:-1]) ** 2)  # neighbouring frequencies are alike
+        return -0.5 * (left @ left / NOISE**2 + prior - volume + hyper)
+
+    h = 1e-3
+    best = found.log_scales
+    for g in range(SCALES):
+        if found.decided[g] < 0.5:
+            continue  # columns of a negligible scale are left out
+        e = h * np.eye(SCALES)[g]
+        uphill = (log_probability(best + e) - log_probability(best - e)) / (2.0 * h)
+        assert uphill == pytest.approx(0.0, abs=0.05)
+    assert np.argmax(found.log_scales[:-1]) in (2, 8)
+
+
+def test_scales_are_found_about_as_large_as_they_are():
+    sizes = []
+    for seed in range(6):
+        lines, inliers, coefficients = shaken_lines(seed)
+        found, *_ = solved(lines, inliers, np.full(SCALES, np.log(5e-3)), 60)
+        scales = np.exp(found.log_scales)
+        true = [np.sqrt(np.mean(coefficients[part] ** 2))
+                for part in (slice(12, 18), slice(48, 54), slice(TURNS, None))]  # fmt: skip
+        sizes.append(np.log(scales[[2, 8, 14]] / true))
+        quiet = np.delete(scales[:14], [2, 8])
+        assert np.median(quiet) < 5e-4
+    # Six coefficients tell a scale to 30 %, and the hyperprior pulls.
+    np.testing.assert_allclose(np.mean(sizes, axis=0), 0.0, atol=0.5)
+
+
+def test_scales_that_vanish_leave_the_covariance_of_the_motion_alone():
+    lines, inliers = lines_of(6)
+    found, information, _ = solved(lines, inliers, np.full(SCALES, np.log(1e-9)), 1)
+    matrix, _ = design(lines, inliers, False, False)
+    alone = np.linalg.inv(matrix.T @ matrix / NOISE**2 + information[:18, :18])
+    scale = np.sqrt(np.diag(alone))
+    np.testing.assert_allclose(
+        found.covariance[:18, :18] / np.outer(scale, scale), alone / np.outer(scale, scale),
+        atol=1e-8,
+    )  # fmt: skip
+    assert found.decided.max() == 0.0
+
+
+def fitted(observations, start, scales=(5e-3, 0.3), hyper=0.2, turns=True, smooth=True):
+    """``scales``: of turns and smooth error, where the fit starts."""
+    first = np.full(SCALES, np.log(scales[0]))
+    first[-1] = np.log(scales[1])
+    mean = HYPER_MEAN if hyper < 1.0 else first
+    return fit_frame(
+        observations.packed, len(observations), start, observations.row_time_gradient, PRIOR, 2.0,
+        30.0, 2.0, first, mean, np.full(SCALES, hyper), turns, smooth, 25,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
+def test_a_motion_with_an_in_frame_turn_is_recovered_without_noise(direction):
+    state, points = scene(direction, 1, 150, speed=0.03, acceleration=0.0)
+    coefficients = np.zeros((FUNCTIONS, 3))
+    rng = np.random.default_rng(0)
+    coefficients[[4, 5, 10, 11]] = 0.003 * rng.normal(size=(4, 3))
+    rays, _ = project(state, points, direction, coefficients)
+    observations = Observations.of(
+        points, rays, row_time(pixels_of(rays), direction), jacobian_of(rays), gradient(direction)
+    )
+    start = apply_step(state, 0.002 * rng.normal(size=18))
+    fit = fitted(observations, start, smooth=False)
+    assert fit.finite
+    assert fit.inliers.all()
+    assert fit.noise < 0.02
+    tau = np.linspace(-0.42, 0.42, 41)  # rows that see points
+
+    def orientations(state, turn):
+        moved = tau[:, None] * state[12:15] + 0.5 * tau[:, None] ** 2 * state[18:21]
+        return (
+            Rotation.from_rotvec(-turn)
+            * Rotation.from_rotvec(-moved)
+            * Rotation.from_matrix(state[:9].reshape(3, 3))
+        )
+
+    found = orientations(fit.state, shake_at(tau, fit.turns)[:, :3])
+    off = (found * orientations(state, shake(tau, coefficients)).inv()).magnitude()
+    assert np.sqrt(np.mean(off**2)) < np.radians(0.005)  # it swings by half a degree
+    assert set(np.argsort(fit.log_scales[:-1])[-2:]) == {2, 5}
+
+
+def test_without_anything_to_explain_the_fit_is_the_plain_one():
+    """At scales that are held to nothing: state, covariance, noise and inliers."""
+    for seed in range(3):
+        observations, truth = frame(seed, 0.05, 0.5, 80)
+        plain = maximum_a_posteriori(observations, truth, PRIOR, 2.0)
+        fit = fitted(observations, truth, (1e-6, 1e-6), 1e6)
+        np.testing.assert_array_equal(fit.inliers, plain.inliers)
+        assert fit.noise == pytest.approx(plain.noise, rel=0.01)
+        assert distance(plain, fit.state, slice(0, 18)) < 0.02
+        scale = np.sqrt(np.diag(plain.covariance))
+        np.testing.assert_allclose(
+            fit.covariance[:18, :18] / np.outer(scale, scale),
+            plain.covariance / np.outer(scale, scale), atol=0.03,
+        )  # fmt: skip
+
+
+def test_more_than_a_motion_is_chosen_by_the_evidence_only_if_there_is_more():
+    """Evidence of a fit with an in-frame turn beside one without, of the same inliers."""
+    swing = 0.004 * np.array([0.6, 0.8, 0.3])
+    cycles = CYCLES[5]
+    for shakes in (False, True):
+        gains = []
+        for seed in range(5):
+            observations, truth = frame(
+                seed, 0.02, 0.3, 100,
+                swing=lambda tau, s=shakes: s * np.sin(2 * np.pi * cycles * tau)[:, None] * swing,
+            )  # fmt: skip
+            with_turn = fitted(observations, truth, smooth=False)
+            none = fitted(observations, truth, (1e-6, 1e-6), 1e6, smooth=False)
+            if with_turn.inliers.sum() == none.inliers.sum():
+                gains.append(with_turn.evidence - none.evidence)
+            else:
+                gains.append(np.inf if with_turn.inliers.sum() > none.inliers.sum() else -np.inf)
+        assert np.median(gains) > 10.0 if shakes else np.median(gains) < 3.0
+
+
+def test_too_few_points_are_no_fit():
+    observations, truth = frame(0, 0.02, 0.3, 5)
+    assert not fitted(observations, truth).finite
