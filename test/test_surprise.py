@@ -112,7 +112,7 @@ def test_surprises_raise_what_is_expected_and_calm_lowers_it():
     assert followed(10.0).jolts == pytest.approx([10.0, 10.0], rel=0.02)
     assert followed(0.1, jolts=20.0).jolts == pytest.approx([2.0, 2.0], rel=0.02)
     # Never below what the configuration says, nor without bound.
-    assert followed(0.0).jolts == pytest.approx([0.1, 0.1])  # a calm camera
+    assert followed(0.0).jolts == pytest.approx([0.3, 0.3])  # a calm camera
     assert followed(100.0, jolts=9e3).jolts == pytest.approx([1e4, 1e4])
 
 
