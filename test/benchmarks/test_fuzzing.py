@@ -12,7 +12,7 @@ import pytest
 from benchmarks.fuzzing.campaign import case_of, run
 from benchmarks.fuzzing.targets import Target, targets
 
-EXECUTIONS = 4000
+EXECUTIONS = 6000
 
 
 def test_no_reader_raises_another_error(tmp_path: Path) -> None:
