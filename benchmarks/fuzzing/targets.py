@@ -64,7 +64,7 @@ _QUERIES = (
 _WPILIB = b"""{"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 0.0, "z": 1.5},
 "rotation": {"quaternion": {"W": 0.5, "X": 0.5, "Y": 0.5, "Z": 0.5}}}}],
 "field": {"length": 16.5, "width": 8.1}}"""
-_MARKERS = b"""# markers of a room, surveyed with a tape measure; lengths in metres, poses of the middle
+_MARKERS = b"""# markers of a room, surveyed with a tape measure; lengths in metres, poses of each
 map_frame: map
 markers:
   - family: 4x4_50

@@ -8,6 +8,7 @@ import importlib.util
 import json
 import shlex
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from tqdm import tqdm
@@ -249,7 +250,7 @@ def _replay(
     """Replay into ``out``; the frames of the result, where something needs all of them at once."""
     exports = Exports(args, localizer, out)
     whole: list[Localized] = []
-    keep = args.smooth or args.rerun is not None or args.view
+    keep = args.rerun is not None or args.view
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
@@ -257,28 +258,30 @@ def _replay(
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
 
-        def write(frame: Localized, recorded_ns: int) -> None:
+        def results() -> Iterator[tuple[int, Localized]]:
+            for recorded_ns, result in replay(bag, topics, localizer):
+                if result:
+                    tally.add(result)
+                    yield recorded_ns, result
+                else:
+                    tally.refuse(result)
+                bar.update(1 if result or result.reason not in NO_FRAMES else 0)
+
+        frames = results()
+        if args.smooth:
+            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
+            parts = smooth_frames(localizer, (frame for _, frame in frames), stamps, args.rate)
+            frames = (
+                (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
+            )
+        for recorded_ns, frame in frames:
             tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
             tally.track.add(frame)
             exports.add(frame)
-
-        for recorded_ns, result in replay(bag, topics, localizer):
-            if result:
-                tally.add(result)
-                if keep:
-                    whole.append(result)
-                if not args.smooth:
-                    write(result, recorded_ns)
-            else:
-                tally.refuse(result)
-            bar.update(1 if result or result.reason not in NO_FRAMES else 0)
-        if args.smooth and whole:
-            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            tally.smoothed = smooth_frames(localizer, whole, stamps, args.rate)
-            whole = tally.smoothed.frames
-            for frame in whole:
-                write(frame, frame.input_stamp_ns)
-            write_bridged(out, tally.smoothed.bridged)
+            if keep:
+                whole.append(frame)
+    if tally.smoothed is not None:
+        write_bridged(out, tally.smoothed.bridged)
     tally.seconds = time.perf_counter() - start
     tally.imu = localizer.imu.state
     if (measured := localizer.readout_watch.measured) is not None:
