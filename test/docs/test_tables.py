@@ -84,8 +84,8 @@ def test_the_topics_of_the_localizer() -> None:
     assert sent == {name: kind.replace("/msg/", "/") for name, kind in TYPES.items()}
 
 
-def test_the_diagram_of_the_readme_has_every_topic() -> None:
-    (diagram,) = pages.fenced("README.md", "mermaid")
+def test_the_diagram_of_the_node_has_every_topic() -> None:
+    (diagram,) = pages.fenced("docs/node.md", "mermaid")
     unused: Any = None
     for name in Feed(unused, unused, unused, unused).topics():
         assert name in diagram
