@@ -1,7 +1,5 @@
 """Imports inside the package go down only."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 
@@ -30,13 +28,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "features": {"core", "config", "io"},
     "pipeline": {*METHOD, "io", "features", "markers", "matching", "trajectory"},
     "mapping": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
     },
     "offline": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
     },
     "simulation": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
     },
     "evaluation": {
         *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
@@ -86,11 +84,11 @@ def parts(names: set[str]) -> set[str]:
         ("from numpy import io", set()),
     ],
 )
-def test_imports_are_seen(source: str, expected: set[str]) -> None:
+def test_imports_are_seen(source, expected):
     assert parts(imported(source, "rs_localizer.core")) == expected
 
 
-def test_imports_go_down_only() -> None:
+def test_imports_go_down_only():
     wrong = []
     for path in sorted(PACKAGE.rglob("*.py")):
         where = path.relative_to(PACKAGE.parent).with_suffix("").parts
@@ -113,7 +111,7 @@ ROS_MAY_IMPORT: dict[str, set[str]] = {
 }
 
 
-def test_nodes_do_not_know_each_other() -> None:
+def test_nodes_do_not_know_each_other():
     """What stands beside the folders starts nodes, and may import any of them."""
     ros = PACKAGE / "ros"
     folders = {path.name for path in ros.iterdir() if (path / "__init__.py").is_file()}

@@ -1,7 +1,5 @@
 """Videos, folders and bags of rendered prints become recordings of their corners."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,7 +72,7 @@ def jpeg(image: Any) -> bytes:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> SimpleNamespace:
+def files(tmp_path) -> SimpleNamespace:
     (tmp_path / "camera.yaml").write_text(CALIBRATION)
     write_marker_map(tmp_path / "map.yaml", MARKERS)
     images = [board(x) for x in (0.0, 0.01, 0.16, 0.02, 5.0, 0.03)]
@@ -97,7 +95,7 @@ def clouds(path: Path) -> list[Any]:
         return [read_correspondences(m) for _, _, m in bag.messages(["/correspondences"])]
 
 
-def test_video_of_a_board(files: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_video_of_a_board(files, capsys):
     words = [*files.calibration, *files.board, "--rate", "20", "--images"]
     assert detect(files, files.video, *words, "--readout-time", "0.011") == 0
     # The third image cuts the board off, in the fifth there is none.
@@ -149,7 +147,7 @@ def image_bag(path: Path, images: list[Any], info: bool = True) -> None:
                 bag.write("/cam/camera_info", make_camera_info(CAMERA, ns), ns)
 
 
-def test_bag_of_markers(files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bag_of_markers(files, tmp_path, capsys):
     images = [markers(x) for x in (0.0, 0.0, 0.01, 5.0)]
     image_bag(tmp_path / "bag", images)
     (tmp_path / "bag" / "parameters.yaml").write_text(
@@ -178,7 +176,7 @@ def test_bag_of_markers(files: Any, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert detector.take(raw[2])
 
 
-def test_georeferenced_maps_keep_their_millimetres(files: Any, tmp_path: Path) -> None:
+def test_georeferenced_maps_keep_their_millimetres(files, tmp_path):
     # UTM coordinates do not fit into single precision.
     text = Path(files.map[1]).read_text()
     far = text.replace("[-0.05, 0.0, 0.0]", "[691608.001, 5334764.002, 0.0]")
@@ -191,7 +189,7 @@ def test_georeferenced_maps_keep_their_millimetres(files: Any, tmp_path: Path) -
     assert found.points[0] == pytest.approx([691607.966, 5334764.037, 0.0], abs=1e-6)
 
 
-def test_folder_of_images(files: Any, tmp_path: Path) -> None:
+def test_folder_of_images(files, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
     for name in ("900000000000000000.png", "1000000000000000000.jpg"):
@@ -201,9 +199,7 @@ def test_folder_of_images(files: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["1650000000000000", "1" + 29 * "0"])
-def test_other_numbers_are_no_times(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_other_numbers_are_no_times(files, tmp_path, capsys, name):
     """Microseconds, and what no stamp can hold."""
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), markers())
@@ -211,9 +207,7 @@ def test_other_numbers_are_no_times(
     assert "the names of the files are not times in ns" in capsys.readouterr().err
 
 
-def test_nothing_is_left_where_nothing_was_seen(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_left_where_nothing_was_seen(files, tmp_path, capsys):
     other = MarkerMap(wall("5x5_50", (1, 1), 0.1, 0.1, first_id=7))
     write_marker_map(tmp_path / "map.yaml", other)
     image_bag(tmp_path / "bag", [markers()])
@@ -223,9 +217,7 @@ def test_nothing_is_left_where_nothing_was_seen(
     assert not files.out.exists()
 
 
-def test_a_map_that_does_not_fit_is_told(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_that_does_not_fit_is_told(files, tmp_path, capsys):
     text = (tmp_path / "map.yaml").read_text()
     path = tmp_path / "map.yaml"
     path.write_text(text.replace("[-0.05, 0.0, 0.0]", "[-0.25, 0.0, 0.0]"))
@@ -235,9 +227,7 @@ def test_a_map_that_does_not_fit_is_told(
     assert "note (1 images): the map does not fit the image" in capsys.readouterr().out
 
 
-def test_faults_end_the_command(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_faults_end_the_command(files, tmp_path, capsys):
     calibration = tmp_path / "camera.yaml"
     calibration.write_text(CALIBRATION.replace("240", "480"))
     words = [*files.calibration, *files.board, "--rate", "30"]
@@ -272,16 +262,14 @@ def test_faults_end_the_command(
         (("--readout-time", "7"), "--readout-time: must lie between 0 and 0.2, got 7"),
     ],
 )
-def test_wrong_usage(
-    files: Any, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], text: str
-) -> None:
+def test_wrong_usage(files, capsys, words, text):
     failed = "--image" in words or "--calibration" in words  # the work, not the usage
     assert detect(files, files.video, *words) == (1 if failed else 2)
     assert text in capsys.readouterr().err
     assert not files.out.exists()
 
 
-def test_settings_are_passed_on(files: Any, tmp_path: Path) -> None:
+def test_settings_are_passed_on(files, tmp_path):
     """The scan direction, and what else calibrate found, not the readout time alone."""
     file = tmp_path / "shutter.yaml"
     file.write_text(
@@ -302,7 +290,7 @@ def test_settings_are_passed_on(files: Any, tmp_path: Path) -> None:
     assert (config.readout_time, config.scan_direction) == (0.011, "top_to_bottom")
 
 
-def test_only_recordings_are_overwritten(files: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_recordings_are_overwritten(files, capsys):
     files.out.mkdir()
     (files.out / "thesis.tex").write_text("mine")
     words = [*files.calibration, *files.board, "--rate", "20", "--overwrite"]

@@ -1,7 +1,5 @@
 """Images of anything become recordings of keypoints, the same as the node's."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,7 +37,7 @@ def image(ns: int, pixels: Any) -> Any:
 
 
 @pytest.fixture
-def here(tmp_path: Path) -> SimpleNamespace:
+def here(tmp_path) -> SimpleNamespace:
     messages = [image((5 + k) * NS, picture(k)) for k in range(3)]
     messages.append(image(8 * NS, np.zeros((120, 160), np.uint8)))
     broken = image(9 * NS, picture(0))
@@ -60,9 +58,7 @@ def clouds(path: Path) -> list[Any]:
 
 
 @pytest.mark.parametrize(("kind", "width"), [("orb", 32), ("sift", 128)])
-def test_a_bag_of_images(
-    here: Any, kind: str, width: int, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bag_of_images(here, kind, width, capsys):
     words = ["--features", kind, "--max-keypoints", "40", "--out", str(here.out), "--timing"]
     assert main(["detect", here.bag, *words, "--readout-time", "0.02"]) == 0
     said = capsys.readouterr().out
@@ -101,9 +97,7 @@ def test_a_bag_of_images(
         (["--features", "orb", "--rate", "30"], "--rate is for videos and folders"),
     ],
 )
-def test_wrong_usage(
-    here: Any, words: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_usage(here, words, text, capsys):
     assert main(["detect", here.bag, *words, "--out", str(here.out)]) == 2
     assert text in capsys.readouterr().err
     assert not here.out.exists()

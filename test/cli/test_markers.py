@@ -1,7 +1,5 @@
 """Prints with their maps, and what is said of maps that cannot be right."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ def make(out: Path, *words: str) -> int:
     return main(["markers", "make", str(out), *words])
 
 
-def test_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_make_and_check(tmp_path, capsys):
     out = tmp_path / "wall.v2"
     assert make(out) == 0
     said = capsys.readouterr().out
@@ -32,9 +30,7 @@ def test_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
 
 
-def test_pages_of_others_are_not_overwritten(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pages_of_others_are_not_overwritten(tmp_path, capsys):
     (tmp_path / "wall_2.png").write_text("a photograph")
     words = ["--size", "0.13", "--grid", "2x1", "--format", "png"]
     assert make(tmp_path / "wall", *words) == 1
@@ -60,15 +56,13 @@ def test_pages_of_others_are_not_overwritten(
         (("--page", "a5"), "invalid choice: 'a5'"),
     ],
 )
-def test_wrong_usage(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], text: str
-) -> None:
+def test_wrong_usage(tmp_path, capsys, words, text):
     assert make(tmp_path / "wall", *words) == 2
     assert text in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_problems_of_a_map_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_problems_of_a_map_are_named(tmp_path, capsys):
     assert make(tmp_path / "wall", "--grid", "2x1", "--size", "0.05", "--gap", "0.03") == 0
     path = tmp_path / "wall.yaml"
     text = path.read_text()

@@ -1,7 +1,5 @@
 """``rs_localizer replay``: three kinds of recordings in, poses and twists out, faults in a line."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -30,7 +28,7 @@ SHUTTER = ["-p", f"readout_time:={READOUT_TIME}"]
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory) -> Path:
     """A simulated flight with /truth beside the inputs."""
     path = tmp_path_factory.mktemp("bags") / "flight"
     camera = Camera(640, 480, K, readout_time=READOUT_TIME)
@@ -60,9 +58,7 @@ def rewrite(source: Path, target: Path, change: Any, storage: str = "mcap") -> P
     return target
 
 
-def test_what_comes_out(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_comes_out(recording, tmp_path, capsys):
     out = tmp_path / "deep" / "out"
     assert main(["replay", str(recording), "--out", str(out), *SHUTTER]) == 0
     captured = capsys.readouterr()
@@ -132,7 +128,7 @@ def write_ros1(source: Path, target: Path) -> Path:
     return target
 
 
-def test_every_kind_of_recording_gives_the_same(recording: Path, tmp_path: Path) -> None:
+def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
     bags = [
         recording,
         next(recording.glob("*.mcap")),
@@ -149,7 +145,7 @@ def test_every_kind_of_recording_gives_the_same(recording: Path, tmp_path: Path)
     assert texts.count(texts[0]) == len(bags)
 
 
-def test_settings_of_a_file_and_of_the_command_line(recording: Path, tmp_path: Path) -> None:
+def test_settings_of_a_file_and_of_the_command_line(recording, tmp_path):
     file = tmp_path / "params.yaml"
     file.write_text(
         f"/**:\n  ros__parameters: {{readout_time: {READOUT_TIME}, pose_time: mid_frame}}\n"
@@ -163,9 +159,7 @@ def test_settings_of_a_file_and_of_the_command_line(recording: Path, tmp_path: P
     assert (middle - first).tolist() == [15_000_000] * FRAMES
 
 
-def test_frames_before_the_first_camera_info_are_refused(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_before_the_first_camera_info_are_refused(recording, tmp_path, capsys):
     infos: list[int] = []
 
     def late(topic: str, message: Any) -> str | None:
@@ -185,9 +179,7 @@ def test_frames_before_the_first_camera_info_are_refused(
     assert rows["  refused: bad_camera_info"] == "1"
 
 
-def test_no_frame_localized_is_a_failure(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
     def empty(topic: str, message: Any) -> str:
         if topic == "/correspondences":
             message.width, message.row_step, message.data = 0, 0, np.zeros(0, np.uint8)
@@ -200,9 +192,7 @@ def test_no_frame_localized_is_a_failure(
     assert "refused: empty_cloud" in captured.out
 
 
-def test_a_recording_that_starts_over_is_counted(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_that_starts_over_is_counted(recording, tmp_path, capsys):
     seen: list[int] = []
 
     def loop(topic: str, message: Any) -> str:
@@ -221,9 +211,7 @@ def test_a_recording_that_starts_over_is_counted(
     assert rows["started afresh: map_changed"] == "1"
 
 
-def test_without_readout_time_there_are_no_twists(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_readout_time_there_are_no_twists(recording, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["replay", str(recording), "--out", str(out)]) == 0
     text = capsys.readouterr().out
@@ -237,9 +225,7 @@ def test_without_readout_time_there_are_no_twists(
         ]
 
 
-def test_settings_beside_the_recording_are_pointed_out(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_beside_the_recording_are_pointed_out(recording, tmp_path, capsys):
     bag = rewrite(recording, tmp_path / "bag", lambda topic, message: topic)
     arguments = ["replay", str(bag), "--out", str(tmp_path / "out"), "--overwrite"]
     assert main(arguments) == 0
@@ -253,9 +239,7 @@ def test_settings_beside_the_recording_are_pointed_out(
     assert hint not in capsys.readouterr().out
 
 
-def test_an_earlier_result_is_not_overwritten_unasked(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_earlier_result_is_not_overwritten_unasked(recording, tmp_path, capsys):
     out = tmp_path / "out"
     arguments = ["replay", str(recording), "--out", str(out), *SHUTTER]
     assert main(arguments) == 0
@@ -269,9 +253,7 @@ def test_an_earlier_result_is_not_overwritten_unasked(
     assert (out / "notes.txt").read_text() == "mine"
 
 
-def test_topics_are_found_or_chosen(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_topics_are_found_or_chosen(recording, tmp_path, capsys):
     def attempt(name: str, change: Any, *arguments: str) -> tuple[int, str]:
         bag = rewrite(recording, tmp_path / name, change)
         out = tmp_path / f"{name}_out"
@@ -327,15 +309,7 @@ def test_topics_are_found_or_chosen(
         (["--ros", "--out", "somewhere"], 2, "are for offline replay"),
     ],
 )
-def test_wrong_settings(
-    recording: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    code: int,
-    text: str,
-) -> None:
+def test_wrong_settings(recording, tmp_path, monkeypatch, capsys, words, code, text):
     monkeypatch.chdir(tmp_path)
     assert main(["replay", str(recording), *words]) == code
     error = capsys.readouterr().err
@@ -381,9 +355,7 @@ def empty_bag(directory: Path) -> Path:
         (lambda directory: directory, "is not a recording"),
     ],
 )
-def test_recordings_that_are_none(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], make: Any, text: str
-) -> None:
+def test_recordings_that_are_none(tmp_path, capsys, make, text):
     path = make(tmp_path)
     assert main(["replay", str(path), "--out", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err

@@ -1,7 +1,5 @@
 """The bag of `simulate`: what it holds, and that its truth is the truth of its frames."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections import Counter
@@ -22,7 +20,7 @@ def simulate(out: Path, *words: str) -> int:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_bag_holds_frames_and_their_truth(tmp_path: Path, storage: str) -> None:
+def test_bag_holds_frames_and_their_truth(tmp_path, storage):
     words = ("--duration", "0.5", "--storage", storage, "--readout-time", "0.02")
     assert simulate(tmp_path / "bag", *words) == 0
     with open_bag(tmp_path / "bag") as bag:
@@ -83,22 +81,14 @@ def test_bag_holds_frames_and_their_truth(tmp_path: Path, storage: str) -> None:
         (["--points", "many"], 2, "--points: must be a whole number, got 'many'"),
     ],
 )
-def test_faults(
-    tmp_path: Path,
-    words: list[str],
-    code: int,
-    expected: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_faults(tmp_path, words, code, expected, capsys):
     assert simulate(tmp_path / "bag", *words) == code
     assert expected in capsys.readouterr().err
     assert not (tmp_path / "bag").exists()
     assert not (tmp_path / "bag").exists()
 
 
-def test_the_next_command_has_the_shutter(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_next_command_has_the_shutter(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ("--readout-time", "0.025", "--scan-direction", "bottom_to_top", "--duration", "0.2")
     assert simulate(Path("my bag"), *words) == 0
@@ -113,9 +103,7 @@ def test_the_next_command_has_the_shutter(
     assert main(["evaluate", "my bag_poses", "my bag"]) == 0
 
 
-def test_fewer_points_than_asked_for_are_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fewer_points_than_asked_for_are_told(tmp_path, capsys):
     # Two seconds at a narrow view of a room: some frames see a point, others none.
     words = ("--focal", "30000", "--points", "5", "--duration", "2")
     assert simulate(tmp_path / "bag", *words) == 0

@@ -4,8 +4,6 @@ The chain is of 4x4 matrices, from the map to the body; velocities are differenc
 covariances come from differences of it and from a Monte Carlo simulation.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -186,13 +184,13 @@ class KnowsTheMotion(Localizer):
 
 
 @pytest.fixture(autouse=True)
-def known_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+def known_motion(monkeypatch) -> None:
     monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", KnowsTheMotion)
 
 
 @pytest.fixture
 def localize(
-    make_cloud_message: Make, make_camera_info: Make
+    make_cloud_message, make_camera_info
 ) -> Callable[..., tuple[Localized | Refusal, NodeConfig]]:
     fields = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]
 
@@ -226,9 +224,7 @@ def covariance(function: Callable[[Array], Array], of: Array, step: float) -> Ar
 
 @pytest.mark.parametrize("direction", list(ScanDirection))
 @pytest.mark.parametrize("pose_time", list(PoseTime))
-def test_every_quantity(
-    localize: Any, robot: TransformTree, pose_time: str, direction: str
-) -> None:
+def test_every_quantity(localize, robot, pose_time, direction):
     # Of a region of the sensor (x 40 to 359, y 100 to 399), the stamp is that of its first line.
     lines = {
         "top_to_bottom": (239.5 - 100) / 479,
@@ -303,7 +299,7 @@ def as_matrix(item: Broadcast) -> Array:
 
 
 @pytest.mark.bench
-def test_covariances_cover_what_is_published(localize: Any, robot: TransformTree) -> None:
+def test_covariances_cover_what_is_published(localize, robot):
     # No derivative at all: the scatter of poses and twists of many disturbed motions.
     frame = localized(localize(robot))
     truth = Chain(estimate(), middle=5.0 + 0.5 * READOUT_TIME)
@@ -324,7 +320,7 @@ def test_covariances_cover_what_is_published(localize: Any, robot: TransformTree
 
 
 @pytest.mark.parametrize("pose_time", list(PoseTime))
-def test_a_camera_on_a_moving_head(localize: Any, robot: TransformTree, pose_time: str) -> None:
+def test_a_camera_on_a_moving_head(localize, robot, pose_time):
     truth = Panning(estimate(), middle=5.0 + 0.5 * READOUT_TIME)
     for index in range(-5, 30):
         seconds = 5.0 + 0.005 * index
@@ -346,7 +342,7 @@ def test_a_camera_on_a_moving_head(localize: Any, robot: TransformTree, pose_tim
     assert "'mast' is known from 4.975 s to 5.145 s, not at 5.155 s" in refused.detail
 
 
-def test_laws() -> None:
+def test_laws():
     rng = np.random.default_rng(5)
 
     def transform() -> Transform:
@@ -378,7 +374,7 @@ def test_laws() -> None:
         assert not same(there[index], original)
 
 
-def test_the_twist_is_the_screw_of_the_motion() -> None:
+def test_the_twist_is_the_screw_of_the_motion():
     # expm of the body's twist is the motion of the body: another way to the same velocities.
     twist = Twist(np.array([0.3, -0.1, 0.2]), np.array([0.4, 0.5, -0.6]), np.eye(6))
     by = Transform(turned("x", 40.0), np.array([0.2, -0.3, 0.5]))
@@ -397,7 +393,7 @@ def test_the_twist_is_the_screw_of_the_motion() -> None:
     assert np.allclose(expm(screw(found.linear, found.angular)), expected, atol=1e-12)
 
 
-def test_a_missing_transform_refuses_the_frame_only(localize: Any) -> None:
+def test_a_missing_transform_refuses_the_frame_only(localize):
     tree = TransformTree()
     refused, _ = localize(tree)
     assert refused == Refusal(
@@ -421,7 +417,7 @@ def test_a_missing_transform_refuses_the_frame_only(localize: Any) -> None:
         assert np.allclose(frame.pose.position, expected[:3, 3], atol=1e-12)
 
 
-def test_without_a_base_frame_nothing_is_looked_up(localize: Any) -> None:
+def test_without_a_base_frame_nothing_is_looked_up(localize):
     for name in ("", "camera"):
         frame = localized(localize(None, base_frame=name))
         assert frame.body_frame == "camera"
@@ -432,7 +428,7 @@ def test_without_a_base_frame_nothing_is_looked_up(localize: Any) -> None:
     assert broadcast(frame, NodeConfig(), TransformTree()) is None
 
 
-def test_odometry_straight_to_the_camera(localize: Any, robot: TransformTree) -> None:
+def test_odometry_straight_to_the_camera(localize, robot):
     robot.add(
         tf("odom", "base_link", matrix([1.0, 2.0, 0.0], turned("z", 30.0)), 5.0), static=False
     )
@@ -441,7 +437,7 @@ def test_odometry_straight_to_the_camera(localize: Any, robot: TransformTree) ->
     assert np.allclose(*map(as_matrix, corrections), atol=1e-12)
 
 
-def test_odometry_that_is_missing_costs_no_pose(localize: Any, robot: TransformTree) -> None:
+def test_odometry_that_is_missing_costs_no_pose(localize, robot):
     frame, config = localize(robot, publish_tf="map_to_odom")
     assert frame
     with pytest.raises(TransformError, match="frame 'odom' does not exist; there are base_link"):
@@ -449,7 +445,7 @@ def test_odometry_that_is_missing_costs_no_pose(localize: Any, robot: TransformT
 
 
 @pytest.mark.parametrize("pose_time", list(PoseTime))
-def test_a_stamp_of_zero(localize: Any, robot: TransformTree, pose_time: str) -> None:
+def test_a_stamp_of_zero(localize, robot, pose_time):
     # The mounting is the latest, the pose goes out, and TF, which needs a time, gets nothing.
     robot.add(tf("base_link", "mast", matrix([9.0, 0.0, 0.0], np.eye(3)), 7.0), static=False)
     robot.add(tf("base_link", "mast", BASE_FROM_MAST, 8.0), static=False)
@@ -463,7 +459,7 @@ def test_a_stamp_of_zero(localize: Any, robot: TransformTree, pose_time: str) ->
         broadcast(frame, config, robot)
 
 
-def test_transforms_that_are_none() -> None:
+def test_transforms_that_are_none():
     good = tf("a", "b", BASE_FROM_MAST).transforms[0].transform
     read = read_transform(good)
     assert np.allclose(matrix(read.translation, read.rotation), BASE_FROM_MAST, atol=1e-15)

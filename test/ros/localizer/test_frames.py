@@ -1,7 +1,5 @@
 """base_frame and publish_tf of the node in its own process, with tf2_ros or a stand-in for it."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import signal
@@ -68,7 +66,7 @@ def stamped(make: Callable[..., Any], sample: Sample) -> Any:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("bags") / "flight"
     camera = Camera(640, 480, K, readout_time=READOUT_TIME)
     motion = ConstantVelocity(
@@ -155,7 +153,7 @@ class Robot:
 
 
 @pytest.fixture
-def robot(peer: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
+def robot(peer, monkeypatch) -> Iterator[Robot]:
     if not INSTALLED:
         monkeypatch.syspath_prepend(str(STAND_IN))
     result = Robot(peer, importlib.import_module("tf2_ros"))
@@ -184,9 +182,7 @@ def change(peer: Any, name: str, value: object) -> tuple[bool, str]:
     return result.successful, result.reason
 
 
-def test_node_and_replay_say_the_same_of_the_base(
-    recording: Path, tmp_path: Path, start_node: Any, robot: Robot
-) -> None:
+def test_node_and_replay_say_the_same_of_the_base(recording, tmp_path, start_node, robot):
     settings = [*SHUTTER, "-p", "base_frame:=base_link", "-p", "publish_tf:=map_to_odom"]
     start_node(*settings, **ENVIRONMENT)
     robot.connect()
@@ -242,9 +238,7 @@ def compare(bag: Any, robot: Robot, count: int) -> None:
             assert np.allclose(*numbers, rtol=0.0, atol=0.0 if INSTALLED else 1e-12)
 
 
-def test_a_mounting_that_comes_and_changes_and_moves(
-    recording: Path, start_node: Any, robot: Robot
-) -> None:
+def test_a_mounting_that_comes_and_changes_and_moves(recording, start_node, robot):
     settings = ("-p", "base_frame:=base_link", "-p", "transform_tolerance:=10.0")
     node = start_node(*SHUTTER, *settings, **ENVIRONMENT)
     robot.connect()
@@ -281,7 +275,7 @@ def test_a_mounting_that_comes_and_changes_and_moves(
     assert time.monotonic() - started < 5.0
 
 
-def test_publish_tf_changes_while_it_runs(recording: Path, start_node: Any, robot: Robot) -> None:
+def test_publish_tf_changes_while_it_runs(recording, start_node, robot):
     start_node(*SHUTTER, **ENVIRONMENT)
     assert robot.peer.spin_until(lambda: robot.peer.node.count_publishers("/rs_localizer/pose"))
     assert change(robot.peer, "publish_tf", "map_to_camera") == (True, "")
@@ -299,7 +293,7 @@ def test_publish_tf_changes_while_it_runs(recording: Path, start_node: Any, robo
     assert not robot.sent
 
 
-def test_without_tf2_ros(recording: Path, start_node: Any, peer: Any) -> None:
+def test_without_tf2_ros(recording, start_node, peer):
     node = start_node("-p", "base_frame:=base_link", run=BLOCKED)
     assert node.process.wait(60) == 1
     assert "base_frame 'base_link' needs the Python package tf2_ros" in node.log

@@ -1,10 +1,6 @@
 """Keypoints and maps over live DDS: latched, late, replaced, bad; said in the diagnostics."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,7 +36,7 @@ LANDMARKS = Map(POINTS, np.arange(8000), random_descriptors(8000, np.random.defa
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, list[SimulatedFrame]]:
+def flight(tmp_path_factory) -> tuple[Any, list[SimulatedFrame]]:
     """The camera's message and frames with their truth."""
     camera = Camera(640, 480, K, readout_time=READOUT_TIME)
     motion = ConstantVelocity(
@@ -119,9 +115,7 @@ class Talk:
         return pose
 
 
-def test_maps_that_are_late_replaced_and_bad(
-    start_node: Callable[..., Any], peer: Any, flight: tuple[Any, list[SimulatedFrame]]
-) -> None:
+def test_maps_that_are_late_replaced_and_bad(start_node, peer, flight):
     info, frames = flight
     node = start_node("-p", f"readout_time:={READOUT_TIME}")
     talk = Talk(peer, info)
@@ -158,9 +152,7 @@ def test_maps_that_are_late_replaced_and_bad(
     assert node.stop() == 0
 
 
-def test_a_map_that_is_not_latched(
-    start_node: Callable[..., Any], peer: Any, flight: tuple[Any, list[SimulatedFrame]]
-) -> None:
+def test_a_map_that_is_not_latched(start_node, peer, flight):
     info, frames = flight
     start_node("-p", f"readout_time:={READOUT_TIME}")
     talk = Talk(peer, info)
@@ -171,12 +163,7 @@ def test_a_map_that_is_not_latched(
     talk.localize(frames[0])
 
 
-def test_a_map_file(
-    tmp_path: Path,
-    start_node: Callable[..., Any],
-    peer: Any,
-    flight: tuple[Any, list[SimulatedFrame]],
-) -> None:
+def test_a_map_file(tmp_path, start_node, peer, flight):
     info, frames = flight
     path = tmp_path / "map.npz"
     write_map_file(path, LANDMARKS)

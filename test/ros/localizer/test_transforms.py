@@ -1,7 +1,5 @@
 """TF in the node. Where tf2_ros is installed the same tests run with it."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys
@@ -26,7 +24,7 @@ HALF_TURN = (0.0, 0.0, 1.0, 0.0)
 
 
 @pytest.fixture
-def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+def tf2_ros(monkeypatch) -> Iterator[ModuleType]:
     installed = importlib.util.find_spec("tf2_ros") is not None
     if not installed:
         monkeypatch.syspath_prepend(str(STAND_IN))
@@ -36,7 +34,7 @@ def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
 
 
 @pytest.fixture
-def robot(tf2_ros: ModuleType, peer: Any) -> Any:
+def robot(tf2_ros, peer) -> Any:
     """Sends transforms, and hears what comes on TF."""
     moving = tf2_ros.TransformBroadcaster(peer.node)
     static: list[Any] = []
@@ -61,7 +59,7 @@ def robot(tf2_ros: ModuleType, peer: Any) -> Any:
 
 
 @pytest.fixture
-def made(peer: Any, robot: Any) -> Iterator[Callable[..., Any]]:
+def made(peer, robot) -> Iterator[Callable[..., Any]]:
     """Makes the node's TF, in a node and a thread of their own as the executor is."""
     parts: list[Any] = []
 
@@ -105,7 +103,7 @@ def known(made: Any, peer: Any, target: str, source: str, stamp_ns: int | None) 
     return made.tf.lookup(target, source, stamp_ns)
 
 
-def test_static_transforms_hold_for_all_times(made: Any, robot: Any, peer: Any) -> None:
+def test_static_transforms_hold_for_all_times(made, robot, peer):
     node = made(base_frame="base_link")
     with pytest.raises(TransformError, match=r'"?camera"?.* does not exist'):
         node.tf.lookup("camera", "base_link", 5)
@@ -122,7 +120,7 @@ def test_static_transforms_hold_for_all_times(made: Any, robot: Any, peer: Any) 
         node.tf.lookup("base_link", "camera", -10_000_000)
 
 
-def test_what_is_not_known_yet_is_said_at_once(made: Any, robot: Any, peer: Any) -> None:
+def test_what_is_not_known_yet_is_said_at_once(made, robot, peer):
     node = made(base_frame="base_link", transform_tolerance=10.0)
     second = 10**9
     robot.send("base_link", "camera", 1.0, 5 * second)
@@ -160,7 +158,7 @@ def heard(robot: Any, peer: Any, parent: str, child: str, stamp_ns: int | None) 
     return found[0]
 
 
-def test_map_to_odom(made: Any, robot: Any, peer: Any) -> None:
+def test_map_to_odom(made, robot, peer):
     node = made(publish_tf="map_to_odom", transform_tolerance=0.5)
     second = 10**9
     assert not node.notes
@@ -188,7 +186,7 @@ def test_map_to_odom(made: Any, robot: Any, peer: Any) -> None:
     assert base.transform.rotation.w == pytest.approx(1.0)
 
 
-def test_odometry_that_does_not_come(made: Any, robot: Any, peer: Any) -> None:
+def test_odometry_that_does_not_come(made, robot, peer):
     node = made(publish_tf="map_to_odom", transform_tolerance=0.1)
     for stamp in (5, 6):
         robot.send("odom", "base_link", 1.0, stamp * 10**9)
@@ -217,7 +215,7 @@ def robot_knows(robot: Any, name: str) -> bool:
     return True
 
 
-def test_map_to_camera(made: Any, robot: Any, peer: Any) -> None:
+def test_map_to_camera(made, robot, peer):
     node = made(publish_tf="map_to_camera", transform_tolerance=0.5)
     node.publish(frame(5 * 10**9, x=4.0), node.config)
     sent = heard(robot, peer, "map", "base_link", None)
@@ -233,7 +231,7 @@ def test_map_to_camera(made: Any, robot: Any, peer: Any) -> None:
     assert len(node.notes) == 1
 
 
-def test_a_frame_has_one_parent(made: Any, robot: Any, peer: Any) -> None:
+def test_a_frame_has_one_parent(made, robot, peer):
     node = made(publish_tf="map_to_camera")
     robot.send("odom", "base_link", 1.0)
     known(node, peer, "odom", "base_link", None)
@@ -248,7 +246,7 @@ def test_a_frame_has_one_parent(made: Any, robot: Any, peer: Any) -> None:
     assert not robot_knows(robot, "map")
 
 
-def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
     check(NodeConfig())
     check(NodeConfig(transform_tolerance=3.0))
