@@ -36,14 +36,6 @@ def is_compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     return bool(names & COMPILED)
 
 
-def test_parameters_are_seen():
-    source = (
-        "class A:\n    def f(self, a, /, b, *c, d, **e): ...\nif TYPE_CHECKING:\n    def g(): ..."
-    )
-    (found,) = functions(ast.parse(source))
-    assert parameters(found) == ["a", "b", "d", "c", "e"]
-
-
 def test_no_function_takes_many_parameters():
     found = {
         f"{path.relative_to(PACKAGE)}: {function.name}"

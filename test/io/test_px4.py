@@ -63,17 +63,6 @@ def test_what_is_not_known_is_nan():
     assert np.isfinite(fields["position"]).all()
 
 
-def test_variances_go_with_their_axes():
-    deviations = (0.1, 0.2, 0.3, 0.01, 0.02, 0.03)  # east, north, up; turns about them
-    level = vehicle_odometry(localized(pose_deviations=deviations), "ned", 0, 0)
-    np.testing.assert_allclose(level["position_variance"], [0.04, 0.01, 0.09], rtol=1e-6)
-    # It looks east: its roll is a turn about east, its pitch one about north.
-    np.testing.assert_allclose(level["orientation_variance"], [1e-4, 4e-4, 9e-4], rtol=1e-6)
-    turned = vehicle_odometry(localized(pose_deviations=deviations, yaw=90.0), "ned", 0, 0)
-    np.testing.assert_allclose(turned["position_variance"], [0.04, 0.01, 0.09], rtol=1e-6)
-    np.testing.assert_allclose(turned["orientation_variance"], [4e-4, 1e-4, 9e-4], rtol=1e-6)
-
-
 def test_variances_are_those_of_the_errors():
     """Of poses drawn from the covariance: positions in the world, turns about the body's axes."""
     rng = np.random.default_rng(3)

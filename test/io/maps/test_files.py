@@ -22,7 +22,6 @@ import pytest
 
 from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.io.maps.ply import write_ply
 
 COLMAP = Path(__file__).parent / "colmap"
 
@@ -40,29 +39,6 @@ def landmarks(ids: str | None, descriptors: str | None, count: int = 7) -> Map:
         "float": rng.normal(size=(count, 5)).astype(np.float32),
     }[descriptors]
     return Map(rng.normal(size=(count, 3)) * 1e5, numbers, rows, "hall")
-
-
-def assert_same(one: Map, other: Map) -> None:
-    for name in ("points", "ids", "descriptors"):
-        a, b = getattr(one, name), getattr(other, name)
-        assert (a is None) == (b is None)
-        if a is not None:
-            assert a.dtype == b.dtype
-            assert a.tolist() == b.tolist()
-    assert one.frame == other.frame
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".ply", "text.ply"])
-@pytest.mark.parametrize("ids", [None, "unsigned", "signed"])
-@pytest.mark.parametrize("descriptors", [None, "binary", "float"])
-def test_round_trip(tmp_path, suffix, ids, descriptors):
-    written = landmarks(ids, descriptors)
-    path = tmp_path / f"map{suffix}"
-    if suffix == "text.ply":
-        write_ply(path, written, binary=False)
-    else:
-        write_map_file(path, written)
-    assert_same(read_map_file(path, "hall"), written)
 
 
 def test_archives_of_numpy_in_other_types(tmp_path):
