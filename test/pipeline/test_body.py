@@ -16,7 +16,7 @@ import pytest
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -28,9 +28,9 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, Pose, Twist, messages
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree, read_transform
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.published import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.refusal import Refusal
 
 Make = Callable[..., SimpleNamespace]
@@ -187,7 +187,7 @@ class KnowsTheMotion(Localizer):
 
 @pytest.fixture(autouse=True)
 def known_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", KnowsTheMotion)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", KnowsTheMotion)
 
 
 @pytest.fixture
