@@ -1,9 +1,6 @@
 """A short campaign over all readers, and that a campaign sees what it is there to see."""
 
-from __future__ import annotations
-
 import warnings
-from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -15,7 +12,7 @@ from benchmarks.fuzzing.targets import Target, targets
 EXECUTIONS = 4000
 
 
-def test_no_reader_raises_another_error(tmp_path: Path) -> None:
+def test_no_reader_raises_another_error(tmp_path):
     everything = targets(tmp_path)
     *_, report = run(everything, EXECUTIONS, seed=1)
     assert report.failures == [], report.text()
@@ -27,7 +24,7 @@ def test_no_reader_raises_another_error(tmp_path: Path) -> None:
     assert report.peak_mb < 200.0
 
 
-def test_what_fails_is_reported() -> None:
+def test_what_fails_is_reported():
     def read(case: Any) -> None:
         if case == 3:
             raise KeyError("three")
@@ -46,7 +43,7 @@ def test_what_fails_is_reported() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_every_damage_changes_something(seed: int, tmp_path: Path) -> None:
+def test_every_damage_changes_something(seed, tmp_path):
     random = Random(seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

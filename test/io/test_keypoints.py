@@ -1,7 +1,5 @@
 """Clouds of keypoints and of landmarks: every layout is read, the others are refused."""
 
-from __future__ import annotations
-
 import array
 from types import SimpleNamespace
 from typing import Any
@@ -55,9 +53,7 @@ NUMBERS = ("descriptor", "f4", (7,))
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("mark", [("id",), ("bits",), ("numbers",), ("id", "bits")])
 @pytest.mark.parametrize("container", [np.asarray, lambda data: array.array("B", data.tobytes())])
-def test_keypoints_and_landmarks_of_any_layout(
-    order: str, mark: tuple[str, ...], container: Any
-) -> None:
+def test_keypoints_and_landmarks_of_any_layout(order, mark, container):
     chosen = {"id": ("id", "i2"), "bits": BITS, "numbers": NUMBERS}
     marks = [chosen[name] for name in mark]
     message = cloud(("other", "i4"), *UV, *marks, ("score", "f4"), order=order)
@@ -88,7 +84,7 @@ def test_keypoints_and_landmarks_of_any_layout(
 
 
 @pytest.mark.parametrize("name", ["u", "descriptor", "score"])
-def test_rows_that_are_not_finite_are_dropped_and_counted(name: str) -> None:
+def test_rows_that_are_not_finite_are_dropped_and_counted(name):
     message = cloud(*UV, NUMBERS, ("score", "f4"))
     kinds = {field.name: field for field in message.fields}
     data = message.data.copy()
@@ -102,7 +98,7 @@ def test_rows_that_are_not_finite_are_dropped_and_counted(name: str) -> None:
     assert len(read) == COUNT - 1
 
 
-def test_landmarks_that_are_not_finite() -> None:
+def test_landmarks_that_are_not_finite():
     message = cloud(("x", "f4"), ("y", "f4"), ("z", "f4"), ("id", "u4"))
     data = message.data.copy()
     data.reshape(COUNT, -1)[1:4, :4] = np.array([np.inf], "<f4").view(np.uint8)
@@ -127,7 +123,7 @@ def test_landmarks_that_are_not_finite() -> None:
         ((("u", "f4", (2,)), ("v", "f4"), ("id", "u4")), "'u' must hold one value, found 2"),
     ],
 )
-def test_bad_keypoints(fields: tuple[Any, ...], text: str) -> None:
+def test_bad_keypoints(fields, text):
     rows = np.zeros(2, list(fields))
     with pytest.raises(MessageError, match=text):
         read_keypoints(make_cloud(make_message, 0, "camera", rows))
@@ -141,13 +137,13 @@ def test_bad_keypoints(fields: tuple[Any, ...], text: str) -> None:
         ((*XYZ, ("id", "u4")), "1 ids stand for several landmarks each, the first of them is 0"),
     ],
 )
-def test_bad_landmarks(fields: tuple[Any, ...], text: str) -> None:
+def test_bad_landmarks(fields, text):
     rows = np.zeros(2, list(fields))
     with pytest.raises(MessageError, match=text):
         read_map(make_cloud(make_message, 0, "map", rows))
 
 
-def test_other_bad_clouds() -> None:
+def test_other_bad_clouds():
     message = cloud(*XYZ, ("id", "u4"), frame="")
     with pytest.raises(MessageError, match=r"frame_id is empty; it must name the frame of x, y, z"):
         read_map(message)

@@ -1,7 +1,5 @@
 """Cubes stand on their markers, each point of them at the time of the row that sees it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -56,7 +54,7 @@ def near(mask: Any, pixel: Any) -> bool:
     return bool(mask[y - 1 : y + 2, x - 1 : x + 2].any())
 
 
-def test_cubes_stand_on_their_markers_while_the_camera_moves() -> None:
+def test_cubes_stand_on_their_markers_while_the_camera_moves():
     path = CameraPath(10**9, POSITION, FACING, np.array(LINEAR), np.array(ANGULAR))
     mask = drawn(path, 10**9)
     for marker in MAP.markers:
@@ -69,7 +67,7 @@ def test_cubes_stand_on_their_markers_while_the_camera_moves() -> None:
         assert near(mask, rolling(a + share * (b - a)))
 
 
-def test_a_pose_of_another_instant_is_brought_to_each_row() -> None:
+def test_a_pose_of_another_instant_is_brought_to_each_row():
     # As with pose_time mid_frame: half a readout after the first row.
     later = 0.5 * READOUT
     rotation = FACING @ Rotation.from_rotvec(np.array(ANGULAR) * later).as_matrix()
@@ -82,13 +80,13 @@ def test_a_pose_of_another_instant_is_brought_to_each_row() -> None:
         assert all(near(mask, rolling(corner)) for corner in marker.corners)
 
 
-def test_a_pose_without_a_twist_misses_them() -> None:
+def test_a_pose_without_a_twist_misses_them():
     still = CameraPath(10**9, POSITION, FACING, np.zeros(3), np.zeros(3))
     mask = drawn(still, 10**9)
     assert not all(near(mask, rolling(c)) for m in MAP.markers for c in m.corners)
 
 
-def test_outlines_tell_what_is_used() -> None:
+def test_outlines_tell_what_is_used():
     found = detections()
     item = found.markers[0]
     seen = Seen(item.family, item.ids, item.quads, item.found, np.array([True, False]))

@@ -1,9 +1,5 @@
 """What an image shows, for those whose map has nothing of it."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -15,7 +11,7 @@ from rs_localizer.markers.recognition import chessboard_size, recognized
 
 
 @pytest.mark.parametrize("name", ["4x4_50", "5x5_250", "apriltag_36h11", "aruco_original"])
-def test_markers_are_named_with_their_family(name: str, render: Any, look: Any) -> None:
+def test_markers_are_named_with_their_family(name, render, look):
     prints = []
     for x, id_ in ((-0.07, 3), (0.07, 17)):
         marker = Marker.at(name, id_, 0.1, Pose(np.array([x, 0.0, 0.0])))
@@ -26,9 +22,7 @@ def test_markers_are_named_with_their_family(name: str, render: Any, look: Any) 
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(7, 5), (4, 3), (6, 6)])
-def test_the_size_of_a_chessboard(
-    columns: int, rows: int, render: Any, look: Any, rectangle: Any, chessboard_cells: Any
-) -> None:
+def test_the_size_of_a_chessboard(columns, rows, render, look, rectangle, chessboard_cells):
     cells = chessboard_cells(columns + 1, rows + 1)
     image = render([(cells, rectangle(0.22, 0.22 * (rows + 1) / (columns + 1)))], look(8.0))
     assert chessboard_size(image) == (columns, rows)

@@ -1,7 +1,5 @@
 """Matches against plain loops; what passes, what is kept, what is refused."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
@@ -48,7 +46,7 @@ def distances(one: Any, other: Any) -> Any:
 @pytest.mark.parametrize("kind", ["bits", "numbers"])
 @pytest.mark.parametrize("width", [1, 32, 61])
 @pytest.mark.parametrize("count", [1, 2, 300])
-def test_the_two_nearest_of_all(kind: str, width: int, count: int) -> None:
+def test_the_two_nearest_of_all(kind, width, count):
     landmarks, queries = descriptors(kind, count, width, 0), descriptors(kind, 9, width, 1)
     found = make_index(landmarks, binary=kind == "bits").nearest(queries)
     table = distances(queries, landmarks)
@@ -64,7 +62,7 @@ def test_the_two_nearest_of_all(kind: str, width: int, count: int) -> None:
         assert np.all(found.landmarks[:, 1] == -1)
 
 
-def test_more_landmarks_than_a_block_holds() -> None:
+def test_more_landmarks_than_a_block_holds():
     for kind in ("bits", "numbers"):
         landmarks = descriptors(kind, 5000, 8, 0)
         if kind == "bits":
@@ -76,7 +74,7 @@ def test_more_landmarks_than_a_block_holds() -> None:
 
 
 @pytest.mark.parametrize("kind", ["bits", "numbers"])
-def test_the_two_nearest_within_the_gate(kind: str) -> None:
+def test_the_two_nearest_within_the_gate(kind):
     rng = np.random.default_rng(0)
     landmarks, queries = descriptors(kind, 200, 32, 0), descriptors(kind, 30, 32, 1)
     pixels, predicted = rng.uniform(0, 100, (30, 2)), rng.uniform(0, 100, (80, 2))
@@ -111,7 +109,7 @@ def matched(matcher: Matcher, points: Keypoints, **settings: Any) -> dict[int, i
     return dict(zip(found.keypoints.tolist(), found.landmarks.tolist(), strict=True))
 
 
-def test_an_id_that_comes_twice_in_an_image() -> None:
+def test_an_id_that_comes_twice_in_an_image():
     matcher = Matcher(make_map(2, ids=np.array([1, 2])))
     ids = np.array([2, 1, 2, 1])
     assert matched(matcher, keypoints(4, ids=ids)) == {0: 1, 1: 0}
@@ -128,7 +126,7 @@ def bits(*counts: int) -> Any:
     return np.array([list(row) for row in rows], np.uint8)
 
 
-def test_the_ratio_test() -> None:
+def test_the_ratio_test():
     matcher = Matcher(make_map(2, descriptors=bits(0, 20)))
     # Distances to the landmarks: 4 and 16, 9 and 11.
     given = keypoints(2, descriptors=bits(4, 9))
@@ -139,7 +137,7 @@ def test_the_ratio_test() -> None:
     assert found.scores.tolist() == [1.0 - 4 / 16]
 
 
-def test_the_mutual_check_and_the_best_of_several() -> None:
+def test_the_mutual_check_and_the_best_of_several():
     matcher = Matcher(make_map(2, descriptors=bits(0, 30)))
     # Two keypoints like the first landmark; the second is the nearer one.
     given = keypoints(3, descriptors=bits(3, 2, 29))
@@ -174,15 +172,13 @@ def test_the_mutual_check_and_the_best_of_several() -> None:
         ),
     ],
 )
-def test_what_cannot_be_compared(
-    landmarks: dict[str, Any], points: dict[str, Any], settings: dict[str, Any], text: str
-) -> None:
+def test_what_cannot_be_compared(landmarks, points, settings, text):
     matcher = Matcher(make_map(2, **landmarks))
     with pytest.raises(MatchError, match=re.escape(text)):
         matcher.match(keypoints(2, **points), Matching(**settings))
 
 
-def test_bytes_are_numbers_where_the_map_has_numbers() -> None:
+def test_bytes_are_numbers_where_the_map_has_numbers():
     """SIFT comes in bytes or in floats."""
     rows = np.random.default_rng(0).integers(0, 256, (20, 128), dtype=np.uint8)
     matcher = Matcher(make_map(20, descriptors=rows.astype(np.float32)))

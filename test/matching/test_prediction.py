@@ -1,7 +1,5 @@
 """Predicted landmarks against the exact rolling-shutter projection, for every camera."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -49,7 +47,7 @@ def camera(name: str) -> Camera:
 
 
 @pytest.mark.parametrize("name", list(CAMERAS))
-def test_all_that_the_image_shows_is_predicted_where_it_is(name: str, points: Any) -> None:
+def test_all_that_the_image_shows_is_predicted_where_it_is(name, points):
     view = camera(name)
     pixels, _ = project_rolling(view, MOTION.at_rows, points)
     shown = np.flatnonzero(view.inside(pixels))
@@ -79,7 +77,7 @@ def is_seen(view: Camera, point: Any, pixel: Any) -> bool:
 
 
 @pytest.mark.parametrize("mutual", [True, False])
-def test_a_prediction_tells_apart_what_looks_the_same(points: Any, mutual: bool) -> None:
+def test_a_prediction_tells_apart_what_looks_the_same(points, mutual):
     """Only a hundred kinds of landmarks: by their looks alone none is recognized."""
     view = camera("ideal")
     rng = np.random.default_rng(1)
@@ -97,9 +95,7 @@ def test_a_prediction_tells_apart_what_looks_the_same(points: Any, mutual: bool)
 
 
 @pytest.mark.parametrize(("in_view", "everywhere"), [(3_000, False), (40_000, True)])
-def test_where_too_much_is_in_view_all_landmarks_are_compared(
-    in_view: int, everywhere: bool
-) -> None:
+def test_where_too_much_is_in_view_all_landmarks_are_compared(in_view, everywhere):
     """To predict and to look near 40,000 landmarks takes longer than to compare 500 with all."""
     rng = np.random.default_rng(2)
     view = camera("ideal")
@@ -119,9 +115,7 @@ def test_where_too_much_is_in_view_all_landmarks_are_compared(
 
 
 @pytest.mark.parametrize(("seen", "whole"), [(40_000, True), (400, False)])
-def test_where_too_many_are_in_view_nothing_is_spent_on_the_prediction(
-    seen: int, whole: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_too_many_are_in_view_nothing_is_spent_on_the_prediction(seen, whole, monkeypatch):
     """The search of all landmarks is as fast as without one; a sample of them decides."""
     rng = np.random.default_rng(0)
     looked_at: list[int] = []

@@ -1,7 +1,5 @@
 """What a camera without a readout time remembers from frame to frame."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +15,7 @@ from rs_localizer.pipeline.single_frames import SingleFrames
 SAID = Scales.nothing()._replace(means=np.full(SCALES, -6.0), precisions=np.ones(SCALES))
 
 
-def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset() -> None:
+def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset():
     priors: list[Any] = []
     said = {"scales": SAID, "lens": None, "of_lens": None}
     results: list[Any] = [SimpleNamespace(**said)] * 3
@@ -42,7 +40,7 @@ def test_the_next_frame_knows_what_the_last_one_with_a_pose_said_until_reset() -
     assert priors[3] is None
 
 
-def test_it_takes_the_place_of_tracking() -> None:
+def test_it_takes_the_place_of_tracking():
     def remembers(**settings: Any) -> tuple[bool, bool]:
         method = Method.of(ANY_CALIBRATION, NodeConfig(**settings))
         frames = method.frames

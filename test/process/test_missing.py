@@ -1,7 +1,5 @@
 """Packages that are not installed: one sentence, whoever is started."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -51,9 +49,7 @@ def run(code: str, environment: dict[str, str], *words: str) -> subprocess.Compl
         ("rosbags", ("evaluate", "a", "b"), "pip install rosbags"),
     ],
 )
-def test_a_command_says_it_in_one_line(
-    tmp_path: Path, name: str, words: tuple[str, ...], advice: str
-) -> None:
+def test_a_command_says_it_in_one_line(tmp_path, name, words, advice):
     done = run(COMMAND, without(tmp_path, name), *words)
     assert done.returncode == 1
     assert done.stderr.startswith(
@@ -65,7 +61,7 @@ def test_a_command_says_it_in_one_line(
 
 @pytest.mark.parametrize("code", [NODE, DETECTOR])
 @pytest.mark.parametrize("name", ["scipy", "numba", "yaml"])
-def test_a_node_says_it_in_one_line(tmp_path: Path, name: str, code: str) -> None:
+def test_a_node_says_it_in_one_line(tmp_path, name, code):
     pytest.importorskip("rclpy", reason="needs ROS 2")
     done = run(code, without(tmp_path, name))
     assert done.returncode == 1
@@ -73,20 +69,20 @@ def test_a_node_says_it_in_one_line(tmp_path: Path, name: str, code: str) -> Non
     assert done.stderr.count("\n") == 1
 
 
-def test_nodes_do_not_wait_for_packages_of_commands(tmp_path: Path) -> None:
+def test_nodes_do_not_wait_for_packages_of_commands(tmp_path):
     pytest.importorskip("rclpy", reason="needs ROS 2")
     code = "import rs_localizer.ros.node.managed, rs_localizer.ros.detector.markers"
     done = run(code, without(tmp_path, *NOT_FOR_NODES))
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_what_is_broken_tells_of_itself() -> None:
+def test_what_is_broken_tells_of_itself():
     text = explain(ImportError("numpy.core.multiarray failed to import"))
     assert text.startswith("numpy.core.multiarray failed to import; ")
     assert "not installed" not in text
 
 
-def test_package_xml_has_no_key_that_rosdep_gives_to_pip() -> None:
+def test_package_xml_has_no_key_that_rosdep_gives_to_pip():
     # Ubuntu 24.04 refuses pip beside apt, and rosdep stops before the keys that follow.
     package = parse_package(str(ROOT / "package.xml"))
     names = [item.name for item in (*package.exec_depends, *package.test_depends)]
@@ -94,7 +90,7 @@ def test_package_xml_has_no_key_that_rosdep_gives_to_pip() -> None:
     assert {"python3-scipy", "python3-numpy", "python3-opencv", "python3-yaml"} <= set(names)
 
 
-def test_rosdep_resolves_every_key_to_a_package_of_ubuntu() -> None:
+def test_rosdep_resolves_every_key_to_a_package_of_ubuntu():
     index = os.environ.get("ROSDISTRO")
     if index is None:
         pytest.skip("ROSDISTRO names no checkout of ros/rosdistro")

@@ -1,7 +1,5 @@
 """Rendered images against plain ray casting, OpenCV's warping and analytic projections."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -91,7 +89,7 @@ def away_from_edges(depths: np.ndarray) -> np.ndarray:
         ("equidistant", "left_to_right"),
     ],
 )
-def test_every_line_is_seen_from_its_own_pose(lens: str, direction: str) -> None:
+def test_every_line_is_seen_from_its_own_pose(lens, direction):
     camera = replace(CAMERA, scan_direction=direction, **LENSES[lens])
     planes = corner_of_a_room()
     image = Renderer(camera, planes).image(MOTION, 300_000_000)
@@ -107,7 +105,7 @@ def test_every_line_is_seen_from_its_own_pose(lens: str, direction: str) -> None
     assert np.abs((late - expected)[compared]).mean() > 2.0 * np.abs(difference).mean()
 
 
-def test_global_shutter_is_a_homography() -> None:
+def test_global_shutter_is_a_homography():
     rotation = MOTION.rotation @ so3.exp(np.array([0.2, -0.1, 0.3]))
     still = replace(
         MOTION, rotation=rotation, angular_velocity=np.zeros(3), linear_velocity=np.zeros(3)
@@ -135,7 +133,7 @@ def chessboard(cell: int = 24, cells: int = 12) -> TexturedPlane:
     )
 
 
-def test_corners_are_where_they_project_to() -> None:
+def test_corners_are_where_they_project_to():
     """Near and far, upright and slanted: no offset, and what the search for a corner can do."""
     camera = Camera(640, 480, np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]))
     plane, rng, errors = chessboard(), np.random.default_rng(0), []
@@ -160,7 +158,7 @@ def test_corners_are_where_they_project_to() -> None:
     assert np.abs(all_errors[distances < 1.0].mean(axis=0)).max() < 0.01
 
 
-def test_a_far_picture_does_not_alias() -> None:
+def test_a_far_picture_does_not_alias():
     squares = np.indices((1024, 1024)).sum(0) % 2
     plane = TexturedPlane(
         np.array([5.0, 2.56, 2.56]), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]),
@@ -171,7 +169,7 @@ def test_a_far_picture_does_not_alias() -> None:
     assert np.abs(image - 127.5).max() < 8.0
 
 
-def test_exposure_blurs_along_the_motion_and_shifts_nothing() -> None:
+def test_exposure_blurs_along_the_motion_and_shifts_nothing():
     """An edge that passes by at v px per exposure is a ramp of that width, in the same place."""
     edge = np.full((400, 800), 20, np.uint8)
     edge[:, 400:] = 220
@@ -197,7 +195,7 @@ def test_exposure_blurs_along_the_motion_and_shifts_nothing() -> None:
 @pytest.mark.parametrize(
     "settings", [{"exposure": -1.0}, {"noise": np.inf}, {"vignetting": 1.5}, {"exposure": np.nan}]
 )
-def test_impossible_settings_are_refused(settings: dict) -> None:
+def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValueError, match=f"{next(iter(settings))} must .* got"):
         ImageSettings(**settings)
     with pytest.raises(ValueError, match="at least one plane"):

@@ -1,9 +1,6 @@
 """Verdicts come from the curves: each claim is shown data for it and data against it."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,7 +17,7 @@ def curves(**level: float) -> Curves:
     return Curves("x", X, {name: np.full((3, 3, 4), value) for name, value in level.items()})
 
 
-def test_results_on_disk(tmp_path: Path) -> None:
+def test_results_on_disk(tmp_path):
     held = Statement("flight.up", "paper", "birds | fly", "up").judged("3 m", True)
     fell = Statement("flight.fish", "paper", "fish fly", "up").judged("0 m", False, "no wings")
     result = Result(

@@ -1,7 +1,5 @@
 """Errors in sigmas against independent truth, and the scenes that they are measured on."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -9,12 +7,7 @@ import pytest
 
 from benchmarks.experiments import bound
 from benchmarks.experiments.trials import Setting
-from benchmarks.experiments.views import (
-    Outcome,
-    View,
-    outcome,
-    synthetic_views,
-)
+from benchmarks.experiments.views import Outcome, View, outcome, synthetic_views
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import apply_step
@@ -45,7 +38,7 @@ def view() -> View:
     return next(synthetic_views(1, 5, MOVING, outliers=0.4))
 
 
-def test_views_are_seen_at_their_own_row() -> None:
+def test_views_are_seen_at_their_own_row():
     one = view()
     pixels, _ = project_rolling(one.camera, one.motion.at_rows, one.points)
     np.testing.assert_allclose(one.true_pixels, pixels, atol=1e-6)
@@ -55,7 +48,7 @@ def test_views_are_seen_at_their_own_row() -> None:
     assert np.abs(one.pixels - one.true_pixels)[~one.inliers].max() > 100.0
 
 
-def test_the_bound_is_that_of_finite_differences() -> None:
+def test_the_bound_is_that_of_finite_differences():
     one = view()
     h, columns = 1e-5, []
     for k in range(12):
@@ -70,7 +63,7 @@ def test_the_bound_is_that_of_finite_differences() -> None:
     np.testing.assert_allclose(one.information(), expected, rtol=1e-4, atol=1e-5 * expected.max())
 
 
-def test_errors_are_steps_from_the_estimate_to_the_truth() -> None:
+def test_errors_are_steps_from_the_estimate_to_the_truth():
     one = view()
     step = 1e-3 * np.arange(1.0, 13.0)
     covariance = np.diag(np.arange(1.0, 13.0)) * 1e-6

@@ -1,7 +1,5 @@
 """The benches of frames judge rightly: honest regions pass, lies and worse versions are seen."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace
@@ -45,7 +43,7 @@ def judged(count: int, wider: float = 1.0, farther: float = 1.0, seed: int = 0) 
     return Judged(figures, [""] * count)
 
 
-def test_honest_regions_hold_and_are_sharp() -> None:
+def test_honest_regions_hold_and_are_sharp():
     row = judged(4000).row(CONDITION)
     for share in ("pose@stamp", "pose@mid", "twist@mid"):
         assert row[share] == pytest.approx(95.0, abs=1.2)
@@ -67,11 +65,11 @@ def test_honest_regions_hold_and_are_sharp() -> None:
         ("pose@s", {}, 0),
     ],
 )
-def test_what_is_certainly_worse_is_seen(figure: str, after: dict[str, float], sign: int) -> None:
+def test_what_is_certainly_worse_is_seen(figure, after, sign):
     assert changes_of(judged(100), judged(100, **after))[figure].sign == sign
 
 
-def test_chance_is_no_change() -> None:
+def test_chance_is_no_change():
     changes = [
         change
         for seed in range(40)
@@ -80,7 +78,7 @@ def test_chance_is_no_change() -> None:
     assert sum(change.sign != 0 for change in changes) <= 0.03 * len(changes)
 
 
-def test_refusals_count_and_frames_of_a_recording_are_one() -> None:
+def test_refusals_count_and_frames_of_a_recording_are_one():
     every = judged(100)
     fewer = Judged(every.figures, ["uncertain"] * 20 + [""] * 80)
     assert changes_of(every, fewer)["localized"].sign == -1
@@ -91,7 +89,7 @@ def test_refusals_count_and_frames_of_a_recording_are_one() -> None:
     assert totals({"a/x": every, "b/y": fewer})["all"]["localized"] == 90.0
 
 
-def test_small_changes_are_certain_of_many_conditions_together() -> None:
+def test_small_changes_are_certain_of_many_conditions_together():
     before = {f"a/{k}": judged(40, seed=k) for k in range(30)}
     after = {f"a/{k}": judged(40, wider=0.8, farther=1.05, seed=k) for k in range(30)}
     changes = {name: changes_of(before[name], after[name]) for name in before}
@@ -102,13 +100,13 @@ def test_small_changes_are_certain_of_many_conditions_together() -> None:
     assert together["deg"].sign == -1
 
 
-def test_conditions_have_names_of_their_own_and_every_bench_some() -> None:
+def test_conditions_have_names_of_their_own_and_every_bench_some():
     names = [(one.bench, one.name) for one in conditions()]
     assert len(set(names)) == len(names)
     assert {bench for bench, _ in names} == set(BENCHES)
 
 
-def test_the_same_seed_gives_the_same_frames() -> None:
+def test_the_same_seed_gives_the_same_frames():
     def pixels(seed: int) -> np.ndarray:
         return next(generate(CONDITION, 1, seed)).pixels
 
@@ -116,7 +114,7 @@ def test_the_same_seed_gives_the_same_frames() -> None:
     assert not np.array_equal(pixels(3), pixels(4))
 
 
-def test_points_are_spoilt_as_described() -> None:
+def test_points_are_spoilt_as_described():
     def frame(**changes: object):
         return next(generate(replace(CONDITION, noise=1e-9, **changes), 1, 0))
 
@@ -148,7 +146,7 @@ def test_points_are_spoilt_as_described() -> None:
     assert np.mean(np.abs(errors) > 5.0) == pytest.approx(0.0154, rel=0.3)
 
 
-def test_the_gyroscope_says_how_the_camera_turns() -> None:
+def test_the_gyroscope_says_how_the_camera_turns():
     planes = Condition(
         "gyro", "x", turning(10.0), SmallPlane(), 1.0, points=Points(gyroscope=True), camera=NARROW
     )
@@ -161,7 +159,7 @@ def test_the_gyroscope_says_how_the_camera_turns() -> None:
     assert np.linalg.norm(logarithm(first.T @ middle)) == pytest.approx(math.radians(5.0), rel=1e-6)
 
 
-def test_calibrations_are_off_as_described() -> None:
+def test_calibrations_are_off_as_described():
     centre = named("camera/centre 1px/rich/1px")
     for variant in range(4):
         off = camera_of(centre, variant).K - centre.camera.matrix
@@ -177,20 +175,20 @@ def test_calibrations_are_off_as_described() -> None:
         np.testing.assert_allclose(found.D, boards.camera.distortion, atol=0.03)
 
 
-def test_settings_have_dotted_names() -> None:
+def test_settings_have_dotted_names():
     config = configured(rsl.LocalizerConfig(), {"velocity_prior.angular": 0.5}, exact=True)
     assert config.velocity_prior.angular == 0.5
     with pytest.raises(ValueError, match="velocity is not a setting"):
         configured(rsl.LocalizerConfig(), {"velocity": 0.5}, exact=True)
 
 
-def test_lengths_have_units() -> None:
+def test_lengths_have_units():
     assert normalised(np.array([3.0, 4.0]), np.diag([9.0, 16.0])) == pytest.approx(2.0)
     assert normalised(np.array([1.0, 0.0]), np.diag([0.0, 1.0])) == math.inf
     assert normalised(np.zeros(2), np.zeros((2, 2))) == 0.0
 
 
-def test_a_hand_before_a_rich_scene_is_honest() -> None:
+def test_a_hand_before_a_rich_scene_is_honest():
     one = judge(CONDITION, 40, 0, {})
     assert one.localized.all()
     row = one.row(CONDITION)
@@ -198,7 +196,7 @@ def test_a_hand_before_a_rich_scene_is_honest() -> None:
     assert 0.5 < float(row["sharp_turn"]) < 2.5
 
 
-def test_times_are_taken_in_turns_and_calls_are_counted() -> None:
+def test_times_are_taken_in_turns_and_calls_are_counted():
     frames = list(generate(CONDITION, 2, 0))
     done: list[str] = []
 
@@ -221,7 +219,7 @@ def test_times_are_taken_in_turns_and_calls_are_counted() -> None:
     assert calls_of(lambda frame: normalised(frame.points[0], np.eye(3)), frames) == (0, 0, 0)
 
 
-def test_the_commands(tmp_path, capsys) -> None:
+def test_the_commands(tmp_path, capsys):
     table = tmp_path / "a.csv"
     words = ["--bench", "real", "--only", "slow", "tracked", "1px", "--frames", "2"]
     assert command.main(["run", "--out", str(table), *words]) == 0

@@ -5,8 +5,6 @@ care: where the heap has put them side by side it runs the loop one by one. A su
 another order, and a division by a constant is no multiplication by its reciprocal.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,7 +67,7 @@ def two_ways(loop: ast.For) -> Iterator[ast.stmt]:
             yield step  # a division that another loop would multiply
 
 
-def test_the_rule_sees_what_it_is_for() -> None:
+def test_the_rule_sees_what_it_is_for():
     bad = """
 @kernel
 def f(a, b, c):
@@ -97,7 +95,7 @@ def f(a, b, c):
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_kernels_round_in_one_way(folder: str) -> None:
+def test_kernels_round_in_one_way(folder):
     found = [
         f"{path.relative_to(PACKAGE)}:{step.lineno}: {ast.unparse(step)}"
         for path in sorted((PACKAGE / folder).rglob("*.py"))

@@ -1,7 +1,5 @@
 """``rs_localizer watch``: what a node publishes, as text; clean ends."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty
@@ -32,14 +30,14 @@ def seen() -> Watched:
     return watched
 
 
-def test_a_pose_in_one_line() -> None:
+def test_a_pose_in_one_line():
     text = line(seen(), 100.6)
     assert text.startswith("localized, 20.0 Hz | ")
     assert re.search(r"xyz +\+1\.000 +-2\.000 +\+0\.500 m \+-5\.0 mm", text)
     assert re.search(r"rpy +\+10\.00 +\+20\.00 +\+30\.00 \+-0\.30 deg", text)
 
 
-def test_a_table_has_a_line_for_each_quantity() -> None:
+def test_a_table_has_a_line_for_each_quantity():
     watched = seen()
     watched.twist = Values(np.array([0.1, 0.0, 0.0]), np.radians([0.0, 90.0, 0.0]), np.ones(6))
     values = {"State": "tracking", "Refused: residual": "3", "Points": "24"}
@@ -51,7 +49,7 @@ def test_a_table_has_a_line_for_each_quantity() -> None:
     assert lines[5:] == ["warning: 3 frames were refused", "refused: residual 3"]
 
 
-def test_angles_are_those_of_rep_103() -> None:
+def test_angles_are_those_of_rep_103():
     turn = Rotation.from_euler("z", 30, degrees=True) * Rotation.from_euler("x", 10, degrees=True)
     np.testing.assert_allclose(np.degrees(euler(turn.as_quat())), [10.0, 0.0, 30.0], atol=1e-9)
     up = Rotation.from_euler("y", 90, degrees=True)
@@ -91,7 +89,7 @@ def told(peer: Any, node: Node, file: Path, wanted: str) -> str:
     return file.read_text()
 
 
-def test_a_live_node_in_lines(peer: Any, tmp_path: Path) -> None:
+def test_a_live_node_in_lines(peer, tmp_path):
     node, file = Node(peer), tmp_path / "said"
     with file.open("w") as output:
         watching = subprocess.Popen(
@@ -104,7 +102,7 @@ def test_a_live_node_in_lines(peer: Any, tmp_path: Path) -> None:
     assert "\x1b" not in file.read_text()
 
 
-def test_in_place_on_a_terminal(peer: Any, tmp_path: Path) -> None:
+def test_in_place_on_a_terminal(peer, tmp_path):
     node, ours_theirs, errors = Node(peer), pty.openpty(), tmp_path / "errors"
     with errors.open("w") as file:
         watching = subprocess.Popen(
@@ -134,7 +132,7 @@ def test_in_place_on_a_terminal(peer: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("domain")
-def test_without_a_node_it_says_what_is_missing_and_who_is_there(peer: Any) -> None:
+def test_without_a_node_it_says_what_is_missing_and_who_is_there(peer):
     node = Node(peer)
     watching = subprocess.Popen(
         [*WATCH, "--every", "0.1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -1,7 +1,5 @@
 """Keypoints and maps with something wrong in them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """A live node, a peer that talks to it over DDS, and the frames that it sends."""
 
-from __future__ import annotations
-
 import array
 import re
 import threading
