@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.features import extraction
-from rs_localizer.features.extraction import FeatureExtractor, Features
-from rs_localizer.features.methods import FeatureError
+from rs_localizer.features.extraction import FeatureError, FeatureExtractor, Features
 
 # OpenCV 5 has AKAZE in its contrib modules only.
 KINDS = [
