@@ -11,7 +11,7 @@ MOST = 6
 COMPILED = {"kernel", "inlined", "error_model"}
 INSTEAD_OF_KERNELS = {"solvers/r6p.py: solve_batch"}
 # Declarations, which are called with keywords.
-DECLARATIONS = {"config/declared.py: setting", "solvers/minimal.py: solve_minimal"}
+DECLARATIONS = {"config.py: setting", "solvers/minimal.py: solve_minimal"}
 
 
 def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:

@@ -10,7 +10,7 @@ from rs_localizer.cli import UsageError
 from rs_localizer.cli.main import main
 from rs_localizer.cli.map.build import add_imu_arguments, imu_of
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.imu_files import ImuFileError
+from rs_localizer.io.imu import ImuFileError
 from rs_localizer.offline.image_sources import SourceError
 
 

@@ -12,7 +12,7 @@ from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.health import State
 from rs_localizer.settings import Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver

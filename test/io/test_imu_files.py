@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.io.imu_files import ImuFileError, read_imu_csv
+from rs_localizer.io.imu import ImuFileError, read_imu_csv
 
 HEAD = "#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z\n"
 LINE = "1403636579758555392,-0.1,0.14,0.07,8.12,-0.3,-3.7\n"

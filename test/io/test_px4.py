@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.outputs import Localized, Pose, Twist
-from rs_localizer.io.px4 import vehicle_odometry
+from rs_localizer.pipeline.px4 import vehicle_odometry
 
 UP = {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}
 # Numbers of the message: PX4-Autopilot, msg/versioned/VehicleOdometry.msg.

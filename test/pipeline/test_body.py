@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -25,9 +25,9 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, Pose, Twist, messages
 from rs_localizer.io.transforms import Transform, TransformError, TransformTree
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.published import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.refusal import Refusal
 
 READOUT_TIME = 0.03
@@ -183,7 +183,7 @@ class KnowsTheMotion(Localizer):
 
 @pytest.fixture(autouse=True)
 def known_motion(monkeypatch) -> None:
-    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", KnowsTheMotion)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", KnowsTheMotion)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime, VelocityPrior
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -88,7 +88,7 @@ class MockLocalizer(Localizer):
 @pytest.fixture
 def mock(monkeypatch) -> type[MockLocalizer]:
     MockLocalizer.made = []
-    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", MockLocalizer)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", MockLocalizer)
     return MockLocalizer
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
@@ -19,8 +19,7 @@ from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
@@ -195,7 +194,7 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
             asked.append(arguments[3] is not None)
             return super().match(*arguments)
 
-    monkeypatch.setattr(rs_localizer.pipeline.landmarks, "Matcher", Asked)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Matcher", Asked)
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:

@@ -69,7 +69,7 @@ def test_a_node_says_it_in_one_line(tmp_path, name, code):
 
 def test_nodes_do_not_wait_for_packages_of_commands(tmp_path):
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    code = "import rs_localizer.ros.node.run, rs_localizer.ros.detector.markers"
+    code = "import rs_localizer.ros.node.managed, rs_localizer.ros.detector.markers"
     done = run(code, without(tmp_path, *NOT_FOR_NODES))
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -17,7 +17,7 @@ from rclpy.context import Context
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
 
 ROOT = Path(__file__).parents[2]
