@@ -45,12 +45,3 @@ def test_what_is_wrong_is_said(tmp_path, text, said):
     with pytest.raises(ImuFileError, match=said) as caught:
         read_imu_csv(path)
     assert str(path) in str(caught.value)
-
-
-def test_files_that_are_none(tmp_path):
-    with pytest.raises(ImuFileError, match="cannot be read: No such file"):
-        read_imu_csv(tmp_path / "none.csv")
-    path = tmp_path / "picture.csv"
-    path.write_bytes(b"\x89PNG\r\n\xff\xfe")
-    with pytest.raises(ImuFileError, match="no text file"):
-        read_imu_csv(path)

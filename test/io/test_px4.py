@@ -49,20 +49,6 @@ def test_east_north_up_becomes_north_east_down():
     assert attitude(fields) == pytest.approx((0.0, 0.0, 90.0))  # it looks east
 
 
-def test_a_map_without_north_only_turns_over():
-    fields = vehicle_odometry(localized((1.0, 2.0, 3.0), yaw=30.0), "frd", 0, 0)
-    assert fields["pose_frame"] == FRD
-    np.testing.assert_allclose(fields["position"], [1.0, -2.0, -3.0])
-    assert attitude(fields) == pytest.approx((0.0, 0.0, -30.0), abs=1e-4)  # left is against it
-
-
-def test_what_is_not_known_is_nan():
-    fields = vehicle_odometry(localized(), "ned", 0, 0)
-    for name in ("velocity", "angular_velocity", "velocity_variance"):
-        assert np.isnan(fields[name]).all()
-    assert np.isfinite(fields["position"]).all()
-
-
 def test_variances_are_those_of_the_errors():
     """Of poses drawn from the covariance: positions in the world, turns about the body's axes."""
     rng = np.random.default_rng(3)

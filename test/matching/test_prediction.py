@@ -94,26 +94,6 @@ def test_a_prediction_tells_apart_what_looks_the_same(points, mutual):
     assert len(set(found.landmarks.tolist())) == len(found)
 
 
-@pytest.mark.parametrize(("in_view", "everywhere"), [(3_000, False), (40_000, True)])
-def test_where_too_much_is_in_view_all_landmarks_are_compared(in_view, everywhere):
-    """To predict and to look near 40,000 landmarks takes longer than to compare 500 with all."""
-    rng = np.random.default_rng(2)
-    view = camera("ideal")
-    still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    prior = Prior(motion=still, covariance=1e-10 * np.eye(12))
-    pixels = rng.uniform([0, 0], [639, 479], (in_view, 2))
-    count = 40_000
-    depths = np.where(np.arange(count) < in_view, 3.0, -3.0)  # the others are behind
-    rays = np.resize(view.rays(pixels), (count, 2))
-    points = depths[:, None] * np.column_stack([rays, np.ones(count)])
-    descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
-    shown = rng.permutation(in_view)[:500]
-    misplaced = 0.5 * pixels[shown]  # not where they are predicted
-    given = Keypoints(0, misplaced, None, descriptors[shown], None, 0)
-    found = Matcher(Map(points, None, descriptors, "map")).match(given, Matching(), view, prior)
-    assert (len(found) == 500) == everywhere
-
-
 @pytest.mark.parametrize(("seen", "whole"), [(40_000, True), (400, False)])
 def test_where_too_many_are_in_view_nothing_is_spent_on_the_prediction(seen, whole, monkeypatch):
     """The search of all landmarks is as fast as without one; a sample of them decides."""

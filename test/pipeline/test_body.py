@@ -375,17 +375,6 @@ def test_a_missing_transform_refuses_the_frame_only(localize):
         assert np.allclose(frame.pose.position, expected[:3, 3], atol=1e-12)
 
 
-def test_without_a_base_frame_nothing_is_looked_up(localize):
-    for name in ("", "camera"):
-        frame = localized(localize(None, base_frame=name))
-        assert frame.body_frame == "camera"
-    frame, config = localize(None, base_frame="", publish_tf="map_to_camera")
-    direct = broadcast(frame, config, TransformTree())
-    assert (direct.parent, direct.child) == ("map", "camera")
-    assert np.allclose(direct.parent_from_child.translation, frame.pose.position)
-    assert broadcast(frame, NodeConfig(), TransformTree()) is None
-
-
 def test_odometry_that_is_missing_costs_no_pose(localize, robot):
     frame, config = localize(robot, publish_tf="map_to_odom")
     assert frame

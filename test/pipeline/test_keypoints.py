@@ -99,23 +99,6 @@ def test_the_true_pose(frames, make_camera_info, names, tracking):
         assert result.estimate.tracked == (tracking and frame is not frames[0])
 
 
-def test_by_id_and_by_correspondences_is_the_same(frames, make_camera_info):
-    """Keypoints by id are correspondences that are put together here."""
-    one, other = localizer(make_camera_info), localizer(make_camera_info)
-    one.use_map(read_map(map_cloud(LANDMARKS)))
-    for frame in frames[:4]:
-        rows = np.zeros(len(frame.ids), [(n, "<f8") for n in "xyz"] + [("u", "<f4"), ("v", "<f4")])
-        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
-            rows[name] = column
-        expected = localized(
-            other.localize(make_cloud(make_message, frame.stamp_ns, "map", rows)), frame
-        )
-        found = localized(one.localize_keypoints(keypoints(frame, "id")), frame)
-        assert found.pose.position.tolist() == expected.pose.position.tolist()
-        assert found.pose.covariance.tolist() == expected.pose.covariance.tolist()
-        assert found.inliers["residual"].tolist() == expected.inliers["residual"].tolist()
-
-
 def test_a_map_that_is_missing_and_comes_late(frames, make_camera_info):
     notices = Notices()
     node = localizer(make_camera_info, notices)
