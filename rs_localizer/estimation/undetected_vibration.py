@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.simd.jit import kernel
+from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import MOTION_PARAMETERS
 from rs_localizer.estimation.refine import half_inverse
 
@@ -37,6 +37,14 @@ class Undetected(NamedTuple):
     covariance: Array  # (12,12) by which it moves pose and velocities, if there is any
 
 
+@inlined
+def _product(left: Array, right: Array, first: int, end: int) -> float:
+    total = 0.0
+    for k in range(first, end):
+        total += left[k] * right[k]
+    return total
+
+
 @kernel
 def undetected_vibration(
     own: Array, pull: Array, along: Array, variance: float, freedom: float, means: Array,
@@ -52,7 +60,7 @@ def undetected_vibration(
         freedom: of the errors.
         means, precisions: (k,) of the logarithms of the scales.
     """
-    count, size, freedom = own.shape[0], own.shape[1], max(freedom, 1.0)
+    count, size, freedom = pull.shape[0], pull.shape[1], max(freedom, 1.0)
     moments, total, most = np.zeros((count, size, size)), 0.0, 0.0
     matrix, whitened, best = np.empty((size, size)), np.empty(size), np.empty(size)
     for f in range(count):
@@ -68,11 +76,11 @@ def undetected_vibration(
                 continue
             explained, volume = 0.0, 0.0
             for i in range(size):
-                volume += math.log(half[i, i] * unit[i])
-                whitened[i] = 0.0
                 for j in range(i + 1):
                     half[i, j] *= unit[j]
-                    whitened[i] += half[i, j] * along[f, j] / variance
+                whitened[i] = _product(half[i], along[f], 0, i + 1) / variance
+            for i in range(size):
+                volume += math.log(half[i, i])
                 explained += scale * whitened[i] * whitened[i]
             log_evidence = math.log(_WEIGHTS[node] / count) + volume
             explained = min(explained / freedom, _MOST_EXPLAINED)
@@ -84,15 +92,11 @@ def undetected_vibration(
             probable = math.exp(log_evidence - most)
             total += probable
             for i in range(size):
-                best[i] = 0.0
-                for k in range(i, size):
-                    best[i] += scale * half[k, i] * whitened[k]
+                best[i] = scale * _product(half[:, i], whitened, i, size)
             for i in range(size):
                 for j in range(size):
-                    spread = 0.0
-                    for k in range(max(i, j), size):
-                        spread += half[k, i] * half[k, j]
-                    moments[f, i, j] += probable * (scale * spread + best[i] * best[j])
+                    spread = scale * _product(half[:, i], half[:, j], max(i, j), size)
+                    moments[f, i, j] += probable * (spread + best[i] * best[j])
     covariance = np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
     for f in range(count):
         moved = pull[f].T @ moments[f] @ pull[f]
