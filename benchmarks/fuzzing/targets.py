@@ -21,8 +21,7 @@ from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
 from rs_localizer.io.hloc import HlocError, open_h5, read_pairs, read_queries
 from rs_localizer.io.images import read_compressed_image, read_image
-from rs_localizer.io.imu import read_imu
-from rs_localizer.io.imu_files import ImuFileError, read_imu_csv
+from rs_localizer.io.imu import ImuFileError, read_imu, read_imu_csv
 from rs_localizer.io.keypoints import read_keypoints, read_map
 from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file

@@ -78,7 +78,7 @@ def smooth_frames(
         inputs = window.stamps_ns
         if rate is not None:
             inputs = _moments(inputs, first_ns, last_ns if not pending else None, rate)
-        if not stretches(1e-9 * (np.array(known, np.int64) - first_ns)):
+        if not stretches((np.array(known, np.int64) - first_ns).astype(np.float64) * 1e-9):
             return SmoothedFrames([], inputs[:0], len(inputs), 0)
         smoothed += 1
         return _smoothed(localizer, frames, inputs, rate is not None)
