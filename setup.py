@@ -76,6 +76,7 @@ setup(
         "fleet": ["dask", "distributed"],
         "hloc": ["h5py"],
         "mapping": ["pycolmap"],
+        "table": ["fsspec", "pyarrow"],
         "view": ["rerun-sdk"],
         "test": [
             "build",

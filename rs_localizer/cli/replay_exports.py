@@ -23,6 +23,7 @@ from rs_localizer.io.gsplat import exposed_rows, write_gsplat
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.nerfstudio import View, middle_of_image, transforms
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.remote import location
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.offline.image_sources import IMAGE_TYPES
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -60,6 +61,13 @@ def add_export_arguments(parser: argparse._ActionsContainer) -> None:
         metavar="DIR",
         help="also make a directory for gsplat: poses at the first and the last row as viewmats, "
         "intrinsics, a text model of COLMAP, and the compressed images of the recording",
+    )
+    parser.add_argument(
+        "--parquet",
+        type=location,
+        metavar="FILE",
+        help="also write one table, a row a frame, of all recordings: poses, twists, covariances, "
+        "why frames were refused; a path or a URL (pip install 'rs_localizer[table]')",
     )
 
 

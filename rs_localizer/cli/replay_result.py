@@ -29,6 +29,7 @@ from rs_localizer.offline.fleet.identity import MARKER
 from rs_localizer.offline.fleet.task import LOG, Figures
 from rs_localizer.offline.replay import TF_TYPE
 from rs_localizer.offline.smoothed import SmoothedFrames
+from rs_localizer.offline.table import FrameTable
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.imu import ImuState
@@ -119,6 +120,7 @@ class Tally:
 
     total: int
     notices: dict[str, tuple[int, str]]  # by name: how often, and the latest sentence
+    table: FrameTable | None = None  # of the frames, where one is wanted
     track: Track = field(default_factory=Track)
     refused: Counter[str] = field(default_factory=Counter)
     last_refusal: str = "nothing came"
