@@ -236,10 +236,12 @@ def _check_usage(args: argparse.Namespace) -> None:
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
     if not args.ros:
-        if args.rate is not None and (args.nerfstudio or args.gsplat):
-            raise UsageError("--nerfstudio and --gsplat are of images, --rate of samples between")
-        if args.gsplat is not None and is_batch(args):
-            raise UsageError("--gsplat is of one recording")
+        if args.rate is not None and (args.nerfstudio or args.gsplat or args.ncore):
+            raise UsageError(
+                "--nerfstudio, --gsplat and --ncore are of images, --rate of samples between"
+            )
+        if (args.gsplat or args.ncore) and is_batch(args):
+            raise UsageError("--gsplat and --ncore are of one recording")
         if args.rate is not None and not args.smooth:
             raise UsageError(
                 "--rate goes with --ros or --smooth; offline replay runs at full speed"
@@ -248,11 +250,11 @@ def _check_usage(args: argparse.Namespace) -> None:
     if is_batch(args):
         raise UsageError("--ros plays one recording, and needs no workers")
     given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
-    if any((*given, args.rows, args.nerfstudio, args.gsplat, args.parquet)):
+    if any((*given, args.rows, args.nerfstudio, args.gsplat, args.ncore, args.parquet)):
         raise UsageError(
-            "--out, --overwrite, --params, --map, --row, --nerfstudio, --gsplat, --parquet, "
-            "--smooth, -p are for offline replay; with --ros the node has the settings and "
-            "publishes the result"
+            "--out, --overwrite, --params, --map, --row, --nerfstudio, --gsplat, --ncore, "
+            "--parquet, --smooth, -p are for offline replay; with --ros the node has the settings "
+            "and publishes the result"
         )
 
 
