@@ -4,7 +4,7 @@
 ``OpenCVFisheyeCameraModelParameters``) under their names, and of each frame what
 ``CameraSensorComponent.Writer.store_frame`` and ``PosesComponent.Writer.store_dynamic_pose`` take:
 timestamps (us) and ``T_sensor_world`` at the first and at the last exposed row. NCore's own package
-makes a sequence of them (docs/exchange.md).
+makes a sequence of them (docs/integrations.md).
 """
 
 from __future__ import annotations
