@@ -43,7 +43,7 @@ COLUMNS = {
     "residual": "double",
     "tracked": "bool_",
 }
-"""Names and types (docs/integrations.md says what they are); list: 36 doubles, a 6x6 matrix by rows."""
+"""Names and types (docs/integrations.md says more); list: 36 doubles, a 6x6 matrix by rows."""
 
 _ROWS = 1000  # that are Python's objects before they become Arrow's
 
@@ -164,8 +164,8 @@ def localize_recording(
     """Localize each frame of a recording, as ``replay`` does; a table with a row a frame.
 
     A pure function that can be pickled: for Dask, Ray, Spark and jobs of Kubernetes
-    (docs/integrations.md). Same content, same arguments: the same bytes, in whichever process. Progress
-    and notices are not printed.
+    (docs/integrations.md). Same content, same arguments: the same bytes, in whichever process.
+    Progress and notices are not printed.
 
     Args:
         source: the recording, a path or a URL of fsspec.
@@ -173,7 +173,8 @@ def localize_recording(
         settings: parameters by dotted name (``{"readout_time": 0.03}``), or a params file.
 
     Returns:
-        a pyarrow.Table; docs/integrations.md has its columns. Refused frames have a reason and no pose.
+        a pyarrow.Table; docs/integrations.md has its columns. Refused frames have a reason and no
+        pose.
 
     Raises:
         ValueError: for a recording, map or settings that cannot be used.
