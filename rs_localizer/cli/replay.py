@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 from tqdm import tqdm
 
@@ -270,6 +271,29 @@ def _hint(recording: Location, params: Path | None) -> None:
         print(f"the recording has settings of its own: --params {shlex.quote(str(file))}")
 
 
+def _localized(
+    bag: BagReader,
+    topics: Topics,
+    localizer: FrameLocalizer,
+    tally: Tally,
+    refused: list[Answer],
+    bar: tqdm[NoReturn],
+) -> Iterator[tuple[int, Localized]]:
+    """The frames with a pose, and when they were recorded; the others are counted and kept."""
+    for answer in replay(bag, topics, localizer):
+        result = answer.result
+        if result:
+            tally.add(result)
+            yield answer.recorded_ns, result
+        else:
+            tally.refuse(result)
+            if result.reason in NO_FRAMES:
+                continue
+            if tally.table is not None:
+                refused.append(answer)
+        bar.update()
+
+
 def _replay(
     bag: BagReader,
     topics: Topics,
@@ -290,22 +314,7 @@ def _replay(
         BagWriter(out / RESULT, args.storage) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
-
-        def results() -> Iterator[tuple[int, Localized]]:
-            for answer in replay(bag, topics, localizer):
-                result = answer.result
-                if result:
-                    tally.add(result)
-                    yield answer.recorded_ns, result
-                else:
-                    tally.refuse(result)
-                    if result.reason in NO_FRAMES:
-                        continue
-                    if tally.table is not None:
-                        refused.append(answer)
-                bar.update()
-
-        frames = results()
+        frames = _localized(bag, topics, localizer, tally, refused, bar)
         if args.smooth:
             stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
             parts = smooth_frames(localizer, (frame for _, frame in frames), stamps, args.rate)

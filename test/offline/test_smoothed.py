@@ -34,7 +34,7 @@ def recorded(
     localizer = FrameLocalizer(CONFIG)
     with open_bag(path) as bag:
         topics = find_topics(bag)
-        frames = [frame for _, frame in replay(bag, topics, localizer) if frame]
+        frames = [frame for a in replay(bag, topics, localizer) if (frame := a.result)]
         stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
     assert len(frames) > 200
     return localizer, frames, stamps
