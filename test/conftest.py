@@ -1,7 +1,5 @@
 """Messages for the tests, written from the definitions of ROS and not by the package's code."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace

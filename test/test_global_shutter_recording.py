@@ -1,7 +1,5 @@
 """The bundled recording of a real global shutter: nothing moves within its images."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -57,7 +55,7 @@ def p3p(messages):
     return jitter(replayed(messages, solver="p3p")[0])
 
 
-def test_p3p_is_what_it_was(p3p) -> None:
+def test_p3p_is_what_it_was(p3p):
     assert p3p == pytest.approx((0.22, 0.73), abs=0.01)
 
 
@@ -69,7 +67,7 @@ def test_p3p_is_what_it_was(p3p) -> None:
         pytest.param("20 ms, single", marks=pytest.mark.bench),
     ],
 )
-def test_a_global_shutter_stays_one(messages, p3p, name: str) -> None:
+def test_a_global_shutter_stays_one(messages, p3p, name):
     frames, notices = replayed(messages, **SETTINGS[name])
     assert any("(a global shutter)" in text for text in notices) == ("20 ms" in name)
     median, most = jitter(frames)

@@ -1,11 +1,7 @@
 """Imports inside the package go down only."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
-
-import pytest
 
 PACKAGE = Path(__file__).parents[1] / "rs_localizer"
 
@@ -30,13 +26,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "features": {"core", "config", "io"},
     "pipeline": {*METHOD, "io", "features", "markers", "matching", "trajectory"},
     "mapping": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
     },
     "offline": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
     },
     "simulation": {
-        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
+        *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings")
     },
     "evaluation": {
         *(*METHOD, "trajectory", "io", "features", "markers", "matching", "pipeline", "settings"),
@@ -73,24 +69,7 @@ def parts(names: set[str]) -> set[str]:
     return below & here | public
 
 
-@pytest.mark.parametrize(
-    ("source", "expected"),
-    [
-        ("import rs_localizer.io.bags", {"io"}),
-        ("from rs_localizer.io.bags import read", {"io"}),
-        ("from rs_localizer import io", {"io"}),
-        ("def late():\n    from ..io import bags", {"io"}),
-        ("from . import so3", {"core"}),
-        ("import numpy, rs_localizer", {"__init__"}),
-        ("from rs_localizer import Camera", {"__init__"}),
-        ("from numpy import io", set()),
-    ],
-)
-def test_imports_are_seen(source: str, expected: set[str]) -> None:
-    assert parts(imported(source, "rs_localizer.core")) == expected
-
-
-def test_imports_go_down_only() -> None:
+def test_imports_go_down_only():
     wrong = []
     for path in sorted(PACKAGE.rglob("*.py")):
         where = path.relative_to(PACKAGE.parent).with_suffix("").parts
@@ -113,7 +92,7 @@ ROS_MAY_IMPORT: dict[str, set[str]] = {
 }
 
 
-def test_nodes_do_not_know_each_other() -> None:
+def test_nodes_do_not_know_each_other():
     """What stands beside the folders starts nodes, and may import any of them."""
     ros = PACKAGE / "ros"
     folders = {path.name for path in ros.iterdir() if (path / "__init__.py").is_file()}

@@ -1,7 +1,5 @@
 """The package as ROS, colcon and pip see it: description, versions, content, import rule."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -25,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 MODULES = {"tf2_ros_py": "tf2_ros"}
 
 
-def test_package_xml_is_valid_and_of_the_right_kind() -> None:
+def test_package_xml_is_valid_and_of_the_right_kind():
     # With an invalid one (its e-mail address, say) colcon silently sees a plain Python package.
     warnings: list[str] = []
     package = parse_package(str(ROOT / "package.xml"), warnings=warnings)
@@ -35,14 +33,14 @@ def test_package_xml_is_valid_and_of_the_right_kind() -> None:
     assert package.licenses == ["Apache-2.0", "CC-BY-4.0"]  # code, and bundled recordings
 
 
-def test_ros_and_pip_name_the_same_maintainers(wheel: zipfile.ZipFile) -> None:
+def test_ros_and_pip_name_the_same_maintainers(wheel):
     (maintainer,) = parse_package(str(ROOT / "package.xml")).maintainers
     for_pip = message_from_string(metadata(wheel, "METADATA"))
     assert maintainer.name == for_pip["Maintainer"] == "rs_localizer maintainers"
     assert maintainer.email == for_pip["Maintainer-email"]
 
 
-def test_versions_agree() -> None:
+def test_versions_agree():
     version = parse_package(str(ROOT / "package.xml")).version
     # The one form that catkin_prepare_release finds and raises.
     assert re.findall(r'version="(\d+\.\d+\.\d+)",', (ROOT / "setup.py").read_text()) == [version]
@@ -75,7 +73,7 @@ def build_wheel(directory: Path, **environment: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
+def wheel(tmp_path_factory) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(build_wheel(tmp_path_factory.mktemp("wheel"))) as archive:
         yield archive
 
@@ -86,14 +84,14 @@ def metadata(wheel: zipfile.ZipFile, name: str) -> str:
     return wheel.read(path).decode()
 
 
-def test_wheel_holds_every_file_of_the_package(wheel: zipfile.ZipFile) -> None:
+def test_wheel_holds_every_file_of_the_package(wheel):
     paths = [p for p in (ROOT / "rs_localizer").rglob("*") if "__pycache__" not in p.parts]
     files = {p.relative_to(ROOT).as_posix() for p in paths if p.is_file()}
     assert "rs_localizer/py.typed" in files
     assert files - set(wheel.namelist()) == set()
 
 
-def test_wheel_puts_shared_files_where_ros_looks(wheel: zipfile.ZipFile) -> None:
+def test_wheel_puts_shared_files_where_ros_looks(wheel):
     shared = {name.partition(".data/data/share/")[2] for name in wheel.namelist()} - {""}
     expected = {"ament_index/resource_index/packages/rs_localizer", "rs_localizer/package.xml"}
     expected |= {f"rs_localizer/config/{path.name}" for path in (ROOT / "config").glob("*")}
@@ -103,7 +101,7 @@ def test_wheel_puts_shared_files_where_ros_looks(wheel: zipfile.ZipFile) -> None
     assert "rs_localizer/launch/localizer.launch.py" in shared
 
 
-def test_declared_commands_can_be_imported(wheel: zipfile.ZipFile) -> None:
+def test_declared_commands_can_be_imported(wheel):
     declared = ConfigParser()
     declared.read_string(metadata(wheel, "entry_points.txt"))
     assert declared.sections() == ["console_scripts"]
@@ -123,12 +121,12 @@ def requirements(text: str) -> set[str]:
     return {re.split(r"[ <>=;]", line)[0] for line in required if "extra ==" not in line}
 
 
-def test_pip_brings_the_libraries(wheel: zipfile.ZipFile) -> None:
+def test_pip_brings_the_libraries(wheel):
     required = requirements(metadata(wheel, "METADATA"))
     assert {"numpy", "numba", "opencv-python-headless", "rosbags"} <= required
 
 
-def test_nothing_is_required_of_pip_in_a_ros_environment(tmp_path: Path) -> None:
+def test_nothing_is_required_of_pip_in_a_ros_environment(tmp_path):
     # Ubuntu's OpenCV is no pip package: a requirement would stop the installed executables.
     with zipfile.ZipFile(build_wheel(tmp_path, AMENT_PREFIX_PATH="/opt/ros/jazzy")) as wheel:
         assert requirements(metadata(wheel, "METADATA")) == {"setuptools"}
@@ -160,7 +158,7 @@ def lint(modules: list[str], path: str) -> str:
     "path",
     [f"{folder}/x.py" for folder in ("rs_localizer", "rs_localizer/cli", "benchmarks", "test")],
 )
-def test_ros_is_refused_outside_its_place(path: str) -> None:
+def test_ros_is_refused_outside_its_place(path):
     modules = [*ros_modules(), "rclpy.node", "sensor_msgs.msg"]
     assert {"rclpy", "sensor_msgs", "tf2_ros", "launch"} <= set(modules)
     lines = lint(modules, path).splitlines()
@@ -168,6 +166,6 @@ def test_ros_is_refused_outside_its_place(path: str) -> None:
     assert [module for k, module in enumerate(modules, 1) if k not in refused] == []
 
 
-def test_ros_is_accepted_in_its_place() -> None:
+def test_ros_is_accepted_in_its_place():
     for path in ("rs_localizer/ros/x.py", "test/ros/test_x.py", "launch/x.launch.py"):
         assert "All checks passed" in lint(["rclpy"], path), path

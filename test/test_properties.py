@@ -1,7 +1,5 @@
 """Laws that hold for any input: what is written is read, what is refused is said."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.messages import MessageError
 from rs_localizer.settings import SettingsError, build, parse_assignment
 from rs_localizer.settings import settings as all_settings
-from rs_localizer.simulation.landmarks import map_rows
+from rs_localizer.simulation.scene import map_rows
 
 quick = settings(max_examples=60, deadline=None)
 # Of a PointField; 32 bits hold all of these.
@@ -56,7 +54,7 @@ def maps(draw: Any) -> Map:
 
 @quick
 @given(landmarks=maps(), form=st.sampled_from(["a.npz", "a.ply", "text"]))
-def test_a_map_is_what_it_was_before_it_was_written(landmarks: Map, form: str) -> None:
+def test_a_map_is_what_it_was_before_it_was_written(landmarks, form):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / (form if form != "text" else "a.ply")
         if form == "text":
@@ -68,7 +66,7 @@ def test_a_map_is_what_it_was_before_it_was_written(landmarks: Map, form: str) -
 
 @quick
 @given(landmarks=maps())
-def test_a_map_is_what_it_was_before_it_was_sent(landmarks: Map) -> None:
+def test_a_map_is_what_it_was_before_it_was_sent(landmarks):
     message = make_cloud(make_message, 0, "map", map_rows(landmarks))
     if landmarks.ids is None and landmarks.descriptors is None:
         with pytest.raises(MessageError, match="neither a field id nor descriptor"):
@@ -82,7 +80,7 @@ def test_a_map_is_what_it_was_before_it_was_sent(landmarks: Map) -> None:
     data=st.binary(max_size=400),
     form=st.sampled_from(["a.npz", "a.ply", "points3D.bin", "points3D.txt"]),
 )
-def test_any_bytes_are_a_map_or_refused(data: bytes, form: str) -> None:
+def test_any_bytes_are_a_map_or_refused(data, form):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / form
         path.write_bytes(data)
@@ -110,9 +108,7 @@ MARKS = [
     map_points=st.booleans(),
     big_endian=st.booleans(),
 )
-def test_any_data_are_keypoints_or_refused(
-    data: bytes, mark: Any, width: int, count: int, map_points: bool, big_endian: bool
-) -> None:
+def test_any_data_are_keypoints_or_refused(data, mark, width, count, map_points, big_endian):
     """NaN and repeated ids among them, and sizes that no memory has."""
     names = "xyz" if map_points else "uv"
     message = seeds.cloud(*((name, "<f4") for name in names), mark)
@@ -141,9 +137,7 @@ NUMBERS = st.floats(width=64) | st.sampled_from([0.0, 500.0, 320.0])
     sizes=st.lists(st.integers(0, 2**32 - 1) | st.integers(1, 3000), min_size=8, max_size=8),
     model=st.sampled_from(["plumb_bob", "rational_polynomial", "equidistant", "", "other"]),
 )
-def test_any_camera_info_is_a_camera_or_refused(
-    k: list[float], d: list[float], sizes: list[int], model: str
-) -> None:
+def test_any_camera_info_is_a_camera_or_refused(k, d, sizes, model):
     message = seeds.camera_info()
     message.k, message.d, message.distortion_model = k, d, model
     message.width, message.height, message.binning_x, message.binning_y = sizes[:4]
@@ -165,7 +159,7 @@ VALUES = (
 
 @quick
 @given(values=st.dictionaries(st.sampled_from(sorted(all_settings())), VALUES, max_size=3))
-def test_any_parameters_are_settings_or_refused(values: dict[str, Any]) -> None:
+def test_any_parameters_are_settings_or_refused(values):
     said = ""
     try:
         assert isinstance(build(values), NodeConfig)
@@ -179,7 +173,7 @@ def test_any_parameters_are_settings_or_refused(values: dict[str, Any]) -> None:
     text=st.text(max_size=30)
     | st.builds("{}:={}".format, st.sampled_from(sorted(all_settings())), st.text(max_size=12))
 )
-def test_any_assignment_is_one_or_refused(text: str) -> None:
+def test_any_assignment_is_one_or_refused(text):
     try:
         name, _ = parse_assignment(text)
     except SettingsError:

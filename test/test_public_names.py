@@ -1,7 +1,5 @@
 """The public names come when they are asked for."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys
@@ -12,7 +10,7 @@ import pytest
 import rs_localizer as rsl
 
 
-def test_every_public_name_is_there() -> None:
+def test_every_public_name_is_there():
     for name in rsl.__all__:
         assert getattr(rsl, name).__module__.startswith("rs_localizer.")
     assert set(rsl.__all__) <= set(dir(rsl))
@@ -22,14 +20,14 @@ def test_every_public_name_is_there() -> None:
     assert set(rsl.__all__) <= set(chosen)
 
 
-def test_no_other_name_is_there() -> None:
+def test_no_other_name_is_there():
     with pytest.raises(AttributeError, match="module 'rs_localizer' has no attribute 'Camra'"):
         rsl.__getattr__("Camra")
     with pytest.raises(ImportError, match="cannot import name 'Camra' from 'rs_localizer'"):
         exec("from rs_localizer import Camra")
 
 
-def test_type_checkers_see_the_same_names() -> None:
+def test_type_checkers_see_the_same_names():
     tree = ast.parse(Path(rsl.__file__).read_text())
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     seen = {
@@ -46,7 +44,7 @@ def test_type_checkers_see_the_same_names() -> None:
 @pytest.mark.parametrize(
     "module", ["rs_localizer", "rs_localizer.__main__", "rs_localizer.ros.main"]
 )
-def test_programs_start_with_light_imports(module: str) -> None:
+def test_programs_start_with_light_imports(module):
     code = (
         f"import sys, {module}\n"
         "heavy = ('numpy', 'numba', 'cv2', 'rclpy', 'rosbags', 'scipy', 'matplotlib')\n"
@@ -58,7 +56,7 @@ def test_programs_start_with_light_imports(module: str) -> None:
     assert done.stderr.strip() == "[]"
 
 
-def test_type_checkers_accept_what_people_write(tmp_path: Path) -> None:
+def test_type_checkers_accept_what_people_write(tmp_path):
     """Lists of whole numbers, sizes as JSON has them, no distortion."""
     api = pytest.importorskip("mypy.api", reason="mypy is not installed")
     program = tmp_path / "program.py"

@@ -1,7 +1,5 @@
 """The table of readout times, and the conventions."""
 
-from __future__ import annotations
-
 import pytest
 
 from rs_localizer.readout import (
@@ -14,7 +12,7 @@ from rs_localizer.readout import (
 )
 
 
-def test_every_row_of_the_table_makes_sense() -> None:
+def test_every_row_of_the_table_makes_sense():
     for known in known_cameras():
         assert 0.0 < known.low <= known.median <= known.high < 0.2
         assert known.number >= (3 if known.source == "gyroflow" else 1)
@@ -22,7 +20,7 @@ def test_every_row_of_the_table_makes_sense() -> None:
         assert known.mode
 
 
-def test_a_camera_is_found_by_words_and_all_of_its_modes_are_told() -> None:
+def test_a_camera_is_found_by_words_and_all_of_its_modes_are_told():
     modes = find_readout("raspberry IMX219")
     assert [known.mode for known in modes] == ["1640x1232", "1920x1080", "3280x2464"]
     (one,) = find_readout("imx219", "1920x1080")
@@ -30,19 +28,19 @@ def test_a_camera_is_found_by_words_and_all_of_its_modes_are_told() -> None:
     assert one.median == pytest.approx(from_line_time(3448 / 182.4e6, 1080), rel=2e-3)
 
 
-def test_values_of_the_whole_interval_are_marked() -> None:
+def test_values_of_the_whole_interval_are_marked():
     assert all(known.upper_bound for known in find_readout("Canon R10", "30 Hz"))
     assert not any(known.upper_bound for known in find_readout("Sony a7sIII"))
 
 
-def test_an_unknown_camera_or_mode_is_said_with_what_there_is() -> None:
+def test_an_unknown_camera_or_mode_is_said_with_what_there_is():
     with pytest.raises(ValueError, match="Sony a7sIII"):
         find_readout("Sonny a7sIII")
     with pytest.raises(ValueError, match="1640x1232"):
         find_readout("imx219", "8000x4000")
 
 
-def test_conventions() -> None:
+def test_conventions():
     assert from_all_rows(0.024, 480) == pytest.approx(from_line_time(0.024 / 480, 480))
     assert stamp_offset(StampAt.START, 0.01) == 0.005
     assert stamp_offset(StampAt.END, 0.01) == -0.005

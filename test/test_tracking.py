@@ -293,7 +293,7 @@ def test_turn_rates_of_a_shaken_camera_are_covered():
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3])
-def test_times_in_other_units_are_refused(unit: float) -> None:
+def test_times_in_other_units_are_refused(unit):
     tracker = Tracker(rsl.Localizer(CAMERA))
     points, pixels = Hand().frame(0.0, 40)
     with pytest.raises(ValueError, match=r"a whole number of nanoseconds, got 12\.5"):
@@ -306,7 +306,7 @@ def test_times_in_other_units_are_refused(unit: float) -> None:
         tracker.localize(first + 3 * step, points, pixels)
 
 
-def test_what_was_passed_instead_is_said() -> None:
+def test_what_was_passed_instead_is_said():
     localizer = rsl.Localizer(CAMERA)
     failure = localizer.localize(np.zeros((3, 3)), np.zeros((3, 2)))
     estimate = localizer.localize(*Hand().frame(0.0, 80))

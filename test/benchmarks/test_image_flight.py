@@ -1,13 +1,8 @@
 """Images of a quick hand into both nodes: the same poses and twists as offline, to the last bit."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
 
 from benchmarks import image_flight
 from rs_localizer.cli.main import main
@@ -20,7 +15,7 @@ def run(*words: str) -> None:
     subprocess.run(command, check=True, capture_output=True)
 
 
-def test_nodes_and_replay_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nodes_and_replay_agree(tmp_path, capsys):
     images, markers, poses = (str(tmp_path / name) for name in ("images", "markers", "poses"))
     assert main(["simulate", images, *FLIGHT, "--grey-noise", "2"]) == 0
     # In processes of their own: what other tests have compiled in this one may round differently.

@@ -1,9 +1,5 @@
 """The load benchmark counts what it sends; its figures are no matter of tests."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
@@ -14,7 +10,7 @@ from benchmarks.load.frames import Frames, simulated
 from benchmarks.load.measuring import steady
 
 
-def test_frames_never_end_and_are_known_by_their_stamps(tmp_path: Path) -> None:
+def test_frames_never_end_and_are_known_by_their_stamps(tmp_path):
     frames = simulated(points=30, outliers=0.3, rate=30.0, different=50)
     frames.save(tmp_path / "frames.npz")
     loaded = Frames.load(tmp_path / "frames.npz")
@@ -33,7 +29,7 @@ def test_frames_never_end_and_are_known_by_their_stamps(tmp_path: Path) -> None:
 
 
 @pytest.mark.bench
-def test_every_frame_is_accounted_for() -> None:
+def test_every_frame_is_accounted_for():
     frames = simulated(points=60, outliers=0.2, rate=20.0, different=40, imu_rate=200.0)
     (result,) = steady(frames, cameras=1, count=60)
     assert result.frames == 60

@@ -1,7 +1,5 @@
 """From photons to poses, offline: images rendered, markers detected, frames replayed; the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,7 @@ FLIGHT = "--images --trajectory tum_vi_room5 --start 21 --duration 0.8 --exposur
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory) -> Path:
     """images, markers, ours and p3p: what the four commands write."""
     made = tmp_path_factory.mktemp("flight")
     images, markers = str(made / "images"), str(made / "markers")
@@ -28,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def test_poses_of_images_are_those_of_the_truth(folder: Path) -> None:
+def test_poses_of_images_are_those_of_the_truth(folder):
     flight = load_flight(folder / "images", folder / "markers")
     assert flight.frames == 24
     assert len(flight.middles_ns) == 24

@@ -2,8 +2,6 @@
 that is the test's own (rays through a distorted lens, four by four in a pixel, row by row).
 """
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 
@@ -71,7 +69,7 @@ def expose(stamp: float, through: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def film(tmp_path_factory) -> Path:
     folder, through = tmp_path_factory.mktemp("film"), rays()
     rng = np.random.default_rng(0)
     for stamp in np.arange(0.0, SECONDS, 1.0 / RATE):
@@ -81,7 +79,7 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_film_gives_lens_readout_time_and_direction(film: Path, tmp_path: Path) -> None:
+def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path):
     out = tmp_path / "camera.yaml"
     board = ["--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]
     assert main(["calibrate", str(film), *board, "--out", str(out)]) == 0
@@ -98,9 +96,7 @@ def test_a_film_gives_lens_readout_time_and_direction(film: Path, tmp_path: Path
     assert found == pytest.approx(K1 * r2 + K2 * r2**2, abs=0.005)
 
 
-def test_what_comes_next_works_as_it_is_printed(
-    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_comes_next_works_as_it_is_printed(film, tmp_path, capsys):
     """Lens, shutter and map are passed on; a board of another size is named."""
     out = tmp_path / "camera.yaml"
     board = ["--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]

@@ -1,7 +1,5 @@
 """Videos, folders and bags of rendered prints become recordings of their corners."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +20,6 @@ from rs_localizer.io.recording import make_camera_info
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.offline.image_sources import SourceError, from_bag
 from rs_localizer.pipeline.images import FrameDetector, correspondences
 from rs_localizer.settings import build, load_params_file
 
@@ -74,7 +71,7 @@ def jpeg(image: Any) -> bytes:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> SimpleNamespace:
+def files(tmp_path) -> SimpleNamespace:
     (tmp_path / "camera.yaml").write_text(CALIBRATION)
     write_marker_map(tmp_path / "map.yaml", MARKERS)
     images = [board(x) for x in (0.0, 0.01, 0.16, 0.02, 5.0, 0.03)]
@@ -97,7 +94,7 @@ def clouds(path: Path) -> list[Any]:
         return [read_correspondences(m) for _, _, m in bag.messages(["/correspondences"])]
 
 
-def test_video_of_a_board(files: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_video_of_a_board(files, capsys):
     words = [*files.calibration, *files.board, "--rate", "20", "--images"]
     assert detect(files, files.video, *words, "--readout-time", "0.011") == 0
     # The third image cuts the board off, in the fifth there is none.
@@ -149,7 +146,7 @@ def image_bag(path: Path, images: list[Any], info: bool = True) -> None:
                 bag.write("/cam/camera_info", make_camera_info(CAMERA, ns), ns)
 
 
-def test_bag_of_markers(files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bag_of_markers(files, tmp_path, capsys):
     images = [markers(x) for x in (0.0, 0.0, 0.01, 5.0)]
     image_bag(tmp_path / "bag", images)
     (tmp_path / "bag" / "parameters.yaml").write_text(
@@ -178,7 +175,7 @@ def test_bag_of_markers(files: Any, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert detector.take(raw[2])
 
 
-def test_georeferenced_maps_keep_their_millimetres(files: Any, tmp_path: Path) -> None:
+def test_georeferenced_maps_keep_their_millimetres(files, tmp_path):
     # UTM coordinates do not fit into single precision.
     text = Path(files.map[1]).read_text()
     far = text.replace("[-0.05, 0.0, 0.0]", "[691608.001, 5334764.002, 0.0]")
@@ -191,29 +188,7 @@ def test_georeferenced_maps_keep_their_millimetres(files: Any, tmp_path: Path) -
     assert found.points[0] == pytest.approx([691607.966, 5334764.037, 0.0], abs=1e-6)
 
 
-def test_folder_of_images(files: Any, tmp_path: Path) -> None:
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for name in ("900000000000000000.png", "1000000000000000000.jpg"):
-        cv2.imwrite(str(folder / name), markers())
-    assert detect(files, str(folder), *files.map, *files.calibration) == 0
-    assert [cloud.stamp_ns for cloud in clouds(files.out)] == [9 * 10**17, 10**18]
-
-
-@pytest.mark.parametrize("name", ["1650000000000000", "1" + 29 * "0"])
-def test_other_numbers_are_no_times(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    """Microseconds, and what no stamp can hold."""
-    (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), markers())
-    assert detect(files, str(tmp_path / "images"), *files.map, *files.calibration) == 2
-    assert "the names of the files are not times in ns" in capsys.readouterr().err
-
-
-def test_nothing_is_left_where_nothing_was_seen(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_is_left_where_nothing_was_seen(files, tmp_path, capsys):
     other = MarkerMap(wall("5x5_50", (1, 1), 0.1, 0.1, first_id=7))
     write_marker_map(tmp_path / "map.yaml", other)
     image_bag(tmp_path / "bag", [markers()])
@@ -223,65 +198,7 @@ def test_nothing_is_left_where_nothing_was_seen(
     assert not files.out.exists()
 
 
-def test_a_map_that_does_not_fit_is_told(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = (tmp_path / "map.yaml").read_text()
-    path = tmp_path / "map.yaml"
-    path.write_text(text.replace("[-0.05, 0.0, 0.0]", "[-0.25, 0.0, 0.0]"))
-    assert path.read_text() != text
-    image_bag(tmp_path / "bag", [markers()])
-    assert detect(files, str(tmp_path / "bag"), *files.map) == 0
-    assert "note (1 images): the map does not fit the image" in capsys.readouterr().out
-
-
-def test_faults_end_the_command(
-    files: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    calibration = tmp_path / "camera.yaml"
-    calibration.write_text(CALIBRATION.replace("240", "480"))
-    words = [*files.calibration, *files.board, "--rate", "30"]
-    assert detect(files, files.video, *words) == 1
-    error = capsys.readouterr().err
-    assert "images are of 320x240, the calibration is for 320x480" in error
-    image_bag(tmp_path / "bag", [markers()], info=False)
-    assert detect(files, str(tmp_path / "bag"), *files.map) == 1
-    assert "no topic of type sensor_msgs/msg/CameraInfo: none" in capsys.readouterr().err
-    silent = SimpleNamespace(path=tmp_path / "bag", topics={}, messages=lambda topics: iter(()))
-    with pytest.raises(SourceError, match="bag has no message on /info; give --calibration"):
-        next(from_bag(silent, "/image", "/info", None))  # type: ignore[arg-type]
-    assert detect(files, str(tmp_path / "bag"), "--map", str(tmp_path / "none.yaml")) == 1
-    assert "none.yaml cannot be read: No such file" in capsys.readouterr().err
-    assert not files.out.exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        ((), "give --map, --board or --features"),
-        (("--board", "6x4"), "--board needs --square"),
-        (("--board", "six", "--square", "1"), "--board must be of the form 6x4, got 'six'"),
-        (("--board", "1x1", "--square", "1"), "--board: a board needs 3x3 inner corners"),
-        (("--board", "6x4", "--square", "0"), "--square: must be more than 0, got 0"),
-        (("--board", "6x4", "--square", "1"), "a video or folder has no camera_info"),
-        (("--board", "6x4", "--square", "1", "--calibration", "x"), "x cannot be read"),
-        (("--board", "6x4", "--square", "25"), "--square: chessboard 6x4 with 25 m"),
-        (("--map", "x", "--pattern", "circles"), "--pattern goes with --board"),
-        (("--map", "x", "--image", "/i", "--rate", "1"), "cannot be read"),
-        (("--rate", "0"), "--rate: must be more than 0, got 0"),
-        (("--readout-time", "7"), "--readout-time: must lie between 0 and 0.2, got 7"),
-    ],
-)
-def test_wrong_usage(
-    files: Any, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], text: str
-) -> None:
-    failed = "--image" in words or "--calibration" in words  # the work, not the usage
-    assert detect(files, files.video, *words) == (1 if failed else 2)
-    assert text in capsys.readouterr().err
-    assert not files.out.exists()
-
-
-def test_settings_are_passed_on(files: Any, tmp_path: Path) -> None:
+def test_settings_are_passed_on(files, tmp_path):
     """The scan direction, and what else calibrate found, not the readout time alone."""
     file = tmp_path / "shutter.yaml"
     file.write_text(
@@ -302,7 +219,7 @@ def test_settings_are_passed_on(files: Any, tmp_path: Path) -> None:
     assert (config.readout_time, config.scan_direction) == (0.011, "top_to_bottom")
 
 
-def test_a_board_is_known_as_paper_is(files: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_board_is_known_as_paper_is(files, capsys):
     """0.2 mm in 10 cm, unless a setting says it; the next command still asks for the shutter."""
     words = [*files.calibration, *files.board, "--rate", "20"]
     assert detect(files, files.video, *words) == 0
@@ -314,12 +231,3 @@ def test_a_board_is_known_as_paper_is(files: Any, capsys: pytest.CaptureFixture[
     assert f"--params {files.out}/parameters.yaml -p readout_time:=SECONDS" in said
     assert detect(files, files.video, *words, "--overwrite", "-p", "map_deviation:=0.0") == 0
     assert load_params_file(files.out / "parameters.yaml") == {"map_deviation": 0.0}
-
-
-def test_only_recordings_are_overwritten(files: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    files.out.mkdir()
-    (files.out / "thesis.tex").write_text("mine")
-    words = [*files.calibration, *files.board, "--rate", "20", "--overwrite"]
-    assert detect(files, files.video, *words) == 1
-    assert "it is no earlier result, and stays as it is" in capsys.readouterr().err
-    assert (files.out / "thesis.tex").read_text() == "mine"

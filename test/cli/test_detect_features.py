@@ -1,7 +1,5 @@
 """Images of anything become recordings of keypoints, the same as the node's."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,7 +37,7 @@ def image(ns: int, pixels: Any) -> Any:
 
 
 @pytest.fixture
-def here(tmp_path: Path) -> SimpleNamespace:
+def here(tmp_path) -> SimpleNamespace:
     messages = [image((5 + k) * NS, picture(k)) for k in range(3)]
     messages.append(image(8 * NS, np.zeros((120, 160), np.uint8)))
     broken = image(9 * NS, picture(0))
@@ -60,9 +58,7 @@ def clouds(path: Path) -> list[Any]:
 
 
 @pytest.mark.parametrize(("kind", "width"), [("orb", 32), ("sift", 128)])
-def test_a_bag_of_images(
-    here: Any, kind: str, width: int, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bag_of_images(here, kind, width, capsys):
     words = ["--features", kind, "--max-keypoints", "40", "--out", str(here.out), "--timing"]
     assert main(["detect", here.bag, *words, "--readout-time", "0.02"]) == 0
     said = capsys.readouterr().out
@@ -85,25 +81,3 @@ def test_a_bag_of_images(
         assert 10 < len(read) <= 40
     with open_bag(here.out) as bag:
         assert bag.count(["/camera_info"]) == len(found) == 3
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (
-            ["--features", "orb", "--map", "wall.yaml"],
-            "--map is for markers; give it or --features",
-        ),
-        (["--features", "orb", "--min-side", "5"], "--min-side is for markers"),
-        (["--max-keypoints", "50", "--map", "wall.yaml"], "--max-keypoints goes with --features"),
-        (["--features", "surf"], "invalid choice: 'surf'"),
-        (["--features", "orb", "--max-keypoints", "3"], "must be 7 or more"),
-        (["--features", "orb", "--rate", "30"], "--rate is for videos and folders"),
-    ],
-)
-def test_wrong_usage(
-    here: Any, words: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["detect", here.bag, *words, "--out", str(here.out)]) == 2
-    assert text in capsys.readouterr().err
-    assert not here.out.exists()

@@ -1,7 +1,5 @@
 """What detect makes of its sources: times, boards, what it keeps of a bag, and what it warns of."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,7 +48,7 @@ def board(columns: int, rows: int, x: int = 0) -> Any:
 
 
 @pytest.fixture
-def here(tmp_path: Path) -> SimpleNamespace:
+def here(tmp_path) -> SimpleNamespace:
     (tmp_path / "camera.json").write_text(
         '{"width": 320, "height": 240, "fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5}'
     )
@@ -86,7 +84,7 @@ def stamps(path: Path) -> list[int]:
         return [stamp_ns(message) for _, _, message in bag.messages(["/correspondences"])]
 
 
-def test_a_video_has_its_own_times(here: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_video_has_its_own_times(here, capsys):
     video = mp4(here.path / "a.mp4", [board(6, 4, x) for x in range(4)], 20.0)
     assert detect(here, video, *here.board, "--readout-time", "0.06", "--start", "7.5") == 0
     assert stamps(here.out) == [7_500_000_000 + 50_000_000 * k for k in range(4)]
@@ -95,9 +93,7 @@ def test_a_video_has_its_own_times(here: Any, capsys: pytest.CaptureFixture[str]
     assert "warning: the readout time of 60 ms is longer than the 50 ms from image to im" in said
 
 
-def test_another_board_is_named_after_the_first_images(
-    here: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_board_is_named_after_the_first_images(here, capsys):
     images = folder(here.path / "images", [board(7, 5)] * 66)
     assert detect(here, images, *here.board, "--rate", "30") == 1
     said = capsys.readouterr().err
@@ -107,7 +103,7 @@ def test_another_board_is_named_after_the_first_images(
     assert not here.out.exists()
 
 
-def test_a_wrong_calibration_is_named(here: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_calibration_is_named(here, capsys):
     text = (here.path / "camera.json").read_text()
     (here.path / "camera.json").write_text(text.replace('"fy": 300', '"fy": 900'))
     images = folder(here.path / "images", [board(6, 4)] * 3)
@@ -116,7 +112,7 @@ def test_a_wrong_calibration_is_named(here: Any, capsys: pytest.CaptureFixture[s
     assert re.search(r"warning: even the stillest images leave \d+\.\d px rms: the calib", said)
 
 
-def test_turned_images_are_named(here: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_turned_images_are_named(here, capsys):
     images = folder(here.path / "images", [np.ascontiguousarray(board(6, 4).T)])
     assert detect(here, images, *here.board, "--rate", "30") == 1
     assert "are of 240x320, the calibration is for 320x240: they are turned by a quarter" in (
@@ -124,7 +120,7 @@ def test_turned_images_are_named(here: Any, capsys: pytest.CaptureFixture[str]) 
     )
 
 
-def test_a_board_of_exactly_min_inliers_corners(here: Any) -> None:
+def test_a_board_of_exactly_min_inliers_corners(here):
     images = folder(here.path / "images", [board(4, 3, x) for x in range(12)])
     assert detect(here, images, "--board", "4x3", "--square", "0.03", "--rate", "30") == 0
     poses = here.path / "poses"
@@ -164,9 +160,7 @@ def imu(ns: int) -> Any:
 
 
 @pytest.mark.parametrize("own_calibration", [True, False])
-def test_transforms_and_imu_of_a_bag_are_kept(
-    here: Any, own_calibration: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_transforms_and_imu_of_a_bag_are_kept(here, own_calibration, capsys):
     start = 100 * 10**9  # the recorder's clock is another one than the stamps
     with BagWriter(here.path / "bag") as bag:
         bag.write("/tf_static", transform(static=True), start)

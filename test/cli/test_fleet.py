@@ -1,10 +1,7 @@
 """Many recordings by one command: the same bytes by one and two workers, and nothing in the way."""
 
-from __future__ import annotations
-
 import csv
 import filecmp
-import itertools
 import os
 import shutil
 import signal
@@ -16,10 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer import data
 from rs_localizer.cli import batch as fleet
 from rs_localizer.cli.main import main
-from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.offline.fleet.task import Outcome, Task, perform
 
 pytest.importorskip("distributed", reason="needs Dask")
@@ -28,7 +23,7 @@ SHUTTER = ["-p", "readout_time:=0.03"]
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def recordings(tmp_path_factory) -> list[str]:
     """Two flights of one name, and a file that is none."""
     path = tmp_path_factory.mktemp("bags")
     words = ["--rate", "10", "--duration", "0.65", "--angular-velocity", "0", "1.2", "0.6"]
@@ -52,8 +47,8 @@ def differing(one: filecmp.dircmp[str]) -> list[str]:
 
 
 def test_bytes_are_the_same_by_one_and_two_workers_and_of_one_recording(
-    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    recordings, tmp_path, capsys
+):
     words = ["replay", *recordings, *SHUTTER]
     for workers in ("1", "2"):
         out = str(tmp_path / workers)
@@ -89,15 +84,13 @@ def test_bytes_are_the_same_by_one_and_two_workers_and_of_one_recording(
 
 
 @pytest.fixture
-def undone(monkeypatch: pytest.MonkeyPatch) -> None:
+def undone(monkeypatch) -> None:
     """Nobody works, so that what comes before it is quick to try."""
     monkeypatch.setattr(fleet, "perform_all", lambda tasks, where: (item for item in ()))
 
 
 @pytest.mark.usefixtures("undone")
-def test_results_of_other_settings_are_in_the_way(
-    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_of_other_settings_are_in_the_way(recordings, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["replay", *recordings, "--out", str(out), *SHUTTER]
     (out / "a_flight").mkdir(parents=True)
@@ -117,9 +110,7 @@ def test_results_of_other_settings_are_in_the_way(
 
 
 @pytest.mark.usefixtures("undone")
-def test_results_of_another_command_stay_whatever_may_be_overwritten(
-    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_of_another_command_stay_whatever_may_be_overwritten(recordings, tmp_path, capsys):
     """As ``replay seen/*/ --out seen --overwrite`` would replace what it reads."""
     made = tmp_path / "seen" / "flight"
     shutil.copytree(recordings[0], made)
@@ -129,30 +120,7 @@ def test_results_of_another_command_stay_whatever_may_be_overwritten(
     assert f"{made} exists and is no result of replay; choose" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("undone")
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["replay", "a", "b"], "many recordings need --out DIR"),
-        (["replay", "a", "b", "--ros"], "--ros plays one recording"),
-        (["replay", "a", "--out", "o", "--workers", "0"], "must be 1 or more, got 0"),
-        (["replay", "a", "--workers", "2", "--scheduler", "tcp://h:1", "--out", "o"], "give it or"),
-        (["replay", "a", "b", "--out", "o", "-p", "solver:=magic"], "-p: solver"),
-        (["calibrate", "a", "b", "--out", "o", "--plots", "x/y"], "--plots is a name in the"),
-        (["detect", "a", "b", "--out", "o"], "give --map, --board or --features"),
-        (["evaluate", "a"], "give EST and TRUTH"),
-        (["evaluate", "a", "b", "--out", "o"], "go with --truths"),
-        (["evaluate", "a", "--truths", "t"], "many recordings need --out DIR"),
-    ],
-)
-def test_wrong_usage(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words) == 2
-    assert text in capsys.readouterr().err
-
-
-def test_without_dask_one_sentence_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_dask_one_sentence_says_what_to_install(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(fleet.importlib.util, "find_spec", lambda name: None)
     assert main(["replay", "a", "b", "--out", str(tmp_path / "out")]) == 1
     assert capsys.readouterr().err == (
@@ -162,24 +130,22 @@ def test_without_dask_one_sentence_says_what_to_install(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_commands_do_not_write_into_one_directory(
-    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_commands_do_not_write_into_one_directory(recordings, tmp_path, capsys):
     with fleet.only_one(tmp_path):
         assert main(["replay", *recordings, *SHUTTER, "--out", str(tmp_path)]) == 1
     assert f"another command is writing into {tmp_path}; wait" in capsys.readouterr().err
 
 
 @pytest.fixture
-def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def in_process(monkeypatch) -> None:
     """As by a worker, without the time that its start takes."""
     monkeypatch.setattr(fleet, "perform_all", lambda tasks, where: map_closed(perform, tasks))
 
 
 @pytest.mark.usefixtures("in_process")
 def test_what_one_recording_s_replay_replaces_is_no_result_of_the_fleet(
-    recordings: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    recordings, tmp_path, capsys
+):
     out = tmp_path / "out"
     many = ["replay", *recordings[:2], *SHUTTER, "--out", str(out)]
     assert main(many) == 0
@@ -190,9 +156,7 @@ def test_what_one_recording_s_replay_replaces_is_no_result_of_the_fleet(
     assert f"{out}/a_flight exists and is no result of replay" in capsys.readouterr().err
 
 
-def test_maps_are_found_from_any_directory(
-    recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_maps_are_found_from_any_directory(recordings, tmp_path, monkeypatch):
     """A worker of a scheduler has a working directory of its own."""
     seen: list[Path] = []
 
@@ -212,9 +176,7 @@ def map_closed(function: Callable[[Task], Outcome], tasks: list[Task]) -> Iterat
 
 
 @pytest.mark.usefixtures("in_process")
-def test_evaluate_finds_the_truth_of_each_by_its_name(
-    recordings: list[str], tmp_path: Path
-) -> None:
+def test_evaluate_finds_the_truth_of_each_by_its_name(recordings, tmp_path):
     """The estimates are the truth itself; one of them has none to be compared with."""
     truths, estimates = tmp_path / "truths", tmp_path / "estimates"
     truths.mkdir()
@@ -231,34 +193,7 @@ def test_evaluate_finds_the_truth_of_each_by_its_name(
     assert not (tmp_path / "out" / "two").exists()
 
 
-@pytest.mark.usefixtures("in_process")
-def test_detect_makes_a_recording_of_each(tmp_path: Path) -> None:
-    webcam = data.path(data.WEBCAM)
-    with open_bag(webcam) as bag, BagWriter(tmp_path / "some") as some:
-        wanted = ("/camera_info", "/image/compressed")
-        for topic, recorded, message in itertools.islice(bag.messages(wanted), 6):
-            some.write(topic, message, recorded)
-    shutil.copytree(tmp_path / "some", tmp_path / "more")
-    words = [str(tmp_path / "some"), str(tmp_path / "more"), "--board", "6x4", "--square", "0.03"]
-    assert main(["detect", *words, "--out", str(tmp_path / "out")]) == 0
-    for name, row in rows(tmp_path / "out").items():
-        assert row["with corners"] == row["images"]
-        assert float(row["corners"]) == 24.0
-        with open_bag(tmp_path / "out" / name) as bag:
-            assert bag.count(["/correspondences"]) == int(row["images"]) > 1
-
-
-@pytest.mark.usefixtures("in_process")
-def test_calibrate_tells_of_each_what_it_lacks(recordings: list[str], tmp_path: Path) -> None:
-    """Seven images are too few, and say so; what can be calibrated with has tests of its own."""
-    assert main(["calibrate", *recordings[:2], "--out", str(tmp_path / "out")]) == 1
-    assert {row["state"] for row in rows(tmp_path / "out").values()} == {"failed"}
-    assert all("images" in row["reason"] for row in rows(tmp_path / "out").values())
-
-
-def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(
-    recordings: list[str], tmp_path: Path
-) -> None:
+def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(recordings, tmp_path):
     """As from a terminal: every process of the group gets the signal."""
     bags = [str(tmp_path / "in" / str(k)) for k in range(3)]
     for bag in bags:

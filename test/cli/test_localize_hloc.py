@@ -1,11 +1,8 @@
 """What hloc has matched becomes poses; its files are made here, by a small projector."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -175,9 +172,7 @@ def global_shutter(files: Any, name: str) -> tuple[Any, Any]:
     return matrix[:, :3], matrix[:, 3]
 
 
-def test_moving_queries_lose_half_of_the_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_moving_queries_lose_half_of_the_error(tmp_path, capsys):
     truth = motions(6)
     files = make(tmp_path, truth)
     assert localize(files, "-p", f"readout_time:={READOUT}") == 0
@@ -198,7 +193,7 @@ def test_moving_queries_lose_half_of_the_error(
     assert np.all(np.median(ours, axis=0) < 0.5 * np.median(theirs, axis=0))
 
 
-def test_still_queries_lose_nothing(tmp_path: Path) -> None:
+def test_still_queries_lose_nothing(tmp_path):
     truth = motions(6, still=True)
     files = make(tmp_path, truth)
     assert localize(files, "-p", f"readout_time:={READOUT}") == 0
@@ -208,7 +203,7 @@ def test_still_queries_lose_nothing(tmp_path: Path) -> None:
     assert np.all(np.median(ours, axis=0) < 1.3 * np.median(theirs, axis=0) + [1e-4, 1e-3])
 
 
-def test_rows_names_and_older_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rows_names_and_older_files(tmp_path, capsys):
     truth = motions(2)
     new, old = make(tmp_path / "new", truth), make(tmp_path / "old", truth, old=True)
     words = ["-p", f"readout_time:={READOUT}", "--prepend-camera-name", "--row", "first"]
@@ -228,9 +223,7 @@ def test_rows_names_and_older_files(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert all(query["angular_velocity"] is None for query in told["queries"].values())
 
 
-def test_bad_files_are_told_of_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_files_are_told_of_in_one_line(tmp_path, capsys):
     files = make(tmp_path, motions(1))
     name = "query/cam0/0.jpg"
     bad = tmp_path / "bad"
@@ -281,12 +274,3 @@ def test_bad_files_are_told_of_in_one_line(
         refused(told, reference_sfm=broken)
     assert localize(files, "-p", "readout:=1") == 2
     assert localize(files, "--row", "third") == 2
-
-
-def test_without_h5py_it_says_what_to_install(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    files = make(tmp_path, motions(1))
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    assert localize(files) == 1
-    assert "h5py is not installed: pip install h5py (the extra hloc" in capsys.readouterr().err

@@ -1,7 +1,5 @@
 """``rs_localizer map``: what it says and writes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ from rs_localizer.io.maps.landmarks import Map
 COLMAP = Path(__file__).parents[1] / "io" / "maps" / "colmap"
 
 
-def test_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info(tmp_path, capsys):
     points = np.array([[0.0, -1.0, 2.0], [1.0, 1.0, 3.5], [5.0, 0.0, 100.0]])
     path = tmp_path / "map.npz"
     write_map_file(path, Map(points, np.array([7, -3, 5]), np.zeros((3, 32), np.uint8), "map"))
@@ -33,9 +31,7 @@ def test_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("form", ["map.npz", "map.ply"])
-def test_a_model_of_colmap_becomes_a_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
-) -> None:
+def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys, form):
     out = tmp_path / form
     words = ["map", "convert", str(COLMAP / "text"), str(out)]
     assert main(words) == 0
@@ -46,21 +42,3 @@ def test_a_model_of_colmap_becomes_a_file(
     assert main(words) == 1
     assert "exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert main([*words, "--overwrite"]) == 0
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "text"),
-    [
-        (["map"], 2, "the following arguments are required: ACTION"),
-        (["map", "fly"], 2, "invalid choice: 'fly'"),
-        (["map", "convert", "a.ply", "b.obj"], 2, "OUT must end in .npz or .ply or .yaml"),
-        (["map", "convert", "a.ply", "b.npz", "--text"], 2, "--text goes with .ply"),
-        (["map", "info", "nowhere.ply"], 1, "No such file or directory: 'nowhere.ply'"),
-        (["map", "info", str(COLMAP / "truth.json")], 1, "truth.json is not a marker map"),
-    ],
-)
-def test_what_is_refused(
-    words: list[str], code: int, text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == code
-    assert text in capsys.readouterr().err

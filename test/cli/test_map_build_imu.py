@@ -1,7 +1,5 @@
 """The IMU of ``map build``: which one is taken, what is read of it, what is said."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
@@ -12,9 +10,8 @@ from rs_localizer.cli import UsageError
 from rs_localizer.cli.main import main
 from rs_localizer.cli.map.build import add_imu_arguments, imu_of
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.imu_files import ImuFileError
+from rs_localizer.io.imu import ImuFileError
 from rs_localizer.offline.image_sources import SourceError
-from rs_localizer.settings import build, load_params_file, write_parameters
 
 
 def given(images: Path, *words: str) -> argparse.Namespace:
@@ -25,7 +22,7 @@ def given(images: Path, *words: str) -> argparse.Namespace:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory) -> Path:
     """With an IMU at rest beside the camera."""
     out = tmp_path_factory.mktemp("recorded") / "bag"
     words = ["--duration", "0.3", "--points", "20", "--imu", "--accelerometer-bias", "0"]
@@ -33,7 +30,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_that_of_a_bag_is_found(recorded: Path) -> None:
+def test_that_of_a_bag_is_found(recorded):
     """Forces, and where TF says that it is."""
     imu = imu_of(given(recorded))
     assert imu is not None
@@ -45,7 +42,7 @@ def test_that_of_a_bag_is_found(recorded: Path) -> None:
     np.testing.assert_allclose(imu.recording.imu_in_camera, [0.03, -0.02, -0.01], atol=1e-9)
 
 
-def test_it_may_be_asked_for_or_left_out(recorded: Path) -> None:
+def test_it_may_be_asked_for_or_left_out(recorded):
     for words in (("--imu",), ("--imu", "/imu")):
         imu = imu_of(given(recorded, *words))
         assert imu is not None
@@ -57,9 +54,7 @@ def test_it_may_be_asked_for_or_left_out(recorded: Path) -> None:
         imu_of(given(recorded, "--imu", "/imu", "--no-imu"))
 
 
-def test_of_several_none_is_taken(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_several_none_is_taken(recorded, tmp_path, capsys):
     with open_bag(recorded) as bag, BagWriter(tmp_path / "two") as out:
         for _, stamp_ns, message in bag.messages(["/imu"]):
             out.write("/left", message, stamp_ns)
@@ -71,7 +66,7 @@ def test_of_several_none_is_taken(
     assert imu_of(given(tmp_path / "two", "--imu", "/left")) is not None
 
 
-def test_a_video_may_have_a_file_beside_it(tmp_path: Path) -> None:
+def test_a_video_may_have_a_file_beside_it(tmp_path):
     path = tmp_path / "data.csv"
     path.write_text("#timestamp [ns],...\n1000,1,2,3,4,5,6\n2000,1,2,3,4,5,7\n")
     video = tmp_path / "walk.mp4"
@@ -85,12 +80,3 @@ def test_a_video_may_have_a_file_beside_it(tmp_path: Path) -> None:
         imu_of(given(video, "--imu"))
     with pytest.raises(ImuFileError, match="cannot be read"):
         imu_of(given(video, "--imu", "/imu"))
-
-
-def test_the_offset_of_stamps_is_a_parameter(tmp_path: Path) -> None:
-    path = tmp_path / "parameters.yaml"
-    shutter = {"readout_time": 0.03, "scan_direction": "bottom_to_top", "imu.time_offset": 0.005}
-    write_parameters(path, shutter)
-    config = build(load_params_file(path))
-    assert config.imu.time_offset == 0.005
-    assert config.readout_time == 0.03

@@ -1,7 +1,5 @@
 """``rs_localizer map`` on maps of markers, and the maps that it makes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -26,16 +24,14 @@ def refused(words: list[str], code: int, said: str, capsys: pytest.CaptureFixtur
 
 
 @pytest.fixture
-def marker_file(tmp_path: Path) -> Path:
+def marker_file(tmp_path) -> Path:
     path = tmp_path / "wall.yaml"
     markers = wall("apriltag_36h11", (3, 2), 0.16, 0.04, pose=Pose(np.array([1.0, 2.0, 0.5])))
     write_marker_map(path, MarkerMap(markers))
     return path
 
 
-def test_info_and_convert(
-    tmp_path: Path, marker_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_and_convert(tmp_path, marker_file, capsys):
     assert main(["map", "info", str(marker_file)]) == 0
     said = capsys.readouterr().out
     assert "markers of apriltag_36h11" in said
@@ -56,7 +52,7 @@ def test_info_and_convert(
     np.testing.assert_array_equal(landmarks.points, read_marker_map(marker_file).points)
 
 
-def test_align(tmp_path: Path, marker_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_align(tmp_path, marker_file, capsys):
     out = tmp_path / "aligned.yaml"
     words = ["align", str(marker_file), str(out), "--upright", "0", "--origin", "0"]
     assert main(["map", *words]) == 0
@@ -72,9 +68,7 @@ def test_align(tmp_path: Path, marker_file: Path, capsys: pytest.CaptureFixture[
     refused(["align", str(marker_file), other, "--distance", "0", "1", "x"], 2, "two ids", capsys)
 
 
-def test_refine_and_survey_what_was_simulated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_refine_and_survey_what_was_simulated(tmp_path, capsys):
     flight, out = tmp_path / "flight", tmp_path / "refined.npz"
     simulated = ["simulate", str(flight), "--duration", "1.5", "--keypoints", "--points", "120"]
     assert main([*simulated, "--trajectory", "tum_vi_room5", "--noise", "0.3"]) == 0
@@ -102,17 +96,3 @@ def test_refine_and_survey_what_was_simulated(
     refused([*again, "--hold", "1", "2", "999999"], 2, "no landmark 999999", capsys)
     refused([*again, "-p", "readout_time:=0.0", "--shutter", "given"], 2, "needs -p", capsys)
     refused(["refine", str(tmp_path), "--out", "a.obj"], 2, "--out must end in", capsys)
-
-
-def test_what_survey_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    base = ["survey", str(tmp_path / "none"), "--out", str(tmp_path / "wall.yaml")]
-    sized = [*base, "--family", "4x4_50", "--size", "0.1"]
-    refused(sized, 1, "does not exist", capsys)
-    refused([*base, "--family", "5x9", "--size", "0.1"], 2, "unknown family '5x9'", capsys)
-    refused([*base, "--family", "4x4_50", "--size", "3:0.1"], 2, "size of all other", capsys)
-    refused([*base, "--family", "4x4_50", "--size", "-1"], 2, "must be metres", capsys)
-    refused([*sized, "--family", "4x4_100"], 2, "share their patterns", capsys)
-    refused([*sized, "--origin", "77"], 2, "have no id 77", capsys)
-    (tmp_path / "none").mkdir()
-    refused(sized, 2, "give --calibration", capsys)
-    assert not (tmp_path / "wall.yaml").exists()

@@ -1,7 +1,5 @@
 """``rs_localizer map survey`` on images of the test's own: flat prints, warped one by one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -50,7 +48,7 @@ def picture(turn: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def walk(tmp_path_factory) -> Path:
     """A second of images, with the calibration beside them."""
     folder = tmp_path_factory.mktemp("walk")
     (folder / "images").mkdir()
@@ -71,9 +69,7 @@ def survey(walk: Path, out: Path, *more: str) -> int:
 
 
 @pytest.mark.parametrize("deviations", ["shape", "origin"])
-def test_markers_of_images_are_found(
-    walk: Path, tmp_path: Path, deviations: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_markers_of_images_are_found(walk, tmp_path, deviations, capsys):
     out = tmp_path / "wall.yaml"
     assert survey(walk, out, "--deviations", deviations) == 0
     said = capsys.readouterr().out
@@ -92,9 +88,7 @@ def test_markers_of_images_are_found(
     assert np.all(held == 0.0) == (deviations == "origin")
 
 
-def test_a_readout_time_that_the_images_contradict_is_refused(
-    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_readout_time_that_the_images_contradict_is_refused(walk, tmp_path, capsys):
     out, wrong = tmp_path / "wall.yaml", ("-p", "readout_time:=0.006")
     assert survey(walk, out, *wrong) == 1
     error = capsys.readouterr().err

@@ -1,7 +1,5 @@
 """Prints with their maps, and what is said of maps that cannot be right."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ def make(out: Path, *words: str) -> int:
     return main(["markers", "make", str(out), *words])
 
 
-def test_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_make_and_check(tmp_path, capsys):
     out = tmp_path / "wall.v2"
     assert make(out) == 0
     said = capsys.readouterr().out
@@ -32,9 +30,7 @@ def test_make_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
 
 
-def test_pages_of_others_are_not_overwritten(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pages_of_others_are_not_overwritten(tmp_path, capsys):
     (tmp_path / "wall_2.png").write_text("a photograph")
     words = ["--size", "0.13", "--grid", "2x1", "--format", "png"]
     assert make(tmp_path / "wall", *words) == 1
@@ -43,32 +39,7 @@ def test_pages_of_others_are_not_overwritten(
     assert not (tmp_path / "wall_1.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (("--family", "4x5_50"), "unknown family '4x5_50'"),
-        (("--grid", "10x10"), "4x4_50 has the ids 0 to 49, found 50"),
-        (("--grid", "0x1"), "--grid must be of the form 6x4, got '0x1'"),
-        (("--grid", "two"), "--grid must be of the form 6x4, got 'two'"),
-        (("--gap", "0.001"), "each needs a white rim of a cell"),
-        (("--square", "0.1"), "--square is for a board"),
-        (("--chessboard", "6x4", "--size", "0.1"), "--size is for a grid"),
-        (("--chessboard", "6x4", "--family", "4x4_50"), "--family is for markers"),
-        (("--chessboard", "2x2"), "a board needs 3x3 inner corners"),
-        (("--charuco", "5x7", "--marker", "0.1"), "do not fit into squares"),
-        (("--size", "0"), "--size: must be more than 0"),
-        (("--page", "a5"), "invalid choice: 'a5'"),
-    ],
-)
-def test_wrong_usage(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], text: str
-) -> None:
-    assert make(tmp_path / "wall", *words) == 2
-    assert text in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_problems_of_a_map_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_problems_of_a_map_are_named(tmp_path, capsys):
     assert make(tmp_path / "wall", "--grid", "2x1", "--size", "0.05", "--gap", "0.03") == 0
     path = tmp_path / "wall.yaml"
     text = path.read_text()

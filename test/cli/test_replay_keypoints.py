@@ -1,7 +1,5 @@
 """Replay of keypoints: with a map in the recording and with a map file, and what is missing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +14,8 @@ from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
@@ -31,7 +28,7 @@ LANDMARKS = Map(
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flight(tmp_path_factory) -> Path:
     """Recordings of one flight: with correspondences, keypoints, and a map, as asked for."""
     folder = tmp_path_factory.mktemp("bags")
     K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
@@ -79,9 +76,7 @@ def errors(out: Path, truth: Path) -> Any:
     return np.linalg.norm(found.positions - true, axis=1)
 
 
-def test_a_map_in_the_recording(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_in_the_recording(flight, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["replay", str(flight / "with_map"), "--out", str(out), *SHUTTER]) == 0
     said = capsys.readouterr().out
@@ -92,7 +87,7 @@ def test_a_map_in_the_recording(
 
 
 @pytest.mark.parametrize("how", ["--map", "-p"])
-def test_a_map_file(flight: Path, tmp_path: Path, how: str) -> None:
+def test_a_map_file(flight, tmp_path, how):
     file = str(flight / "map.npz")
     given = ["--map", file] if how == "--map" else ["-p", f"map_file:={file}"]
     out = tmp_path / "out"
@@ -102,9 +97,7 @@ def test_a_map_file(flight: Path, tmp_path: Path, how: str) -> None:
     assert found.max() < 0.02
 
 
-def test_a_recording_of_everything(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_of_everything(flight, tmp_path, capsys):
     words = ["replay", str(flight / "all"), *SHUTTER]
     assert main(words) == 1
     assert "choose with --correspondences or --keypoints" in capsys.readouterr().err
@@ -123,39 +116,7 @@ def test_a_recording_of_everything(
     assert np.allclose(one.positions, other.positions[2:], atol=0.01)
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "text"),
-    [
-        (["keypoints"], 1, "has /cam/keypoints and no map; give one with --map"),
-        (
-            ["keypoints", "--map", "nowhere.npz"],
-            1,
-            "map_file: nowhere.npz cannot be read: No",
-        ),
-        (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth, -p are for offline replay"),
-        (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),
-        (["all", "--keypoints", "/nowhere"], 1, "topic /nowhere does not exist"),
-        (["all", "--keypoints", "/ids", "--map-points", "/x"], 1, "topic /x does not exist"),
-    ],
-)
-def test_what_is_refused(
-    flight: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    code: int,
-    text: str,
-) -> None:
-    bag, *more = words
-    out = [] if "--ros" in more else ["--out", str(tmp_path / "out")]
-    assert main(["replay", str(flight / bag), *more, *out]) == code
-    assert text in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_simulated_recording_and_its_map(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_simulated_recording_and_its_map(tmp_path, monkeypatch, capsys):
     """The line that simulate prints as the next one works, and gives the true poses."""
     monkeypatch.chdir(tmp_path)
     assert main(["simulate", "flight", "--keypoints", "--duration", "0.4", "--points", "200"]) == 0

@@ -1,7 +1,5 @@
 """``replay --rerun``: what the file holds, read back, and that nothing else changes."""
 
-from __future__ import annotations
-
 import filecmp
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.cli import replay
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.estimates import read_motions
@@ -25,7 +22,7 @@ FRAMES = 7
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flight(tmp_path_factory) -> Path:
     """A flight with images."""
     folder = tmp_path_factory.mktemp("bags")
     words = ["--rate", "10", "--duration", "0.65", "--outliers", "0.2", "--noise", "0.5"]
@@ -41,7 +38,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def shown(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def shown(flight, tmp_path_factory) -> tuple[Path, dict[str, Any]]:
     """The result, and all that its file for the viewer holds, by entity."""
     out = tmp_path_factory.mktemp("out") / "seen"
     assert main(["replay", str(flight), *SHUTTER, "--out", str(out), "--rerun"]) == 0
@@ -62,9 +59,7 @@ def values(found: dict[str, Any], path: str, column: str) -> list[Any]:
     return [value for _, value in sorted(rows, key=lambda row: row[0])]
 
 
-def test_poses_and_velocities_are_those_of_the_result(
-    shown: tuple[Path, dict[str, Any]],
-) -> None:
+def test_poses_and_velocities_are_those_of_the_result(shown):
     out, found = shown
     motions = read_motions(out)
     assert motions.twists is not None
@@ -80,7 +75,7 @@ def test_poses_and_velocities_are_those_of_the_result(
     np.testing.assert_allclose(path, motions.poses.positions, atol=1e-5)
 
 
-def test_matches_are_inliers_or_others(shown: tuple[Path, dict[str, Any]]) -> None:
+def test_matches_are_inliers_or_others(shown):
     _, found = shown
     inliers = values(found, paths.MATCHES, "Points2D:positions")
     rest = values(found, paths.OTHERS, "Points2D:positions")
@@ -92,57 +87,14 @@ def test_matches_are_inliers_or_others(shown: tuple[Path, dict[str, Any]]) -> No
     assert len(values(found, paths.IMAGE, "EncodedImage:blob")) == FRAMES
 
 
-def test_nothing_else_changes(
-    flight: Path, shown: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_nothing_else_changes(flight, shown, tmp_path):
     assert main(["replay", str(flight), *SHUTTER, "--out", str(tmp_path / "plain")]) == 0
     for name in ("poses.txt", "twists.txt", "result/result.mcap"):
         assert filecmp.cmp(tmp_path / "plain" / name, shown[0] / name, shallow=False)
     assert not (tmp_path / "plain" / "view.rrd").exists()
 
 
-def test_a_name_of_one_s_own_is_in_the_current_directory(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["replay", str(flight), *SHUTTER, "--out", "out", "--rerun", "view.rrd"]) == 0
-    assert (tmp_path / "view.rrd").is_file()
-    assert not (tmp_path / "out" / "view.rrd").exists()
-
-
-def test_a_file_that_cannot_be_written_is_one_line(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["--out", str(tmp_path / "out"), "--rerun", str(tmp_path / "no" / "where.rrd")]
-    assert main(["replay", str(flight), *SHUTTER, *words]) == 1
-    assert "where.rrd cannot be written: No such file" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", "--rerun", "flight", "other"]) == 2
-    assert "--rerun FILE must end in .rrd, got flight (a recording" in capsys.readouterr().err
-    assert main(["replay", "a", "b", "--out", "o", "--view"]) == 2
-    assert "--rerun and --view show one recording" in capsys.readouterr().err
-
-
-def test_without_the_sdk_one_sentence_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, flight: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(replay.importlib.util, "find_spec", lambda name: None)
-    assert main(["replay", str(flight), "--view"]) == 1
-    assert capsys.readouterr().err == (
-        "rs_localizer replay: --rerun and --view need the Rerun SDK, which is not installed: "
-        "pip install 'rs_localizer[view]'\n"
-    )
-
-
-def test_without_a_screen_nothing_begins(
-    monkeypatch: pytest.MonkeyPatch,
-    flight: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_without_a_screen_nothing_begins(monkeypatch, flight, tmp_path, capsys):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     out = tmp_path / "out"

@@ -1,19 +1,14 @@
 """rs_localizer warm: kernels are there, or the exit code says that they are not."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.simd.jit import cache_directory
 
 
-def test_it_says_where_the_kernels_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_says_where_the_kernels_are(capsys):
     assert main(["warm", "--solver", "p3p"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line[:10].strip() for line in lines[:2]] == ["markers", "solver p3p"]
@@ -21,7 +16,7 @@ def test_it_says_where_the_kernels_are(capsys: pytest.CaptureFixture[str]) -> No
     assert list(cache_directory().rglob("*.nbc"))
 
 
-def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path: Path) -> None:
+def test_kernels_that_cannot_be_kept_are_a_failure(tmp_path):
     (tmp_path / "cache").write_text("a file in its place")
     done = subprocess.run(
         [sys.executable, "-m", "rs_localizer", "warm", "--solver", "p3p"],

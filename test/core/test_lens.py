@@ -66,7 +66,7 @@ def test_pixels_are_those_of_the_point_that_moves_farthest():
     assert lens.pixels == pytest.approx(400.0 * (0.05 * far**3 - 0.055 * far**5), rel=0.01)
 
 
-def test_what_a_wrong_focal_length_moves_is_said() -> None:
+def test_what_a_wrong_focal_length_moves_is_said():
     # It was 0.0 px: only the radial part counted. At the corner 3 % are 0.03 times its distance.
     given = Camera(640, 480, np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]]))
     corner = given.focal_length * corner_of(given)

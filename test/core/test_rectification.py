@@ -1,7 +1,5 @@
 """Rectified pixels are those of a global shutter, by a projector of the test's own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -39,7 +37,7 @@ def seen(camera: rsl.Camera, point: Any) -> tuple[Any, float]:
 @pytest.mark.parametrize("tau", [0.0, -0.5, 0.37])
 @pytest.mark.parametrize("D", [[], [-0.2, 0.05, 1e-3, -1e-3]])
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_with_depths_pixels_are_exact(tau: float, D: list[float], direction: str) -> None:
+def test_with_depths_pixels_are_exact(tau, D, direction):
     camera = rsl.Camera(640, 480, K, D, readout_time=0.03, scan_direction=direction)
     found = [seen(camera, point) for point in POINTS]
     pixels, depths = np.array([p for p, _ in found]), np.array([d for _, d in found])
@@ -49,7 +47,7 @@ def test_with_depths_pixels_are_exact(tau: float, D: list[float], direction: str
     assert np.abs(pixels - expected).max() > 10.0  # there is something to undo
 
 
-def test_without_depths_it_is_exact_for_what_is_far_away() -> None:
+def test_without_depths_it_is_exact_for_what_is_far_away():
     camera = rsl.Camera(640, 480, K, readout_time=0.03)
     far = 1e6 * POINTS
     pixels = np.array([seen(camera, point)[0] for point in far])
@@ -60,7 +58,7 @@ def test_without_depths_it_is_exact_for_what_is_far_away() -> None:
     )
 
 
-def test_what_does_not_move_stays() -> None:
+def test_what_does_not_move_stays():
     camera = rsl.Camera(640, 480, K, [-0.2, 0.05, 0, 0])
     still = rsl.Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
     pixels = RNG.uniform([0, 0], [639, 479], (50, 2))
@@ -80,13 +78,13 @@ def test_what_does_not_move_stays() -> None:
         ([[1.0, 2.0]], None, np.nan, "tau must be finite"),
     ],
 )
-def test_bad_input_is_refused(pixels: Any, depths: Any, tau: float, text: str) -> None:
+def test_bad_input_is_refused(pixels, depths, tau, text):
     with pytest.raises(ValueError, match=text):
         rsl.rectify(rsl.Camera(640, 480, K), MOTION, pixels, depths, tau)
 
 
 @pytest.mark.parametrize("tau", [0.0, -0.5, 0.3])
-def test_states_are_derivatives_of_the_poses(tau: float) -> None:
+def test_states_are_derivatives_of_the_poses(tau):
     """Position and velocities in SI units, against finite differences of the motion."""
     readout, step = 0.02, 1e-6
     camera = rsl.Camera(640, 480, K, readout_time=readout)

@@ -1,12 +1,10 @@
 """What comes with the package can be read and is what its attribution says."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
 
-from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
+from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from rs_localizer import data
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
@@ -15,7 +13,7 @@ from rs_localizer.io.trajectories import read_tum, split_at_gaps
 from rs_localizer.settings import build, load_params_file
 
 
-def test_webcam_recording() -> None:
+def test_webcam_recording():
     with open_bag(data.path(data.WEBCAM)) as bag:
         (info, *_) = (message for _, _, message in bag.messages(["/camera_info"]))
         clouds = [read_correspondences(m) for _, _, m in bag.messages(["/correspondences"])]
@@ -44,22 +42,14 @@ def test_webcam_recording() -> None:
     assert build(parameters).readout_time == pytest.approx(0.33 / 30, rel=0.01)
 
 
-def test_hand_motion() -> None:
+def test_hand_motion():
     trajectory = read_tum(data.path(data.HAND_MOTION))
     assert len(trajectory) == 16999
     assert trajectory.stamps_ns[0] == 1_520_531_467_575_280_000
     assert len(split_at_gaps(trajectory)) == 14
 
 
-def test_slow_hand_motion() -> None:
-    trajectory = read_tum(SLOW_HAND_MOTION)
-    assert len(trajectory) == 3000
-    speeds = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    seconds = np.diff(trajectory.stamps_ns) * 1e-9
-    assert np.median(speeds / seconds) == pytest.approx(0.33, abs=0.1)
-
-
-def test_global_shutter_tags() -> None:
+def test_global_shutter_tags():
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         (info, *_) = (message for _, _, message in bag.messages(["/camera/camera_info"]))
         clouds = [read_correspondences(m) for _, _, m in bag.messages(["/camera/correspondences"])]
@@ -76,7 +66,7 @@ def test_global_shutter_tags() -> None:
     assert np.median(residuals) < 0.4
 
 
-def test_everything_is_attributed_and_small() -> None:
+def test_everything_is_attributed_and_small():
     root = data.path(".")
     files = [file for file in root.rglob("*") if file.is_file() and file.suffix != ".pyc"]
     assert sum(file.stat().st_size for file in files) < 6_000_000
@@ -85,8 +75,3 @@ def test_everything_is_attributed_and_small() -> None:
             text = (folder / "ATTRIBUTION.md").read_text()
             licences = ("CC BY 4.0", "CC0", "Apache License, Version 2.0")
             assert any(licence in text for licence in licences)
-
-
-def test_missing_data_is_named() -> None:
-    with pytest.raises(FileNotFoundError, match=r"absent is missing: .*installed without its data"):
-        data.path("absent")

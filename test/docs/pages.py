@@ -1,7 +1,5 @@
 """The pages that users read, taken apart: headings, links, code, tables."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every command that README and docs show can be understood by the program that it calls."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import importlib.util
@@ -33,14 +31,14 @@ _MODULES = [
 _LAUNCHES = [(page, line) for page, line in LINES if line.startswith("ros2 launch rs_localizer ")]
 
 
-def test_commands_are_found() -> None:
+def test_commands_are_found():
     assert len(_OURS) > 40
     assert len(_MODULES) > 8
     assert len(_LAUNCHES) > 4
 
 
 @pytest.mark.parametrize(("page", "words"), _OURS)
-def test_commands_and_options_exist(page: str, words: str) -> None:
+def test_commands_and_options_exist(page, words):
     if words.startswith("COMMAND"):
         return
     name, *rest = shlex.split(words)
@@ -53,7 +51,7 @@ def test_commands_and_options_exist(page: str, words: str) -> None:
 
 
 @pytest.mark.parametrize(("page", "module", "words"), _MODULES)
-def test_modules_exist(page: str, module: str, words: str) -> None:
+def test_modules_exist(page, module, words):
     assert importlib.util.find_spec(module) is not None, page
     if module == "pytest":
         for word in shlex.split(words):
@@ -64,7 +62,7 @@ def test_modules_exist(page: str, module: str, words: str) -> None:
 
 
 @pytest.mark.parametrize(("page", "line"), _LAUNCHES)
-def test_launch_files_exist(page: str, line: str) -> None:
+def test_launch_files_exist(page, line):
     file, *arguments = shlex.split(line)[3:]
     if file == "...":
         return
@@ -84,14 +82,14 @@ def test_launch_files_exist(page: str, line: str) -> None:
 
 
 @pytest.mark.parametrize("page", pages.NAMES)
-def test_commands_in_sentences_exist(page: str) -> None:
+def test_commands_in_sentences_exist(page):
     said = pages.names_in(pages.prose(page))
     called = {words.split()[1] for words in said if re.match(r"rs_localizer [a-z]", words)}
     assert called <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("page", pages.NAMES)
-def test_targets_of_make_exist(page: str) -> None:
+def test_targets_of_make_exist(page):
     known = re.findall(r"^(\w+):", (pages.ROOT / "Makefile").read_text(), re.MULTILINE)
     used = [line.split()[1] for line in pages.shell(page) if re.match(r"make \w", line)]
     assert set(used) <= set(known)

@@ -1,7 +1,5 @@
 """The Python examples of README and docs run, page by page, with what a reader would have."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -38,7 +36,7 @@ def images() -> list[tuple[int, Array, Array]]:
 
 
 @pytest.mark.parametrize("page", WITH_EXAMPLES)
-def test_examples_run(page: str, images: list[tuple[int, Array, Array]]) -> None:
+def test_examples_run(page, images):
     _, points, pixels = images[0]
     reader: dict[str, Any] = {
         "K": K, "D": np.zeros(5), "points": points, "pixels": pixels, "camera": CAMERA,

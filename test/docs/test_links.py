@@ -1,15 +1,14 @@
 """Every link of README and docs leads somewhere."""
 
-from __future__ import annotations
-
 import re
+import runpy
 
 import pages
 import pytest
 
 
 @pytest.mark.parametrize("page", pages.NAMES)
-def test_links_lead_to_files_and_headings(page: str) -> None:
+def test_links_lead_to_files_and_headings(page):
     wrong = []
     for link in pages.links(page):
         if link.startswith(("http://", "https://", "mailto:")):
@@ -24,7 +23,7 @@ def test_links_lead_to_files_and_headings(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", pages.NAMES)
-def test_files_and_folders_that_are_named_exist(page: str) -> None:
+def test_files_and_folders_that_are_named_exist(page):
     """`rs_localizer/.../x.py`, `test/...`, `docs/...`, `config/...`, `launch/...`."""
     known = r"(?:rs_localizer/\w+[./]|test/|docs/|config/|launch/|\.ci/)[\w./-]*"
     named = {name for name in pages.names_in(pages.prose(page)) if re.fullmatch(known, name)}
@@ -32,7 +31,7 @@ def test_files_and_folders_that_are_named_exist(page: str) -> None:
     assert missing == set()
 
 
-def test_every_page_can_be_reached_from_the_readme() -> None:
+def test_every_page_can_be_reached_from_the_readme():
     reached, waiting = set(), ["README.md"]
     while waiting:
         page = waiting.pop()
@@ -45,19 +44,28 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
     assert reached == set(pages.NAMES)
 
 
-def test_the_readme_is_short() -> None:
-    assert len(pages.text("README.md").splitlines()) <= 140
-
-
-def test_modules_that_the_architecture_names_exist() -> None:
+def test_modules_that_the_architecture_names_exist():
     modules = {n for n in pages.names_in(pages.prose("docs/architecture.md")) if n.endswith(".py")}
     assert len(modules) > 20
     inside = {name for name in modules if not (pages.ROOT / name).is_file()}
     assert {name for name in inside if not (pages.ROOT / "rs_localizer" / name).is_file()} == set()
 
 
-def test_the_tree_of_the_architecture_is_that_of_the_package() -> None:
+def test_the_tree_of_the_architecture_is_that_of_the_package():
     (tree,) = pages.fenced("docs/architecture.md", "text")
     named = {line.split()[0].rstrip("/") for line in tree.splitlines()[1:]}
     parts = {path.name for path in (pages.ROOT / "rs_localizer").iterdir()}
     assert named == {name for name in parts if name not in ("__pycache__", "compiled", "py.typed")}
+
+
+def test_the_ten_files_to_read_first_are_short():
+    (table,) = [t for t in pages.tables("docs/architecture.md") if "you learn" in t.columns]
+    files = [pages.ROOT / "rs_localizer" / pages.names_in(name)[0] for name in table.column("file")]
+    assert len(files) == 10
+    assert sum(len(file.read_text().splitlines()) for file in files) < 3000
+
+
+def test_pictures_are_what_their_script_draws():
+    drawn = runpy.run_path(str(pages.ROOT / "docs" / "pictures.py"))["PICTURES"]
+    for name, draw in drawn.items():
+        assert (pages.ROOT / "docs" / name).read_text(encoding="utf-8") == draw(), name

@@ -1,7 +1,5 @@
 """Tables of README and docs that repeat the code say what the code says."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator
@@ -14,7 +12,7 @@ from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.health import State
 from rs_localizer.settings import Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
@@ -40,7 +38,7 @@ def documented(where: set[str]) -> Iterator[tuple[str, str, str]]:
 
 
 @pytest.mark.parametrize(("kind", "where"), OF_NODES)
-def test_every_parameter_is_in_a_table_with_its_default(kind: Kind, where: set[str]) -> None:
+def test_every_parameter_is_in_a_table_with_its_default(kind, where):
     known = settings(kind)
     rows = [row for row in documented(where) if "*" not in row[1]]
     assert {name for _, name, _ in rows} == set(known)
@@ -58,19 +56,19 @@ def read(cell: str, like: Any) -> Any:
     return said.strip('"') if isinstance(like, str) else type(like)(said)
 
 
-def test_the_table_of_solvers() -> None:
+def test_the_table_of_solvers():
     (table,) = [t for t in pages.all_tables("`solver`", "points") if t.page == "docs/solvers.md"]
     said = {pages.names_in(row[0])[0]: (int(row[1]), int(row[2])) for row in table.rows}
     solvers = {name: find_solver(name) for name in SOLVERS}
     assert said == {name: (it.sample_size, it.solutions) for name, it in solvers.items()}
 
 
-def test_figures_are_of_solvers_that_exist() -> None:
+def test_figures_are_of_solvers_that_exist():
     (table,) = [t for t in pages.all_tables("`solver`", "µs") if t.page == "docs/benchmarks.md"]
     assert {name for row in table.rows for name in pages.names_in(row[0])} <= set(SOLVERS)
 
 
-def test_the_topics_of_the_localizer() -> None:
+def test_the_topics_of_the_localizer():
     (table,) = [t for t in pages.all_tables("topic or service") if t.page == "docs/node.md"]
     said = {pages.names_in(row[1])[0]: (row[0], row[2]) for row in table.rows}
     unused: Any = None
@@ -84,8 +82,8 @@ def test_the_topics_of_the_localizer() -> None:
     assert sent == {name: kind.replace("/msg/", "/") for name, kind in TYPES.items()}
 
 
-def test_the_diagram_of_the_readme_has_every_topic() -> None:
-    (diagram,) = pages.fenced("README.md", "mermaid")
+def test_the_diagram_of_the_node_has_every_topic():
+    (diagram,) = pages.fenced("docs/node.md", "mermaid")
     unused: Any = None
     for name in Feed(unused, unused, unused, unused).topics():
         assert name in diagram
@@ -99,7 +97,7 @@ def literals() -> Iterator[tuple[str, ast.AST]]:
             yield str(path), node
 
 
-def test_every_notice_is_explained_and_given_somewhere() -> None:
+def test_every_notice_is_explained_and_given_somewhere():
     (table,) = pages.all_tables("notice")
     assert {name for cell in table.column("notice") for name in pages.names_in(cell)} == set(Notice)
     given = {
@@ -110,13 +108,13 @@ def test_every_notice_is_explained_and_given_somewhere() -> None:
     assert given == {notice.name for notice in Notice}
 
 
-def test_every_state_is_explained() -> None:
+def test_every_state_is_explained():
     page = pages.text("docs/reasons.md").split("## States of the localizer")[1]
     rows = [line.split("|")[2] for line in page.splitlines() if line.startswith("| ")]
     said = {name.partition(" for ")[0] for cell in rows for name in pages.names_in(cell)}
     assert said == {state.removesuffix(" for") for state in State}
 
 
-def test_commands_are_all_told_of() -> None:
+def test_commands_are_all_told_of():
     told = "\n".join(line for page in pages.NAMES for line in pages.shell(page))
     assert {name for name in COMMANDS if f"rs_localizer {name}" not in told} <= {"demo"}

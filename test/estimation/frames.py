@@ -1,7 +1,5 @@
 """Frames of a box of points, made by the tests' own projection, and what is assumed of them."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """What errors of the calibration do to poses, and that their covariances say so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

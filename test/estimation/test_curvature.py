@@ -1,7 +1,5 @@
 """A camera that may have turned about what it sees is somewhere on an arc, not on its tangent."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -28,7 +26,7 @@ def step_covariance(turn, seen):
     return covariance
 
 
-def test_the_second_order_is_that_of_cameras_on_the_arc() -> None:
+def test_the_second_order_is_that_of_cameras_on_the_arc():
     rng = np.random.default_rng(0)
     turn, seen = TURNS @ TURNS, MOVES @ MOVES
     covariance = step_covariance(turn, seen)
@@ -43,13 +41,13 @@ def test_the_second_order_is_that_of_cameras_on_the_arc() -> None:
     assert not np.any(added)  # the turn is what it was, and so is all else
 
 
-def test_where_the_orientation_is_known_nothing_is_added() -> None:
+def test_where_the_orientation_is_known_nothing_is_added():
     covariance = step_covariance(1e-8 * np.eye(3), 1e-8 * np.eye(3))
     added = along_arcs(covariance, CENTRE) - covariance
     assert np.abs(added).max() < 1e-6 * covariance[3, 3]
 
 
-def test_steps_from_one_state_are_told_from_another() -> None:
+def test_steps_from_one_state_are_told_from_another():
     rng = np.random.default_rng(1)
     here = np.concatenate(
         [Rotation.random(random_state=1).as_matrix().ravel(), rng.normal(size=15)]
@@ -68,7 +66,7 @@ def test_steps_from_one_state_are_told_from_another() -> None:
 
 
 @pytest.mark.bench
-def test_regions_before_a_small_tilted_plane_hold_under_motion() -> None:
+def test_regions_before_a_small_tilted_plane_hold_under_motion():
     """Along the ellipsoid's own axes they held in half of the frames."""
     found = judge(named("planes/0.6m/tilt 30/10deg/1px"), 40, 2, {})
     assert np.mean(found.localized) > 0.8

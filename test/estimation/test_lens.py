@@ -8,13 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.honesty.estimating import (
-    believed,
-    estimate,
-    frames_of,
-    scored,
-    truth_of,
-)
+from benchmarks.honesty.estimating import believed, estimate, frames_of, scored, truth_of
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import hand, vibration
 from benchmarks.independent.rotations import logarithm

@@ -1,9 +1,5 @@
 """Answers beside the truth: what is compared, what is counted, and the table of it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from matplotlib.quiver import Quiver
@@ -35,7 +31,7 @@ MIDDLE_NS = 15_000_000
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def recording(tmp_path_factory) -> Recording:
     """A simulated recording of 30 frames that turns by 200 deg/s."""
     bag = tmp_path_factory.mktemp("comparison") / "bag"
     rate = str(np.radians(200.0))
@@ -67,23 +63,14 @@ def answers(recording: Recording, *, moving: bool, shift: float) -> dict[int, An
 
 
 @pytest.fixture
-def results(recording: Recording) -> dict[str, Result]:
+def results(recording) -> dict[str, Result]:
     return {
         "good": compare(answers(recording, moving=True, shift=0.002), recording.truth),
         "bad": compare(answers(recording, moving=False, shift=0.05), recording.truth),
     }
 
 
-def test_recording_is_read_as_a_whole_or_in_part(tmp_path: Path) -> None:
-    assert main(["simulate", str(tmp_path / "bag"), "--duration", "0.5"]) == 0
-    whole, part = load_recording(tmp_path / "bag"), load_recording(tmp_path / "bag", 4)
-    assert (len(whole.clouds), len(part.clouds)) == (15, 4)
-    assert len(whole.camera_infos) == 15
-    assert None not in whole.camera_infos
-    assert part.stamps_ns == whole.stamps_ns[:4]
-
-
-def test_errors_and_counts(recording: Recording, results: dict[str, Result]) -> None:
+def test_errors_and_counts(recording, results):
     good, bad = results["good"], results["bad"]
     assert good.errors is not None
     assert bad.errors is not None
@@ -100,7 +87,7 @@ def test_errors_and_counts(recording: Recording, results: dict[str, Result]) -> 
     assert counts.sum() == 2 * (len(recording.stamps_ns) - 1)
 
 
-def test_table(recording: Recording, results: dict[str, Result]) -> None:
+def test_table(recording, results):
     text = table("A flight", recording, results)
     lines = {line[:44].strip(): line[44:].split() for line in text.splitlines()}
     assert all(len(line) <= 80 for line in text.splitlines())
@@ -117,7 +104,7 @@ def test_table(recording: Recording, results: dict[str, Result]) -> None:
     assert "error" not in table("A flight", blind, {"good": compare({}, None)})
 
 
-def test_pictures(recording: Recording, results: dict[str, Result], tmp_path: Path) -> None:
+def test_pictures(recording, results, tmp_path):
     """They are drawn at all, also where a method has no answer."""
     matches = np.full(len(recording.stamps_ns), 105.0)
     assert recording.truth is not None
@@ -135,7 +122,7 @@ def project(camera: Camera, points: Array, rotation: Rotation, centre: Array) ->
     return camera.project(rotation.inv().apply(points - centre))
 
 
-def test_predicted_pixels_move_with_the_rows() -> None:
+def test_predicted_pixels_move_with_the_rows():
     K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
     camera = Camera(640, 480, K, readout_time=0.03)
     rng = np.random.default_rng(0)
@@ -155,7 +142,7 @@ def test_predicted_pixels_move_with_the_rows() -> None:
 
 
 @pytest.mark.parametrize(("residual", "enlarged"), [(0.11, "500"), (3.0, "20"), (700.0, "0.1")])
-def test_arrows_stay_inside(residual: float, enlarged: str) -> None:
+def test_arrows_stay_inside(residual, enlarged):
     """All the points lie at the border of the image, and the arrows point outwards."""
     pixels = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
     outwards = (pixels - pixels.mean(axis=0)) / np.linalg.norm(pixels[2] / 2)

@@ -1,7 +1,5 @@
 """The cube is drawn where its points are, each at its own row's pose; animations can be played."""
 
-from __future__ import annotations
-
 import io
 
 import cv2
@@ -32,7 +30,7 @@ def drawn(motion: Motion) -> np.ndarray:
     return picture[..., 0]
 
 
-def test_cube_stands_on_the_marker_toward_the_viewer() -> None:
+def test_cube_stands_on_the_marker_toward_the_viewer():
     corners = cube_on(MARKER).corners
     sides = np.linalg.norm(corners[[1, 2, 4]] - corners[0], axis=1)
     np.testing.assert_allclose(sides, 0.6)
@@ -40,7 +38,7 @@ def test_cube_stands_on_the_marker_toward_the_viewer() -> None:
     np.testing.assert_allclose(corners[:4].mean(axis=0), MARKER.pose.position)
 
 
-def test_every_edge_is_drawn_where_the_rows_see_it() -> None:
+def test_every_edge_is_drawn_where_the_rows_see_it():
     picture, corners = drawn(MOVING), cube_on(MARKER).corners
     share = np.linspace(0.0, 1.0, 15)[:, None]
     for a in range(8):
@@ -63,12 +61,12 @@ def test_every_edge_is_drawn_where_the_rows_see_it() -> None:
     assert v.max() < all_seen[:, 1].max() + 5
 
 
-def test_a_cube_behind_the_camera_is_not_drawn() -> None:
+def test_a_cube_behind_the_camera_is_not_drawn():
     behind = Motion(np.eye(3), np.array([0.0, 0.0, -2.7]), np.zeros(3), np.zeros(3))
     assert not drawn(behind).any()
 
 
-def test_animation_can_be_played() -> None:
+def test_animation_can_be_played():
     pictures = []
     for k in range(6):
         left = np.full((48, 64, 3), 200, np.uint8)

@@ -1,7 +1,5 @@
 """The clip of the demo: which markers count as visible, and how far the cube is off."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -30,11 +28,11 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
         (np.where(SQUARE > 0.5, np.nan, 100.0), False),  # behind the camera
     ],
 )
-def test_what_is_visible(quad: np.ndarray, expected: bool) -> None:
+def test_what_is_visible(quad, expected):
     assert visible(np.array([quad]), (640, 480)).tolist() == [expected]
 
 
-def test_a_turned_pose_puts_the_cube_off() -> None:
+def test_a_turned_pose_puts_the_cube_off():
     walls = MarkerWalls(read_tum(data.path(data.HAND_MOTION)), 0)
     middle, away = (middle_stamp(CAMERA, clip_stamps(walls)[k]) for k in (90, 60))
     state, cube = walls.motion.state(middle, np.zeros(1)), clip_cube(walls)

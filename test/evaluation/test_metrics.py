@@ -1,7 +1,5 @@
 """Errors of known size are found, and only frames of the same time are compared."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +12,7 @@ ROTATIONS = Rotation.from_quat(RNG.normal(size=(10, 4)))
 TRUTH = Trajectory(STAMPS, RNG.normal(size=(10, 3)), ROTATIONS.as_quat())
 
 
-def test_associate_takes_the_nearest_within_the_tolerance() -> None:
+def test_associate_takes_the_nearest_within_the_tolerance():
     true = np.array([10, 20, 30, 40], np.int64)
     estimated = np.array([0, 8, 16, 25, 30, 33, 47], np.int64)
     rows, true_rows = associate(estimated, true, 5)
@@ -24,7 +22,7 @@ def test_associate_takes_the_nearest_within_the_tolerance() -> None:
     assert (rows.tolist(), true_rows.tolist()) == ([4], [2])
 
 
-def test_pose_errors_are_in_metres_and_degrees() -> None:
+def test_pose_errors_are_in_metres_and_degrees():
     # Rotations about different axes by 5 degrees, in the body's own axes; a sign means nothing.
     axes = RNG.normal(size=(10, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -37,13 +35,13 @@ def test_pose_errors_are_in_metres_and_degrees() -> None:
     assert len(pose_errors(moved.part(slice(3, 6)), TRUTH).linear) == 3
 
 
-def test_pose_errors_need_a_common_time() -> None:
+def test_pose_errors_need_a_common_time():
     later = Trajectory(STAMPS + 1, TRUTH.positions, TRUTH.quaternions)
     assert len(pose_errors(later, TRUTH).angular) == 0
     np.testing.assert_allclose(pose_errors(later, TRUTH, 1).angular, 0.0, atol=1e-5)
 
 
-def test_twist_errors() -> None:
+def test_twist_errors():
     angular, linear = RNG.normal(size=(10, 3)), RNG.normal(size=(10, 3))
     true = Twists(STAMPS, angular, linear)
     off = Twists(STAMPS, angular + np.array([0.0, 0.03, 0.04]), linear - np.array([0.6, 0, 0.8]))

@@ -1,7 +1,5 @@
 """What pictures show: titles, ranges that one outlier does not stretch, contrast, no blank band."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rs_localizer.evaluation import plots
@@ -22,7 +20,7 @@ def luminance(color: str) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def test_one_outlier_stretches_no_axis() -> None:
+def test_one_outlier_stretches_no_axis():
     far = WAY.copy()
     far[50] = [400.0, -300.0, 90.0]
     figure = plots.trajectories(None, {"r6p_vcwt": Trajectory(STAMPS, far, STILL)})

@@ -1,7 +1,5 @@
 """Clocks that differ are found from the motion; frames that differ are laid over each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -38,7 +36,7 @@ def estimate(truth: Trajectory, noise: float = 0.1) -> Trajectory:
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.012, 1.0, -1.7e9])
-def test_offsets_are_found(truth: Trajectory, offset: float) -> None:
+def test_offsets_are_found(truth, offset):
     found = estimate_offset(shifted(estimate(truth), -offset), truth)
     assert found is not None
     assert found.seconds == pytest.approx(offset, abs=5e-4)
@@ -48,7 +46,7 @@ def test_offsets_are_found(truth: Trajectory, offset: float) -> None:
         assert found.before > 5.0
 
 
-def test_an_offset_is_found_in_another_frame(truth: Trajectory) -> None:
+def test_an_offset_is_found_in_another_frame(truth):
     """A map that was made elsewhere: the poses do not fit, their speeds do."""
     turn = Rotation.from_rotvec([0.3, -2.0, 1.0])
     other = Trajectory(
@@ -60,7 +58,7 @@ def test_an_offset_is_found_in_another_frame(truth: Trajectory) -> None:
     assert found.seconds == pytest.approx(-0.5, abs=0.02)
 
 
-def test_another_motion_has_none(truth: Trajectory) -> None:
+def test_another_motion_has_none(truth):
     recorded = read_tum(data.path(data.HAND_MOTION))
     seconds = (recorded.stamps_ns - recorded.stamps_ns[0]) * 1e-9
     other = recorded.part((seconds > 60.0) & (seconds < 70.0))
@@ -68,7 +66,7 @@ def test_another_motion_has_none(truth: Trajectory) -> None:
     assert estimate_offset(truth.part(slice(0, 3)), truth) is None
 
 
-def test_positions_on_a_line_do_not_spoil_orientations(truth: Trajectory) -> None:
+def test_positions_on_a_line_do_not_spoil_orientations(truth):
     """Along a straight way positions leave the turn about it open; orientations do not."""
     count = 100
     rng = np.random.default_rng(1)
@@ -85,7 +83,7 @@ def test_positions_on_a_line_do_not_spoil_orientations(truth: Trajectory) -> Non
     assert np.abs(found.positions - true.positions).max() < 0.01
 
 
-def test_positions_decide_where_they_say_more() -> None:
+def test_positions_decide_where_they_say_more():
     """Orientations all off by 10 deg, as between two bodies, do not tilt the map."""
     rng = np.random.default_rng(2)
     positions = rng.normal(size=(50, 3))
@@ -97,7 +95,7 @@ def test_positions_decide_where_they_say_more() -> None:
     np.testing.assert_allclose(found.positions, positions, atol=0.02)
 
 
-def test_still_cameras_are_aligned_by_their_orientations() -> None:
+def test_still_cameras_are_aligned_by_their_orientations():
     turns = Rotation.random(20, random_state=1)
     stamps = np.arange(20, dtype=np.int64)
     true = Trajectory(stamps, np.zeros((20, 3)), turns.as_quat())

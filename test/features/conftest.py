@@ -1,7 +1,5 @@
 """Pictures whose points are known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -33,7 +31,7 @@ def texture() -> Any:
 
 
 @pytest.fixture(scope="session")
-def look(texture: Any) -> Callable[[float, float, tuple[float, float]], tuple[Any, Any]]:
+def look(texture) -> Callable[[float, float, tuple[float, float]], tuple[Any, Any]]:
     """An image (300,400) of the texture, and the texels (3,3) of its pixels."""
 
     def look(angle: float, scale: float, shift: tuple[float, float]) -> tuple[Any, Any]:

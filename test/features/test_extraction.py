@@ -1,16 +1,13 @@
 """Keypoints lie where the picture has them, and are described as COLMAP does."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.features import methods
-from rs_localizer.features.extraction import FeatureExtractor, Features
-from rs_localizer.features.methods import FeatureError
+from rs_localizer.features import extraction
+from rs_localizer.features.extraction import FeatureError, FeatureExtractor, Features
 
 # OpenCV 5 has AKAZE in its contrib modules only.
 KINDS = [
@@ -37,7 +34,7 @@ def mutual(ours: Any, others: Any, kind: str) -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize("kind", [KINDS[0], KINDS[2]])
-def test_blobs_are_found_in_their_middle(kind: str, blobs: Any) -> None:
+def test_blobs_are_found_in_their_middle(kind, blobs):
     image, middles = blobs
     found = FeatureExtractor(kind, 1000).extract(image)
     off = found.pixels[:, None] - middles
@@ -50,7 +47,7 @@ def test_blobs_are_found_in_their_middle(kind: str, blobs: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_two_images_show_the_same_points(kind: str, look: Any) -> None:
+def test_two_images_show_the_same_points(kind, look):
     (one, to_one), (two, to_two) = look(0.0, 1.5, (0, 0)), look(0.1, 1.9, (3.3, -2.6))
     extractor = FeatureExtractor(kind, 600)
     a, b = extractor.extract(one), extractor.extract(two)
@@ -68,7 +65,7 @@ def test_two_images_show_the_same_points(kind: str, look: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_same_image_gives_the_same_bits(kind: str, look: Any) -> None:
+def test_the_same_image_gives_the_same_bits(kind, look):
     image, _ = look(0.0, 1.5, (0, 0))
 
     def bits(found: Features) -> list[bytes]:
@@ -84,7 +81,7 @@ def test_the_same_image_gives_the_same_bits(kind: str, look: Any) -> None:
     assert results[0] == results[1] == results[2]
 
 
-def test_sift_is_colmaps(look: Any) -> None:
+def test_sift_is_colmaps(look):
     pycolmap = pytest.importorskip("pycolmap")
     image, _ = look(0.0, 1.5, (0, 0))
     theirs, values = pycolmap.Sift().extract(image)
@@ -102,7 +99,7 @@ def test_sift_is_colmaps(look: Any) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(1, 1), (1, 300), (15, 40), (16, 16), (17, 200), (33, 64)])
-def test_small_images(kind: str, shape: tuple[int, int]) -> None:
+def test_small_images(kind, shape):
     noise = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     extractor = FeatureExtractor(kind, 50)
     for image in (noise, np.zeros(shape, np.uint8)):
@@ -112,9 +109,9 @@ def test_small_images(kind: str, shape: tuple[int, int]) -> None:
         assert np.all((found.pixels > -1.0) & (found.pixels < np.array(shape[::-1])))
 
 
-def test_what_opencv_does_not_have_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(methods.cv2, "AKAZE", raising=False)
-    monkeypatch.delattr(methods.cv2, "xfeatures2d", raising=False)
+def test_what_opencv_does_not_have_is_said(monkeypatch):
+    monkeypatch.delattr(extraction.cv2, "AKAZE", raising=False)
+    monkeypatch.delattr(extraction.cv2, "xfeatures2d", raising=False)
     with pytest.raises(FeatureError, match="has no AKAZE: take sift or orb, or install"):
         FeatureExtractor("akaze", 100)
     with pytest.raises(FeatureError, match="features must be one of sift, orb, akaze; got 'surf'"):

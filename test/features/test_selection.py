@@ -1,7 +1,5 @@
 """Every part of an image keeps some of its keypoints, and the best ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from rs_localizer.features.extraction import balanced
 
 
 @pytest.mark.parametrize("size", [(640, 480), (479, 641), (300, 1000)])
-def test_dim_parts_keep_keypoints(size: tuple[int, int]) -> None:
+def test_dim_parts_keep_keypoints(size):
     rng = np.random.default_rng(1)
     # Bright on the left tenth, dim elsewhere.
     bright = rng.uniform((0, 0), (0.1 * size[0], size[1]), (2000, 2))

@@ -1,7 +1,5 @@
 """Readings in any order, repeated, lost, from a clock that jumps: an exposure gets its own."""
 
-from __future__ import annotations
-
 import random
 import threading
 
@@ -34,7 +32,7 @@ def lack(found: Readings | Lacking) -> Lack:
     return found.lack
 
 
-def test_an_exposure_gets_its_readings_and_one_on_either_side() -> None:
+def test_an_exposure_gets_its_readings_and_one_on_either_side():
     buffer = filled(stamps(400))
     start, end = START + 501 * MS, START + 531 * MS
     found = buffer.between(start, end)
@@ -53,7 +51,7 @@ def test_an_exposure_gets_its_readings_and_one_on_either_side() -> None:
     assert buffer.rate() == pytest.approx(400.0)
 
 
-def test_what_lies_around_it_comes_as_far_as_there_is_no_gap() -> None:
+def test_what_lies_around_it_comes_as_far_as_there_is_no_gap():
     lost = range(START + 300 * MS, START + 330 * MS)
     buffer = filled([t for t in stamps(400) if t not in lost])
     start, end = START + 501 * MS, START + 531 * MS
@@ -68,7 +66,7 @@ def test_what_lies_around_it_comes_as_far_as_there_is_no_gap() -> None:
     assert (late.stamps_ns[-1] - START) / MS == 997.5
 
 
-def test_order_and_repetition_do_not_matter() -> None:
+def test_order_and_repetition_do_not_matter():
     times = stamps(400)
     mixed = [*times, *random.Random(0).sample(times, 50)]
     # Stragglers by up to 0.1 s.
@@ -82,7 +80,7 @@ def test_order_and_repetition_do_not_matter() -> None:
     assert pair[0].angular_velocities.tolist() == pair[1].angular_velocities.tolist()
 
 
-def test_readings_that_nearly_coincide_count_once() -> None:
+def test_readings_that_nearly_coincide_count_once():
     # Two drivers on one topic: between noisy readings microseconds apart a spline would swing.
     times = stamps(400)
     doubled = filled(sorted(times + [time + 1_000 for time in times]))
@@ -91,7 +89,7 @@ def test_readings_that_nearly_coincide_count_once() -> None:
     assert np.diff(found.stamps_ns).min() > 0.9 * PERIOD
 
 
-def test_what_is_missing_is_told() -> None:
+def test_what_is_missing_is_told():
     assert lack(ReadingBuffer().between(START, START + 30 * MS)) == Lack.NEVER
     buffer = filled(stamps(400))  # until 997.5 ms
     not_yet = buffer.between(START + 980 * MS, START + 1010 * MS)
@@ -116,7 +114,7 @@ def test_what_is_missing_is_told() -> None:
     assert filled(stamps(100, 10 * MS)).between(START + 100 * MS, START + 130 * MS)
 
 
-def test_a_clock_that_is_set_back_starts_over() -> None:
+def test_a_clock_that_is_set_back_starts_over():
     buffer = filled(stamps(400))
     assert not buffer.add(START - 5 * 10**9, "imu", (0.0, 0.0, 0.0))
     assert (buffer.jumps, len(buffer)) == (1, 1)
@@ -126,7 +124,7 @@ def test_a_clock_that_is_set_back_starts_over() -> None:
     assert lack(buffer.between(START + 500 * MS, START + 530 * MS)) == Lack.STOPPED
 
 
-def test_one_reading_without_force_leaves_the_turn() -> None:
+def test_one_reading_without_force_leaves_the_turn():
     buffer = filled(stamps(100))
     buffer.add(START + 100 * PERIOD, "imu", (0.0, 0.0, 0.0))
     found = buffer.between(START + 95 * PERIOD, START + 100 * PERIOD)
@@ -134,7 +132,7 @@ def test_one_reading_without_force_leaves_the_turn() -> None:
     assert found.specific_forces is None
 
 
-def test_the_end_of_the_range_is_noticed() -> None:
+def test_the_end_of_the_range_is_noticed():
     rng = np.random.default_rng(0)
     turn = 6.0 * np.sin(2.0 * np.pi * 3.0 * np.arange(400) * 2.5e-3)
     noisy = turn + 1e-3 * rng.normal(size=400)
@@ -149,15 +147,7 @@ def test_the_end_of_the_range_is_noticed() -> None:
         assert buffer.between(START + 650 * MS, START + 680 * MS)
 
 
-def test_rest_and_steady_turns_are_no_end_of_a_range() -> None:
-    for rate in (0.0, 1.5):
-        buffer = ReadingBuffer()
-        for time in stamps(100):
-            buffer.add(time, "imu", (rate, 0.0, 0.0))
-        assert buffer.between(START + 50 * MS, START + 80 * MS)
-
-
-def test_memory_is_bounded() -> None:
+def test_memory_is_bounded():
     times = stamps(20_000)
     buffer = filled(times)
     found = buffer.between(times[-20], times[-10], times[0])
@@ -172,7 +162,7 @@ def test_memory_is_bounded() -> None:
     assert rush.between(START + 399_000_000, START + 399_500_000)
 
 
-def test_readings_come_while_others_are_asked_for() -> None:
+def test_readings_come_while_others_are_asked_for():
     buffer, found = ReadingBuffer(), []
     done = threading.Event()
 

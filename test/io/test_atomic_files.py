@@ -1,23 +1,16 @@
 """Results appear whole or not at all; a disk that takes no more is named."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from rs_localizer.io.atomic_files import (
-    OutputError,
-    atomic_directory,
-    atomic_files,
-    write_errors,
-)
+from rs_localizer.io.atomic_files import OutputError, atomic_directory, atomic_files, write_errors
 from rs_localizer.io.bags import STORAGES
 
 
-def test_what_was_finished_stays(tmp_path: Path) -> None:
+def test_what_was_finished_stays(tmp_path):
     with atomic_directory(tmp_path / "out") as out:
         out.mkdir()
         (out / "a").write_text("a")
@@ -28,7 +21,7 @@ def test_what_was_finished_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no"), SystemExit(1)])
-def test_what_was_not_finished_is_gone(tmp_path: Path, error: BaseException) -> None:
+def test_what_was_not_finished_is_gone(tmp_path, error):
     def half() -> None:
         with atomic_directory(tmp_path / "out") as out:
             out.mkdir()
@@ -40,7 +33,7 @@ def test_what_was_not_finished_is_gone(tmp_path: Path, error: BaseException) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_faults_name_the_path(tmp_path: Path) -> None:
+def test_faults_name_the_path(tmp_path):
     def fill(path: Path) -> None:
         with write_errors(path), path.open("w") as file:
             file.write("a" * 100_000)
@@ -52,7 +45,7 @@ def test_faults_name_the_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", list(STORAGES))
-def test_a_full_disk_is_named_and_nothing_half_written(tmp_path: Path, storage: str) -> None:
+def test_a_full_disk_is_named_and_nothing_half_written(tmp_path, storage):
     """A limit for the size of files fails at the same place as a full disk."""
     code = (
         "import resource, sys; from rs_localizer.cli.main import main\n"
@@ -69,7 +62,7 @@ def test_a_full_disk_is_named_and_nothing_half_written(tmp_path: Path, storage: 
     assert not (tmp_path / "bag").exists()
 
 
-def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
+def test_files_are_whole_or_not_there(tmp_path):
     first, second = tmp_path / "a", tmp_path / "b"
 
     def half() -> None:
@@ -89,7 +82,7 @@ def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
     assert Path("/dev/null").is_char_device()
 
 
-def test_an_empty_directory_is_filled_and_an_earlier_result_replaced(tmp_path: Path) -> None:
+def test_an_empty_directory_is_filled_and_an_earlier_result_replaced(tmp_path):
     out = tmp_path / "out"
     out.mkdir()  # a mount point, say: it stays the same
     number = out.stat().st_ino

@@ -1,7 +1,5 @@
 """Recordings of all three kinds are written and read back; bad ones are refused by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +56,7 @@ def write_ros1(path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_ros2_round_trip_in_order_of_time(tmp_path: Path, storage: str) -> None:
+def test_ros2_round_trip_in_order_of_time(tmp_path, storage):
     write_ros2(tmp_path / "bag", storage)
     (data,) = (file for file in (tmp_path / "bag").iterdir() if file.name != "metadata.yaml")
     for path in (tmp_path / "bag", data):
@@ -77,14 +75,14 @@ def test_ros2_round_trip_in_order_of_time(tmp_path: Path, storage: str) -> None:
         assert repr(read[2][2]) == repr(point(3, 3.0))
 
 
-def test_killed_recorder_left_no_metadata(tmp_path: Path) -> None:
+def test_killed_recorder_left_no_metadata(tmp_path):
     write_ros2(tmp_path / "bag", "mcap")
     (tmp_path / "bag" / "metadata.yaml").unlink()
     with open_bag(tmp_path / "bag") as bag:
         assert bag.count(["/points"]) == 2
 
 
-def test_ros1_has_the_names_of_ros2(tmp_path: Path) -> None:
+def test_ros1_has_the_names_of_ros2(tmp_path):
     write_ros1(tmp_path / "old.bag")
     with open_bag(tmp_path / "old.bag") as bag:
         ((topic, stamp, info),) = bag.messages(["/camera_info"])
@@ -96,7 +94,7 @@ def test_ros1_has_the_names_of_ros2(tmp_path: Path) -> None:
     assert (info.binning_x, info.roi.width) == (2, 4)
 
 
-def test_what_was_written_before_an_error_stays_readable(tmp_path: Path) -> None:
+def test_what_was_written_before_an_error_stays_readable(tmp_path):
     def interrupted() -> None:
         with BagWriter(tmp_path / "bag") as bag:
             bag.write("/points", point(1, 1.0), 1)
@@ -108,7 +106,7 @@ def test_what_was_written_before_an_error_stays_readable(tmp_path: Path) -> None
         assert bag.count(["/points"]) == 1
 
 
-def test_an_error_before_the_first_message_leaves_nothing(tmp_path: Path) -> None:
+def test_an_error_before_the_first_message_leaves_nothing(tmp_path):
     def failed() -> None:
         with BagWriter(tmp_path / "bag"):
             raise OSError
@@ -118,7 +116,7 @@ def test_an_error_before_the_first_message_leaves_nothing(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_nothing_is_overwritten(tmp_path):
     write_ros2(tmp_path / "bag", "mcap")
     with pytest.raises(BagError, match=r"bag exists already"):
         BagWriter(tmp_path / "bag")
@@ -137,26 +135,16 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         ("wrong.bag", b"hello" * 99, "wrong.bag cannot be read as a recording: .*magic"),
     ],
 )
-def test_what_is_no_recording_is_refused(
-    tmp_path: Path, name: str, content: bytes | None, expected: str
-) -> None:
+def test_what_is_no_recording_is_refused(tmp_path, name, content, expected):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(BagError, match=expected), open_bag(tmp_path / name):
         pass
 
 
-def test_directories_that_are_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match=r"no metadata.yaml and 0 files"), open_bag(tmp_path):
-        pass
-    (tmp_path / "metadata.yaml").write_text("{: not yaml")
-    with pytest.raises(BagError, match="cannot be read"), open_bag(tmp_path):
-        pass
-
-
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("keep", [0.2, 0.6, 0.95])
-def test_truncated_recording(tmp_path: Path, storage: str, keep: float) -> None:
+def test_truncated_recording(tmp_path, storage, keep):
     with BagWriter(tmp_path / "bag", storage) as bag:
         for index in range(500):
             bag.write("/points", point(index, 1.0), index)

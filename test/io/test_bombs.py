@@ -1,7 +1,5 @@
 """Small files that stand for much work or memory, or lie about it: one sentence, at once."""
 
-from __future__ import annotations
-
 import gzip
 import shutil
 import sqlite3
@@ -37,13 +35,13 @@ def in_time() -> Iterator[None]:
     assert time.process_time() - started < 20.0
 
 
-def test_a_stream_of_starts_is_walked_once() -> None:
+def test_a_stream_of_starts_is_walked_once():
     scan = b"\xff\xd8\xff\xda\x00\x02" + bytes(10)
     assert list(split_jpegs(scan * 40_000)) == []
     assert list(split_jpegs(b"\xff\xd8\xff\xe1\xff\xff" * 100_000)) == []
 
 
-def test_a_stream_of_images_that_claim_too_much(tmp_path: Path) -> None:
+def test_a_stream_of_images_that_claim_too_much(tmp_path):
     size = b"\x00\x11\x08" + struct.pack(">HH", 65000, 65000) + b"\x03" + bytes(9)
     image = b"\xff\xd8\xff\xc0" + size + b"\xff\xda\x00\x02" + bytes(20) + b"\xff\xd9"
     (tmp_path / "a.mjpeg").write_bytes(image * 3)
@@ -52,13 +50,13 @@ def test_a_stream_of_images_that_claim_too_much(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [bytes(50_000_000), b"1" * 50_000_000, POSE + b"# " * 10**7])
-def test_packed_text(tmp_path: Path, text: bytes) -> None:
+def test_packed_text(tmp_path, text):
     (tmp_path / "a.gz").write_bytes(gzip.compress(text, 1))
     with pytest.raises(TrajectoryError, match="at most 10000 characters"):
         read_tum(tmp_path / "a.gz")
 
 
-def test_damaged_packed_text(tmp_path: Path) -> None:
+def test_damaged_packed_text(tmp_path):
     data = bytearray(gzip.compress(POSE * 1000))
     data[20:40] = bytes(20)
     (tmp_path / "a.gz").write_bytes(data)
@@ -66,13 +64,13 @@ def test_damaged_packed_text(tmp_path: Path) -> None:
         read_tum(tmp_path / "a.gz")
 
 
-def test_deep_xml(tmp_path: Path) -> None:
+def test_deep_xml(tmp_path):
     (tmp_path / "a.xml").write_text("<a>" * 50_000 + "</a>" * 50_000)
     with pytest.raises(CalibrationError, match="nests too deep"):
         read_calibration(tmp_path / "a.xml")
 
 
-def test_a_view_in_the_place_of_descriptors(tmp_path: Path) -> None:
+def test_a_view_in_the_place_of_descriptors(tmp_path):
     shutil.copytree(COLMAP / "binary", tmp_path / "model")
     endless = (
         "CREATE VIEW descriptors AS WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)"
@@ -86,7 +84,7 @@ def test_a_view_in_the_place_of_descriptors(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("features", [2**40, 2**62, 2**64 - 1])
-def test_counts_of_a_model_that_lie(tmp_path: Path, features: int) -> None:
+def test_counts_of_a_model_that_lie(tmp_path, features):
     image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.jpg\0"
     data = struct.pack("<Q", 2**64 - 1) + image + struct.pack("<Q", features) + image
     (tmp_path / "images.bin").write_bytes(data)
@@ -94,13 +92,13 @@ def test_counts_of_a_model_that_lie(tmp_path: Path, features: int) -> None:
         read_images(tmp_path)
 
 
-def test_a_query_that_is_no_camera(tmp_path: Path) -> None:
+def test_a_query_that_is_no_camera(tmp_path):
     (tmp_path / "queries.txt").write_text("image.jpg what is this\n")
     with pytest.raises(HlocError, match="line 1: expected NAME MODEL"):
         read_queries(tmp_path / "queries.txt")
 
 
-def test_damaged_hdf5(tmp_path: Path) -> None:
+def test_damaged_hdf5(tmp_path):
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
@@ -120,7 +118,7 @@ def test_damaged_hdf5(tmp_path: Path) -> None:
             pass
 
 
-def test_recordings_with_types_of_their_own(tmp_path: Path) -> None:
+def test_recordings_with_types_of_their_own(tmp_path):
     own = get_typestore(Stores.EMPTY)
     own.register(get_types_from_msg("float64[] angular_velocity_covariance\n", IMU))
     with Writer(tmp_path / "bag", version=9) as writer:
@@ -143,9 +141,7 @@ def test_recordings_with_types_of_their_own(tmp_path: Path) -> None:
         (CompressionMode.MESSAGE, StoragePlugin.MCAP),
     ],
 )
-def test_packed_recordings(
-    tmp_path: Path, mode: CompressionMode, storage: StoragePlugin, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_packed_recordings(tmp_path, mode, storage, monkeypatch):
     monkeypatch.setattr(bags, "_MOST_UNPACKED", 1_000_000)
     monkeypatch.setattr(bags, "_BEST_PACKING", 50)
     text = "std_msgs/msg/String"
@@ -168,7 +164,7 @@ def test_packed_recordings(
         read()
 
 
-def test_metadata_that_merges_for_ever(tmp_path: Path) -> None:
+def test_metadata_that_merges_for_ever(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.write("/a", make_message("std_msgs/msg/String", data="a"), 1)
     file = tmp_path / "bag" / "metadata.yaml"

@@ -1,7 +1,5 @@
 """Clouds of every layout are read; those that cannot be are refused with what was found."""
 
-from __future__ import annotations
-
 import array
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -22,19 +20,17 @@ from rs_localizer.io.clouds import (
 )
 from rs_localizer.io.messages import MessageError
 
-Make = Callable[..., SimpleNamespace]
-
 PLAIN = [(name, 4 * i, 7) for i, name in enumerate("xyzuv")]
 # Exact in single precision.
 ROWS = [[0.5 * i, -i, 2.0 + i, 100.25 + i, 200.5 - i] for i in range(12)]
 
 
 @pytest.fixture
-def cloud(make_cloud_message: Make) -> SimpleNamespace:
+def cloud(make_cloud_message) -> SimpleNamespace:
     return make_cloud_message(ROWS, PLAIN, point_step=20)
 
 
-def test_a_plain_cloud(cloud: SimpleNamespace) -> None:
+def test_a_plain_cloud(cloud):
     read = read_correspondences(cloud)
     assert read.stamp_ns == 5_000_000_007
     assert read.frame == "map"
@@ -49,14 +45,7 @@ def test_a_plain_cloud(cloud: SimpleNamespace) -> None:
 @pytest.mark.parametrize(("height", "row_padding"), [(1, 0), (1, 5), (3, 0), (4, 7)])
 @pytest.mark.parametrize("score_type", [7, 8])
 @pytest.mark.parametrize("id_type", [1, 2, 3, 4, 5, 6])
-def test_any_layout(
-    make_cloud_message: Make,
-    big_endian: bool,
-    height: int,
-    row_padding: int,
-    score_type: int,
-    id_type: int,
-) -> None:
+def test_any_layout(make_cloud_message, big_endian, height, row_padding, score_type, id_type):
     # Mixed types at odd offsets in no order, gaps, and unknown fields among them.
     fields = [
         ("id", 0, id_type), ("v", 5, 8), ("rgb", 13, 6), ("x", 17, 7), ("score", 21, score_type),
@@ -64,12 +53,7 @@ def test_any_layout(
     ]  # fmt: skip
     rows = [[i, r[4], 7, r[0], 0.25 * i, r[3], -9, r[2], r[1]] for i, r in enumerate(ROWS)]
     message = make_cloud_message(
-        rows,
-        fields,
-        point_step=57,
-        height=height,
-        row_padding=row_padding,
-        big_endian=big_endian,
+        rows, fields, point_step=57, height=height, row_padding=row_padding, big_endian=big_endian
     )
     for data in (message.data, array.array("B", message.data.tobytes())):  # rosbags, rclpy
         message.data = data
@@ -82,12 +66,7 @@ def test_any_layout(
         assert set(read.table.dtype.names or ()) == {"x", "y", "z", "u", "v", "score", "id"}
 
 
-def test_a_row_step_of_zero_in_a_single_row(cloud: SimpleNamespace) -> None:
-    cloud.row_step = 0
-    assert len(read_correspondences(cloud).points) == 12
-
-
-def test_count_zero_is_an_old_one(cloud: SimpleNamespace) -> None:
+def test_count_zero_is_an_old_one(cloud):
     for field in cloud.fields:
         field.count = 0
     assert len(read_correspondences(cloud).points) == 12
@@ -95,9 +74,7 @@ def test_count_zero_is_an_old_one(cloud: SimpleNamespace) -> None:
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("column", range(6))
-def test_rows_that_are_not_finite_are_dropped_and_counted(
-    make_cloud_message: Make, bad: float, column: int
-) -> None:
+def test_rows_that_are_not_finite_are_dropped_and_counted(make_cloud_message, bad, column):
     rows = [[*row, 1.0] for row in ROWS]
     rows[3][column] = rows[7][column] = bad
     message = make_cloud_message(rows, [*PLAIN, ("score", 20, 8)], point_step=28)
@@ -110,7 +87,7 @@ def test_rows_that_are_not_finite_are_dropped_and_counted(
     assert len(read.scores) == len(read.table) == 10
 
 
-def test_a_signaling_nan_is_dropped_silently(cloud: SimpleNamespace) -> None:
+def test_a_signaling_nan_is_dropped_silently(cloud):
     data = cloud.data.copy()
     data[20:24] = np.array([0x7F800001], "<u4").view(np.uint8)
     cloud.data = data
@@ -156,22 +133,14 @@ def change_message(**values: Any) -> Callable[[Any], None]:
         ),
     ],
 )
-def test_what_cannot_be_read_is_said(
-    cloud: SimpleNamespace, change: Callable[[Any], None], text: str
-) -> None:
+def test_what_cannot_be_read_is_said(cloud, change, text):
     change(cloud)
     with pytest.raises(MessageError, match=text):
         read_correspondences(cloud)
 
 
-def test_an_id_that_is_no_integer(make_cloud_message: Make) -> None:
-    message = make_cloud_message([[1.0] * 6], [*PLAIN, ("id", 20, 7)], point_step=24)
-    with pytest.raises(MessageError, match=r"'id' must be one of INT8, .*; found FLOAT32"):
-        read_correspondences(message)
-
-
 @pytest.mark.parametrize("size", [{"width": 0}, {"height": 0}, {"width": 0, "height": 0}])
-def test_no_points(cloud: SimpleNamespace, size: dict[str, int]) -> None:
+def test_no_points(cloud, size):
     vars(cloud).update(size, data=np.zeros(0, np.uint8))
     with pytest.raises(EmptyCloudError, match="no points: width"):
         read_correspondences(cloud)
@@ -197,15 +166,8 @@ def test_no_points(cloud: SimpleNamespace, size: dict[str, int]) -> None:
     plain=st.booleans(),
 )
 def test_nothing_that_is_sent_raises_another_error(
-    data: bytes,
-    width: int,
-    height: int,
-    point_step: int,
-    row_step: int,
-    big_endian: bool,
-    fields: list[tuple[str, int, int, int]],
-    plain: bool,
-) -> None:
+    data, width, height, point_step, row_step, big_endian, fields, plain
+):
     described = [(*field, 1) for field in PLAIN] if plain else fields
     message = SimpleNamespace(
         header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="map"),
@@ -227,7 +189,7 @@ def test_nothing_that_is_sent_raises_another_error(
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
-def test_inliers_keep_their_fields_and_types(make_cloud_message: Make, big_endian: bool) -> None:
+def test_inliers_keep_their_fields_and_types(make_cloud_message, big_endian):
     fields = [("u", 0, 7), ("v", 4, 7), ("x", 8, 8), ("y", 16, 8), ("z", 24, 7), ("id", 29, 4)]
     rows = [[r[3], r[4], r[0] + 1e-9, r[1], r[2], 1000 * i] for i, r in enumerate(ROWS)]
     message = make_cloud_message(rows, fields, point_step=40, big_endian=big_endian)
@@ -253,7 +215,7 @@ def test_inliers_keep_their_fields_and_types(make_cloud_message: Make, big_endia
     assert residuals == [0.25, 0.625, 1.375]
 
 
-def test_of_many_points_the_best_are_kept_in_their_order(make_cloud_message: Make) -> None:
+def test_of_many_points_the_best_are_kept_in_their_order(make_cloud_message):
     rows = [[*row, score] for row, score in zip(ROWS, [3, 9, 1, 8, 7] * 3, strict=False)]
     fields = [*PLAIN, ("score", 20, 7)]
     read = read_correspondences(make_cloud_message(rows, fields, point_step=24))
@@ -265,7 +227,7 @@ def test_of_many_points_the_best_are_kept_in_their_order(make_cloud_message: Mak
     assert len(few.table) == len(few.pixels) == 4
 
 
-def test_without_scores_each_part_of_the_image_keeps_as_many(make_cloud_message: Make) -> None:
+def test_without_scores_each_part_of_the_image_keeps_as_many(make_cloud_message):
     crowd = [[0.0, 0.0, 1.0, 10.0, 10.0]] * 200
     spread = [
         [1.0, 0.0, 1.0, 40.0 * column, 40.0 * row] for column in range(1, 16) for row in range(12)

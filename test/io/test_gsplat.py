@@ -1,7 +1,5 @@
 """What is written for gsplat says where a rolling shutter sees points, in all four directions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +35,7 @@ def seen_by_gsplat(folder: Path, point: np.ndarray, shutter: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("direction", list(ScanDirection))
-def test_projection(tmp_path: Path, direction: ScanDirection) -> None:
+def test_projection(tmp_path, direction):
     camera = Camera(WIDTH, HEIGHT, K, readout_time=0.03, scan_direction=direction)
     motion = Motion(
         Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.1, -0.2, 0.3]),
@@ -61,7 +59,7 @@ def test_projection(tmp_path: Path, direction: ScanDirection) -> None:
     np.testing.assert_allclose(found, pixels + 0.5, atol=0.01)
 
 
-def test_a_model_of_colmap(tmp_path: Path) -> None:
+def test_a_model_of_colmap(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     D = np.array([0.1, -0.05, 0.001, 0.002, 0.03])
     camera = Camera(WIDTH, HEIGHT, K, D)

@@ -1,7 +1,5 @@
 """Images of all encodings, and what is wrong with those that cannot be read."""
 
-from __future__ import annotations
-
 import array
 import struct
 import subprocess
@@ -41,7 +39,7 @@ def compressed(data: bytes, name: str = "jpeg") -> Any:
 GRAY = np.random.default_rng(0).integers(0, 256, (6, 8), np.uint8)
 
 
-def test_gray_with_padded_rows() -> None:
+def test_gray_with_padded_rows():
     for step in (8, 11):
         found = read_image(image("mono8", [row.tobytes() for row in GRAY], 8, step))
         np.testing.assert_array_equal(found.pixels, GRAY)
@@ -52,7 +50,7 @@ def test_gray_with_padded_rows() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "bgra8", "rgba8", "8UC3", "8UC4"])
-def test_color(encoding: str) -> None:
+def test_color(encoding):
     # ITU-R BT.601, as in every other converter.
     weights = {"r": 0.299, "g": 0.587, "b": 0.114, "a": 0.0}
     order = {"8UC3": "bgr8", "8UC4": "bgra8"}.get(encoding, encoding)[:-1]
@@ -65,7 +63,7 @@ def test_color(encoding: str) -> None:
 @pytest.mark.parametrize("encoding", ["mono16", "16UC1", "bgr16"])
 @pytest.mark.parametrize("big", [0, 1])
 @pytest.mark.parametrize(("bits", "shift"), [(16, 8), (12, 4), (8, 0)])
-def test_sixteen_bits(encoding: str, big: int, bits: int, shift: int) -> None:
+def test_sixteen_bits(encoding, big, bits, shift):
     values = np.array([[0, 2**bits - 1], [2**bits // 3, 2**bits // 2]])
     count = 3 if encoding == "bgr16" else 1
     rows = [
@@ -77,7 +75,7 @@ def test_sixteen_bits(encoding: str, big: int, bits: int, shift: int) -> None:
 
 @pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
 @pytest.mark.parametrize("bits", [8, 16])
-def test_bayer(order: str, bits: int) -> None:
+def test_bayer(order, bits):
     # An evenly colored wall: every pixel is the same gray, whatever the pattern.
     color = {"r": 255, "g": 100, "b": 40}
     pattern = np.array([color[c] for c in order]).reshape(2, 2)
@@ -88,7 +86,7 @@ def test_bayer(order: str, bits: int) -> None:
     np.testing.assert_allclose(found.pixels[2:-2, 2:-2], expected, atol=1.5)
 
 
-def test_yuv() -> None:
+def test_yuv():
     luma = np.arange(12, dtype=np.uint8).reshape(2, 6)
     for encoding, place in (("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)):
         data = np.full((2, 6, 2), 128, np.uint8)
@@ -114,7 +112,7 @@ def test_yuv() -> None:
         ({"data": array.array("B")}, "found 0"),
     ],
 )
-def test_bad_images(changes: dict[str, Any], text: str) -> None:
+def test_bad_images(changes, text):
     message = image("mono8", [row.tobytes() for row in GRAY], 8)
     for name, value in changes.items():
         setattr(message, name, value)
@@ -127,7 +125,7 @@ JPEG = cv2.imencode(".jpg", SMOOTH)[1].tobytes()
 PNG = cv2.imencode(".png", SMOOTH)[1].tobytes()
 
 
-def test_jpeg_and_png() -> None:
+def test_jpeg_and_png():
     np.testing.assert_array_equal(read_compressed_image(compressed(PNG, "png")).pixels, SMOOTH)
     found = read_compressed_image(compressed(JPEG, "mono8; jpeg compressed mono8"))
     np.testing.assert_allclose(found.pixels, SMOOTH, atol=6)
@@ -141,7 +139,7 @@ def test_jpeg_and_png() -> None:
     np.testing.assert_allclose(read_compressed_image(compressed(color)).pixels, SMOOTH, atol=1)
 
 
-def test_rows_stay_where_the_sensor_has_them() -> None:
+def test_rows_stay_where_the_sensor_has_them():
     # An Exif note "show this turned by a quarter" (orientation 6).
     entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
     tiff = b"II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
@@ -163,12 +161,12 @@ def test_rows_stay_where_the_sensor_has_them() -> None:
         (b"\xff\xd8\xff\xd9", "jpeg", "the JPEG image of 4 bytes cannot be decoded"),
     ],
 )
-def test_bad_compressed_images(data: bytes, name: str, text: str) -> None:
+def test_bad_compressed_images(data, name, text):
     with pytest.raises(MessageError, match=text):
         read_compressed_image(compressed(data, name))
 
 
-def test_sizes_that_an_image_claims() -> None:
+def test_sizes_that_an_image_claims():
     """Refused before the decoder allocates them."""
     wide = PNG[:16] + (30000).to_bytes(4) * 2 + PNG[24:]
     with pytest.raises(MessageError, match="PNG image says that it is 30000 x 30000, of which"):
@@ -194,9 +192,7 @@ def png_of(width: int, height: int) -> bytes:
     return PNG[:8] + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
-def test_a_small_file_of_many_pixels_is_refused_by_its_header(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_small_file_of_many_pixels_is_refused_by_its_header(monkeypatch):
     np.testing.assert_array_equal(
         read_compressed_image(compressed(png_of(300, 200))).pixels, np.zeros((200, 300))
     )
@@ -216,13 +212,13 @@ def jpeg_of(width: int, height: int, before: bytes = b"") -> bytes:
     return JPEG[:2] + before + JPEG[2 : start + 5] + size + JPEG[start + 9 : -2]
 
 
-def test_a_jpeg_that_hides_its_size_is_not_decoded() -> None:
+def test_a_jpeg_that_hides_its_size_is_not_decoded():
     hidden = JPEG[:2] + b"junk" + JPEG[2:]
     with pytest.raises(MessageError, match="cannot be decoded: no header tells its size"):
         read_compressed_image(compressed(hidden))
 
 
-def test_an_animated_png_is_read_as_its_still_image() -> None:
+def test_an_animated_png_is_read_as_its_still_image():
     """OpenCV 5.0 ends the process by SIGSEGV; hence a process of its own."""
 
     def chunk(kind: bytes, body: bytes) -> bytes:
@@ -245,7 +241,7 @@ def test_an_animated_png_is_read_as_its_still_image() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["nv12", "nv21", "yuv420", "nv24"])
-def test_planes_of_which_the_first_is_the_brightness(encoding: str) -> None:
+def test_planes_of_which_the_first_is_the_brightness(encoding):
     step, behind = 11, 12 if encoding == "nv24" else 3
     rows = [row.tobytes() for row in GRAY] + [bytes(8)] * behind
     message = image(encoding, rows, 8, step)
@@ -257,7 +253,7 @@ def test_planes_of_which_the_first_is_the_brightness(encoding: str) -> None:
         read_image(message)
 
 
-def test_planes_are_converted_as_opencv_does() -> None:
+def test_planes_are_converted_as_opencv_does():
     packed = np.random.default_rng(2).integers(0, 256, (9, 8), np.uint8)
     message = image("nv12", [row.tobytes() for row in packed], 8)
     message.height = 6

@@ -1,7 +1,5 @@
 """sensor_msgs/Imu of rosbags and of rclpy are read alike; what no IMU measures is refused."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from collections.abc import Callable
@@ -49,7 +47,7 @@ MAKERS: list[Callable[[Any], Any]] = [lambda message: message, as_rclpy][: 1 + R
 
 
 @pytest.mark.parametrize("like", MAKERS)
-def test_a_message(like: Callable[[Any], Any]) -> None:
+def test_a_message(like):
     variances = np.diag([1e-4, 4e-4, 7e-4]).ravel()
     found = read_imu(like(make(angular_velocity_covariance=variances)))
     assert found.stamp_ns == 12_345_678_901
@@ -58,7 +56,7 @@ def test_a_message(like: Callable[[Any], Any]) -> None:
     assert found.linear_acceleration == (0.5, 0.0, 9.8)
 
 
-def test_a_gyroscope_alone() -> None:
+def test_a_gyroscope_alone():
     absent = np.array([-1.0, *[0.0] * 8])
     found = read_imu(make(linear_acceleration_covariance=absent))
     assert found.linear_acceleration is None
@@ -80,6 +78,6 @@ def test_a_gyroscope_alone() -> None:
         ({"frame": ""}, "header.frame_id is empty"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_used_is_told(changed: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_used_is_told(changed, said):
     with pytest.raises(MessageError, match=said):
         read_imu(make(**changed))

@@ -1,7 +1,5 @@
 """The six messages of a frame: values, frames and stamps, and what is left out without a twist."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -47,7 +45,7 @@ def vector(message: Any) -> list[float]:
     return [message.x, message.y, message.z]
 
 
-def test_types_and_headers(frame: Localized) -> None:
+def test_types_and_headers(frame):
     made = messages(frame, make_message)
     assert {name: message.__msgtype__ for name, message in made.items()} == TYPES
     for name, message in made.items():
@@ -60,7 +58,7 @@ def test_types_and_headers(frame: Localized) -> None:
         typestore().serialize_cdr(message, message.__msgtype__)
 
 
-def test_values(frame: Localized) -> None:
+def test_values(frame):
     made = messages(frame, make_message)
     assert frame.twist is not None
     odometry = made["odometry"]
@@ -83,6 +81,6 @@ def test_values(frame: Localized) -> None:
         assert np.array_equal(message.covariance.reshape(6, 6), frame.twist.covariance)
 
 
-def test_without_a_twist_nothing_claims_one(frame: Localized) -> None:
+def test_without_a_twist_nothing_claims_one(frame):
     made = messages(dataclasses.replace(frame, twist=None), make_message)
     assert set(made) == {"pose", "pose_with_covariance", "inliers"}

@@ -1,7 +1,5 @@
 """YAML files: those of people are read, those that are traps are refused in time."""
 
-from __future__ import annotations
-
 import time
 
 import pytest
@@ -17,7 +15,7 @@ MERGES = "k0: &a0 {x: 1}\n" + "".join(
 )
 
 
-def test_what_people_write() -> None:
+def test_what_people_write():
     assert load_yaml("a: &x {b: 1}\nc: *x\nd: [1, 2.5, yes, text]\n") == {
         "a": {"b": 1}, "c": {"b": 1}, "d": [1, 2.5, True, "text"],
     }  # fmt: skip
@@ -40,7 +38,7 @@ def test_what_people_write() -> None:
         ("!!python/object/apply:os.system [ls]", "could not determine a constructor"),
     ],
 )
-def test_traps(text: str, fault: str) -> None:
+def test_traps(text, fault):
     started = time.monotonic()
     with pytest.raises(YamlError, match=fault):
         load_yaml(text)

@@ -1,7 +1,5 @@
 """Makes the tests' own scenes importable, and the projector of the trajectory's tests."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

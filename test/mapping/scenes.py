@@ -1,7 +1,5 @@
 """Recordings of a room and of markers by the tests' own rolling-shutter camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

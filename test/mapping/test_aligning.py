@@ -1,7 +1,5 @@
 """Maps in another frame: what was wished holds, and nothing else changes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +25,7 @@ def room() -> Map:
     return Map(points, np.arange(20), None, "map", covariances=covariances)
 
 
-def test_floor_size_and_origin() -> None:
+def test_floor_size_and_origin():
     wishes = Wishes(distance=(4, 9, 1.5), floor=(0, 1, 2, 3), origin=2)
     found = moved(room(), alignment(room(), wishes))
     np.testing.assert_allclose(found.points[:4, 2], 0.0, atol=1e-12)
@@ -44,13 +42,13 @@ def test_floor_size_and_origin() -> None:
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 2.0), (0.0, 0.0, -1.0), (1.0, -2.0, 0.5)])
-def test_up(up: tuple[float, float, float]) -> None:
+def test_up(up):
     by = alignment(room(), Wishes(up=np.array(up)))
     np.testing.assert_allclose(by.rotation @ up, [0.0, 0.0, np.linalg.norm(up)], atol=1e-12)
     assert np.linalg.det(by.rotation) == pytest.approx(1.0)
 
 
-def test_markers() -> None:
+def test_markers():
     known = np.array([0.001, 0.001, 0.001, 0.01, 0.01, 0.01])
     hung = Marker.at("4x4_50", 3, 0.2, Pose(np.array([1.0, 2.0, 3.0]), TURN))
     other = Marker.at("4x4_50", 5, 0.2, Pose(np.array([1.0, 2.0, 5.0])))
@@ -64,7 +62,7 @@ def test_markers() -> None:
     np.testing.assert_allclose(found[0].deviations, known * [2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
 
-def test_what_cannot_be_wished() -> None:
+def test_what_cannot_be_wished():
     with pytest.raises(ValueError, match="the map has no landmark 77"):
         alignment(room(), Wishes(origin=77))
     with pytest.raises(ValueError, match="a floor needs at least 3 ids, got 2"):

@@ -1,7 +1,5 @@
 """Errors that are alike from image to image, and how much less they say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +24,7 @@ def alike(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> np.
 
 
 @pytest.mark.parametrize("share", [0.0, 0.7])
-def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share: float) -> None:
+def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share):
     rng = np.random.default_rng(0)
     times = np.repeat(np.arange(RATE * SECONDS) / RATE, LANDMARKS)
     landmarks = np.tile(np.arange(LANDMARKS), RATE * SECONDS)
@@ -47,7 +45,7 @@ def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share: float) 
     assert pull.found / pull.expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)
 
 
-def test_few_seconds_are_not_believed() -> None:
+def test_few_seconds_are_not_believed():
     assert Pull(0.0, 0.0).inflation(1.3) == pytest.approx(1.3)
     assert Pull(10.0, 2.0).inflation(1.3) < 0.6 * 5.0
     assert Pull(500.0, 100.0).inflation(1.3) == pytest.approx(5.0, rel=0.05)
@@ -67,7 +65,7 @@ def surveyed(share: float) -> Survey:
     return survey(camera(), seen, every_marker([family("4x4_50")], 0.15, {}))
 
 
-def test_a_survey_knows_less_when_errors_are_alike() -> None:
+def test_a_survey_knows_less_when_errors_are_alike():
     independent, much = surveyed(0.0), surveyed(0.8)
     assert 1.0 < independent.fit.inflation < 2.2
     assert much.fit.inflation > 2.5 * independent.fit.inflation

@@ -1,7 +1,5 @@
 """Deviations of a shape, wherever the whole of it lies."""
 
-from __future__ import annotations
-
 import numpy as np
 from scenes import SQUARE
 from scipy.spatial.transform import Rotation
@@ -19,7 +17,7 @@ def moved_by(corners: np.ndarray, motion: np.ndarray) -> np.ndarray:
     return np.concatenate([np.concatenate([place, motion[3:]]) for place in places])
 
 
-def test_it_is_what_is_left_when_the_markers_are_laid_over_the_truth() -> None:
+def test_it_is_what_is_left_when_the_markers_are_laid_over_the_truth():
     rng = np.random.default_rng(0)
     turns = Rotation.random(COUNT, random_state=1).as_matrix()
     middles = rng.normal(size=(COUNT, 3))
@@ -40,7 +38,7 @@ def test_it_is_what_is_left_when_the_markers_are_laid_over_the_truth() -> None:
     np.testing.assert_allclose(np.std(left, axis=0), np.sqrt(np.diag(held)), rtol=0.07)
 
 
-def test_motions_of_the_whole_do_not_count() -> None:
+def test_motions_of_the_whole_do_not_count():
     rng = np.random.default_rng(1)
     corners = rng.normal(size=(COUNT, 4, 3))
     motions = np.array([moved_by(corners, 1e-5 * of) for of in np.eye(6)]).T * 1e5

@@ -1,7 +1,5 @@
 """Scale and gravity of a map by an IMU: found, refused with a reason, compared with markers."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -37,18 +35,16 @@ def felt() -> Felt:
 
 
 @pytest.fixture(scope="module")
-def imu(felt: Felt) -> ImuRecording:
+def imu(felt) -> ImuRecording:
     return imu_of(felt)
 
 
 @pytest.fixture(scope="module")
-def refined(felt: Felt) -> RefinedMap:
+def refined(felt) -> RefinedMap:
     return refined_of(felt)
 
 
-def test_a_map_of_any_size_and_orientation(
-    felt: Felt, refined: RefinedMap, imu: ImuRecording
-) -> None:
+def test_a_map_of_any_size_and_orientation(felt, refined, imu):
     """The IMU turned, off the camera, biased by 0.3 m/s^2, its stamps off by 5 ms."""
     found = inertial_metres(refined, imu)
     assert found.metric.scale == pytest.approx(felt.scale, rel=5e-3)
@@ -59,9 +55,7 @@ def test_a_map_of_any_size_and_orientation(
     assert found.doubts == ()
 
 
-def test_the_frame_is_in_metres_and_upright(
-    felt: Felt, refined: RefinedMap, imu: ImuRecording
-) -> None:
+def test_the_frame_is_in_metres_and_upright(felt, refined, imu):
     place = place_by_imu(NOTHING, refined, GivenImu(imu, asked=True))
     assert place.placement.scaled
     assert place.placement.levelled
@@ -75,9 +69,7 @@ def test_the_frame_is_in_metres_and_upright(
 
 
 @pytest.mark.parametrize(("wrong", "said"), [(1.0, ()), (1.08, ("7.", "smaller"))])
-def test_markers_are_checked(
-    felt: Felt, refined: RefinedMap, imu: ImuRecording, wrong: float, said: tuple[str, ...]
-) -> None:
+def test_markers_are_checked(felt, refined, imu, wrong, said):
     """Sizes of markers that are given 8 % too large."""
     by_markers = Similarity(wrong * felt.scale, felt.map_from_world.as_matrix().T, np.ones(3))
     given = Placement(by_markers, True, True, "markers", up="as in the marker map")
@@ -90,9 +82,7 @@ def test_markers_are_checked(
         assert word in place.doubts[0]
 
 
-def test_a_distance_gives_the_scale_and_the_imu_what_is_up(
-    felt: Felt, refined: RefinedMap, imu: ImuRecording
-) -> None:
+def test_a_distance_gives_the_scale_and_the_imu_what_is_up(felt, refined, imu):
     given = replace(NOTHING, similarity=Similarity(0.36, np.eye(3), np.zeros(3)), scaled=True)
     place = place_by_imu(given, refined, GivenImu(imu, asked=False))
     assert place.placement.similarity.scale == 0.36
@@ -100,7 +90,7 @@ def test_a_distance_gives_the_scale_and_the_imu_what_is_up(
     assert np.degrees(place.tilt) < 0.1
 
 
-def test_tf_is_checked_and_not_believed(felt: Felt, refined: RefinedMap, imu: ImuRecording) -> None:
+def test_tf_is_checked_and_not_believed(felt, refined, imu):
     right = felt.camera_from_imu.as_matrix()
     assert inertial_metres(refined, replace(imu, camera_from_imu=right)).doubts == ()
     turned = replace(imu, camera_from_imu=right @ np.diag([1.0, -1.0, -1.0]))
@@ -109,7 +99,7 @@ def test_tf_is_checked_and_not_believed(felt: Felt, refined: RefinedMap, imu: Im
     assert found.metric.scale == pytest.approx(felt.scale, rel=5e-3)
 
 
-def test_where_turns_do_not_tell_the_rotation_tf_does() -> None:
+def test_where_turns_do_not_tell_the_rotation_tf_does():
     """About one axis alone."""
     felt = Felt.random(10, turn=np.array([0.2, 0.0, 0.0]))
     refined, imu = refined_of(felt), imu_of(felt)
@@ -169,9 +159,7 @@ def in_degrees(imu: ImuRecording) -> ImuRecording:
         (in_degrees, "are they in rad/s"),
     ],
 )
-def test_what_is_wrong_is_said(
-    refined: RefinedMap, imu: ImuRecording, spoilt: object, said: str
-) -> None:
+def test_what_is_wrong_is_said(refined, imu, spoilt, said):
     assert callable(spoilt)
     place = place_by_imu(NOTHING, refined, GivenImu(spoilt(imu), asked=False))
     assert place.placement is NOTHING
@@ -181,7 +169,7 @@ def test_what_is_wrong_is_said(
     assert re.search(said, doubt)
 
 
-def test_no_map_without_a_scale_that_is_asked_for(refined: RefinedMap, imu: ImuRecording) -> None:
+def test_no_map_without_a_scale_that_is_asked_for(refined, imu):
     silent = without_accelerometer(imu)
     with pytest.raises(MappingError, match="gives no scale: the IMU has no accelerometer"):
         place_by_imu(NOTHING, refined, GivenImu(silent, asked=True))
@@ -191,7 +179,7 @@ def test_no_map_without_a_scale_that_is_asked_for(refined: RefinedMap, imu: ImuR
     assert place.doubts[0].startswith("the IMU cannot check the scale: ")
 
 
-def test_another_clock_is_noticed_before_the_work(refined: RefinedMap, imu: ImuRecording) -> None:
+def test_another_clock_is_noticed_before_the_work(refined, imu):
     """Unless the scale may be another's, or nobody asked."""
     stamps = START_NS + np.round(1e9 * refined.times).astype(np.int64)
     refuse_early(GivenImu(imu, asked=True), stamps)
@@ -202,7 +190,7 @@ def test_another_clock_is_noticed_before_the_work(refined: RefinedMap, imu: ImuR
         refuse_early(GivenImu(without_accelerometer(imu), asked=True), stamps)
 
 
-def test_gravity_that_was_taken_off(felt: Felt, refined: RefinedMap, imu: ImuRecording) -> None:
+def test_gravity_that_was_taken_off(felt, refined, imu):
     stamps = felt.stamps(SECONDS)
     axes = (felt.world(stamps + felt.delay)[0] * felt.camera_from_imu).inv()
     assert imu.specific_forces is not None
@@ -211,7 +199,7 @@ def test_gravity_that_was_taken_off(felt: Felt, refined: RefinedMap, imu: ImuRec
         inertial_metres(refined, replace(imu, specific_forces=forces))
 
 
-def test_a_camera_that_only_turns_determines_no_size() -> None:
+def test_a_camera_that_only_turns_determines_no_size():
     felt = Felt.random(8, way=5e-4, lever=(0.0, 0.0, 0.0))
     refined, imu = refined_of(felt), imu_of(felt)
     rng = np.random.default_rng(0)
@@ -224,7 +212,7 @@ def test_a_camera_that_only_turns_determines_no_size() -> None:
     assert not place.placement.scaled
 
 
-def test_of_images_with_a_rolling_shutter() -> None:
+def test_of_images_with_a_rolling_shutter():
     """From keypoints of a map that is off by 2 cm, and 2.3 times too large."""
     rng = np.random.default_rng(11)
     state = rng.bit_generator.state

@@ -1,7 +1,5 @@
 """How fast a motion changes, as a time lapse has it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.mapping.initial_trajectory import usual_accelerations
 
 
-def test_accelerations_of_a_time_lapse_are_those_of_its_own_time() -> None:
+def test_accelerations_of_a_time_lapse_are_those_of_its_own_time():
     """Round a place of 3 m in three seconds, nodding twice a second."""
     times = 0.04 * np.arange(75)
     angle, nod = 2.0 * np.pi * times / 3.0, 4.0 * np.pi
@@ -23,6 +21,6 @@ def test_accelerations_of_a_time_lapse_are_those_of_its_own_time() -> None:
     assert angular == pytest.approx(0.2 * nod**2 / np.sqrt(6.0), rel=0.05)
 
 
-def test_images_on_their_own_have_none() -> None:
+def test_images_on_their_own_have_none():
     times = np.arange(5.0)
     assert usual_accelerations(times, np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3))) == (0, 0)

@@ -1,7 +1,5 @@
 """Markers among what is adjusted."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +30,7 @@ def sightings(points: np.ndarray, images: range = range(IMAGES)) -> MapObservati
     return MapObservations(STAMPS, rows, which, CAMERA.project(local))
 
 
-def test_the_start_moves_into_the_markers_frame() -> None:
+def test_the_start_moves_into_the_markers_frame():
     start = Start(POINTS, ROTATIONS, POSITIONS)
     places = TO_MARKERS(CORNERS)
     seen, moved, freedom = marker_constraints(
@@ -58,7 +56,7 @@ def test_the_start_moves_into_the_markers_frame() -> None:
     assert np.allclose(local, seen.pixels[at], atol=1e-3)
 
 
-def test_markers_that_are_hardly_seen_hold_nothing() -> None:
+def test_markers_that_are_hardly_seen_hold_nothing():
     start = Start(POINTS, ROTATIONS, POSITIONS)
     given = sightings(POINTS)
     corners = sightings(CORNERS[:3])

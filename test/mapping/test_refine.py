@@ -1,7 +1,5 @@
 """Refining maps: against dense algebra, and against the truth of an own projector."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -67,7 +65,7 @@ def small_problem() -> tuple[MapProblem, State]:
     return problem, state
 
 
-def test_the_elimination_solves_the_dense_system() -> None:
+def test_the_elimination_solves_the_dense_system():
     problem, state = small_problem()
     normal = problem.normal(state, 5.0)[1]
     matrix, slope = dense(normal)
@@ -77,7 +75,7 @@ def test_the_elimination_solves_the_dense_system() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
 
 
-def test_covariances_are_those_of_the_dense_system() -> None:
+def test_covariances_are_those_of_the_dense_system():
     problem, state = small_problem()
     normal = problem.normal(state, 5.0)[1]
     inverse = np.linalg.inv(dense(normal)[0])
@@ -90,7 +88,7 @@ def test_covariances_are_those_of_the_dense_system() -> None:
     np.testing.assert_allclose(shared, inverse[at, at], rtol=1e-5, atol=1e-12)
 
 
-def test_the_slope_is_the_derivative_of_the_cost() -> None:
+def test_the_slope_is_the_derivative_of_the_cost():
     rng = np.random.default_rng(2)
     problem, state = small_problem()
     cost, normal = problem.normal(state, 5.0)
@@ -120,7 +118,7 @@ def video() -> Walk:
     return walk(np.random.default_rng(3), VIDEO)
 
 
-def test_a_global_shutter_bends_the_map_and_the_rolling_one_does_not(video: Walk) -> None:
+def test_a_global_shutter_bends_the_map_and_the_rolling_one_does_not(video):
     bent = refine(camera(0.0), video.seen, video.start, stamp_offset=0.5 * READOUT)
     right = refine(camera(), video.seen, video.start)
     assert np.median(errors(right, video)) < 0.3 * np.median(errors(bent, video))
@@ -130,7 +128,7 @@ def test_a_global_shutter_bends_the_map_and_the_rolling_one_does_not(video: Walk
     assert np.mean(right.inliers) > 0.98
 
 
-def test_the_readout_time_is_found(video: Walk) -> None:
+def test_the_readout_time_is_found(video):
     found = refine(
         camera(0.02), video.seen, video.start, MapFreedom(readout_time=True),
         stamp_offset=0.0,
@@ -139,7 +137,7 @@ def test_the_readout_time_is_found(video: Walk) -> None:
     assert abs(found.readout_time - READOUT) < 4.0 * found.readout_time_deviation
 
 
-def test_a_wrong_readout_time_is_named(video: Walk) -> None:
+def test_a_wrong_readout_time_is_named(video):
     right = refine(camera(), video.seen, video.start).readout_check
     assert right is not None
     assert not right.differs
@@ -151,7 +149,7 @@ def test_a_wrong_readout_time_is_named(video: Walk) -> None:
     assert f"{0.4e3 * READOUT:.1f} ms was given" in wrong.message
 
 
-def test_the_reverse_scan_direction_is_found(video: Walk) -> None:
+def test_the_reverse_scan_direction_is_found(video):
     reverse = replace(camera(0.0), scan_direction=ScanDirection.BOTTOM_TO_TOP)
     found = refine(reverse, video.seen, video.start, MapFreedom(readout_time=True))
     assert found.readout_time == pytest.approx(-READOUT, abs=2e-3)
@@ -160,7 +158,7 @@ def test_the_reverse_scan_direction_is_found(video: Walk) -> None:
     assert as_found.readout_time == pytest.approx(READOUT, abs=2e-3)
 
 
-def test_the_map_as_a_whole_stays(video: Walk) -> None:
+def test_the_map_as_a_whole_stays(video):
     found = refine(camera(), video.seen, video.start)
     ours, given = found.points[found.refined], video.start.points[found.refined]
     whole = through(ours, given)
@@ -168,7 +166,7 @@ def test_the_map_as_a_whole_stays(video: Walk) -> None:
     assert np.linalg.norm(whole.translation) < 0.04
 
 
-def test_landmarks_of_known_place_hold_frame_and_size(video: Walk) -> None:
+def test_landmarks_of_known_place_hold_frame_and_size(video):
     shrunk = replace(
         video.start, points=0.8 * video.start.points, positions=0.8 * video.start.positions
     )
@@ -190,7 +188,7 @@ def test_landmarks_of_known_place_hold_frame_and_size(video: Walk) -> None:
     assert 0.3 < np.mean(squared) / 3.0 < 3.0
 
 
-def test_images_that_stand_alone() -> None:
+def test_images_that_stand_alone():
     scene = walk(np.random.default_rng(5), np.arange(0.0, 8.0, 0.5), points=100, off=0.1)
     found = refine(camera(), scene.seen, scene.start)
     assert len(found.spline.layout.starts) == 16
@@ -207,7 +205,7 @@ def shifted(seen: MapObservations, by: int) -> MapObservations:
     return replace(seen, landmarks=seen.landmarks + np.where(late, by, 0))
 
 
-def test_what_is_no_map_is_refused(video: Walk) -> None:
+def test_what_is_no_map_is_refused(video):
     count = len(video.points)
     twice = replace(video.start, points=np.concatenate([video.start.points] * 2))
     with pytest.raises(ValueError, match=r"fall into 2 parts .* \(of 18, 18 images\)"):
@@ -233,7 +231,7 @@ def test_what_is_no_map_is_refused(video: Walk) -> None:
         replace(video.seen, stamps_ns=video.seen.stamps_ns[::-1])
 
 
-def test_landmarks_that_are_known_worse_than_before_stay(video: Walk) -> None:
+def test_landmarks_that_are_known_worse_than_before_stay(video):
     """Seen from one side only, they would be anywhere along it."""
     found = refine(camera(), video.seen, video.start)
     seen = np.unique(video.seen.landmarks)

@@ -1,7 +1,5 @@
 """Which shutter images show where nobody knows it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scenes import READOUT, camera, walk
@@ -21,7 +19,7 @@ def fit(readout: float, stamps: np.ndarray = VIDEO) -> tuple[RefinedMap, Shutter
     return fit_shutter(camera(0.0), scene.seen, scene.start, MapFreedom(), BOTH, lambda text: None)
 
 
-def test_a_rolling_shutter_is_found_along_its_axis() -> None:
+def test_a_rolling_shutter_is_found_along_its_axis():
     refined, shutter = fit(READOUT)
     assert shutter is not None
     assert shutter.visible
@@ -33,19 +31,19 @@ def test_a_rolling_shutter_is_found_along_its_axis() -> None:
     assert shutter.better_images > 0.9
 
 
-def test_a_global_shutter_is_left_alone() -> None:
+def test_a_global_shutter_is_left_alone():
     refined, shutter = fit(0.0)
     assert shutter is not None
     assert not shutter.visible
     assert refined.readout_time == 0.0
 
 
-def test_images_on_their_own_tell_no_readout_time() -> None:
+def test_images_on_their_own_tell_no_readout_time():
     refined, shutter = fit(READOUT, np.arange(0.0, 6.0, 0.5))
     assert shutter is None
     assert refined.readout_time == 0.0
 
 
-def test_the_rows_of_sensors_lie_along_the_longer_side() -> None:
+def test_the_rows_of_sensors_lie_along_the_longer_side():
     assert likely_axes((640, 480))[0] == ScanDirection.TOP_TO_BOTTOM
     assert likely_axes((450, 800))[0] == ScanDirection.LEFT_TO_RIGHT

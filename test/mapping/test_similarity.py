@@ -1,7 +1,5 @@
 """Similarities."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.mapping.gauge import Similarity, through, upright
 
 
-def test_the_similarity_through_points_is_found() -> None:
+def test_the_similarity_through_points_is_found():
     rng = np.random.default_rng(0)
     given = Similarity(2.5, Rotation.random(random_state=1).as_matrix(), rng.normal(size=3))
     points = rng.normal(size=(9, 3))
@@ -19,20 +17,20 @@ def test_the_similarity_through_points_is_found() -> None:
     assert np.allclose(found.translation, given.translation)
 
 
-def test_points_of_a_plane_are_not_mirrored() -> None:
+def test_points_of_a_plane_are_not_mirrored():
     points = np.random.default_rng(0).normal(size=(8, 3)) * (1.0, 1.0, 0.0)
     turn = Rotation.from_euler("xyz", [170.0, 20.0, 40.0], degrees=True).as_matrix()
     assert np.allclose(through(points, points @ turn.T).rotation, turn)
 
 
 @pytest.mark.parametrize("points", [np.eye(3)[:2], np.outer(np.arange(5.0), [1.0, 2.0, 3.0])])
-def test_too_few_and_points_on_a_line_are_refused(points: np.ndarray) -> None:
+def test_too_few_and_points_on_a_line_are_refused(points):
     with pytest.raises(ValueError, match="determine"):
         through(points, points)
 
 
 @pytest.mark.parametrize("down", [(0.0, 0.0, -2.0), (0.0, 0.0, 3.0), (1.0, 2.0, -3.0), (1.0, 0, 0)])
-def test_down_comes_down(down: tuple[float, float, float]) -> None:
+def test_down_comes_down(down):
     turn = upright(np.array(down))
     assert np.allclose(turn @ np.array(down), [0.0, 0.0, -np.linalg.norm(down)])
     assert np.allclose(turn @ turn.T, np.eye(3))

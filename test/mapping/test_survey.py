@@ -1,7 +1,5 @@
 """Surveying markers of an own projector."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +27,7 @@ def poses() -> Poses:
 
 
 @pytest.fixture(scope="module")
-def spotted(poses: Poses) -> list[Spotted]:
+def spotted(poses) -> list[Spotted]:
     return spot(np.random.default_rng(1), poses, SIZE, STAMPS)
 
 
@@ -44,7 +42,7 @@ def check(found: Survey, poses: Poses, limit: float) -> None:
         assert np.linalg.norm(off) < limit
 
 
-def test_markers_are_where_they_are(spotted: list[Spotted], poses: Poses) -> None:
+def test_markers_are_where_they_are(spotted, poses):
     found = survey(camera(), spotted, MARKERS)
     assert [marker.id for marker in found.markers] == [0, 1, 2, 3, 4]
     assert np.all(found.deviations[0] == 0.0)
@@ -53,15 +51,6 @@ def test_markers_are_where_they_are(spotted: list[Spotted], poses: Poses) -> Non
     assert problems(MarkerMap(found.markers)) == []
     assert found.apart == found.rare == ()
     assert all(marker.size == pytest.approx(SIZE) for marker in found.markers)
-
-
-def test_another_origin_and_the_readout_time(spotted: list[Spotted], poses: Poses) -> None:
-    found = survey(camera(0.0), spotted, MARKERS, origin=2, stamp_offset=0.0)
-    assert found.markers[0].id == 2
-    np.testing.assert_allclose(found.markers[0].pose.position, 0.0, atol=1e-12)
-    deviation = found.fit.readout_time_deviation
-    assert abs(found.fit.state.readout_time - READOUT) < 4.0 * deviation < 4e-3
-    check(found, poses, 0.03)
 
 
 def only(spotted: list[Spotted], kept: list[set[int]]) -> list[Spotted]:
@@ -73,13 +62,13 @@ def only(spotted: list[Spotted], kept: list[set[int]]) -> list[Spotted]:
     return parts
 
 
-def test_what_does_not_hang_together_is_named(spotted: list[Spotted]) -> None:
+def test_what_does_not_hang_together_is_named(spotted):
     found = survey(camera(), only(spotted, [{0, 1, 2}, {3, 4}]), MARKERS)
     assert [marker.id for marker in found.markers] == [0, 1, 2]
     assert [[marker.id for marker in part] for part in found.apart] == [[3, 4]]
 
 
-def test_what_says_nothing_is_refused(spotted: list[Spotted]) -> None:
+def test_what_says_nothing_is_refused(spotted):
     with pytest.raises(ValueError, match="0 images show a whole marker, at least 5"):
         survey(camera(), [], MARKERS)
     with pytest.raises(ValueError, match=r"no image shows marker 4x4_50 \d together with another"):
@@ -88,7 +77,7 @@ def test_what_says_nothing_is_refused(spotted: list[Spotted]) -> None:
         survey(camera(), spotted, MARKERS, origin=40)
 
 
-def test_a_wrong_size_is_a_wrong_scale(spotted: list[Spotted]) -> None:
+def test_a_wrong_size_is_a_wrong_scale(spotted):
     right = survey(camera(), spotted, MARKERS)
     twice = survey(camera(), spotted, every_marker([family("4x4_50")], 2.0 * SIZE, {}))
     first, second = (
@@ -97,7 +86,7 @@ def test_a_wrong_size_is_a_wrong_scale(spotted: list[Spotted]) -> None:
     np.testing.assert_allclose(second, 2.0 * first, atol=0.01)
 
 
-def test_images_of_one_marker_do_not_hide_the_noise(spotted: list[Spotted], poses: Poses) -> None:
+def test_images_of_one_marker_do_not_hide_the_noise(spotted, poses):
     """All but every tenth image show one marker: two numbers more than a pose."""
     few = []
     for k, one in enumerate(spotted):
@@ -109,7 +98,7 @@ def test_images_of_one_marker_do_not_hide_the_noise(spotted: list[Spotted], pose
     check(found, poses, 0.1)
 
 
-def test_a_wrong_readout_time_is_named(spotted: list[Spotted]) -> None:
+def test_a_wrong_readout_time_is_named(spotted):
     right = survey(camera(), spotted, MARKERS).readout_check
     assert right is not None
     assert not right.differs
@@ -120,7 +109,7 @@ def test_a_wrong_readout_time_is_named(spotted: list[Spotted]) -> None:
     assert survey(camera(0.0), spotted, MARKERS).readout_check is None
 
 
-def test_a_survey_that_few_corners_fit_is_refused(spotted: list[Spotted]) -> None:
+def test_a_survey_that_few_corners_fit_is_refused(spotted):
     with pytest.raises(ValueError, match=r"% of the corners fit .* check the readout time"):
         survey(camera(0.3 * READOUT), spotted, MARKERS)
 
@@ -142,9 +131,7 @@ def turned_over(chained: Chained, marker: int) -> Chained:
 
 
 @pytest.mark.parametrize("origin", [0, 2])
-def test_a_marker_that_was_turned_over_is_turned_back(
-    spotted: list[Spotted], poses: Poses, origin: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_marker_that_was_turned_over_is_turned_back(spotted, poses, origin, monkeypatch):
     monkeypatch.setattr(
         "rs_localizer.mapping.survey.chain", lambda *given: turned_over(chain(*given), 2)
     )

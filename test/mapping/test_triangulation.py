@@ -1,7 +1,5 @@
 """Points from keypoints of cameras whose motion is known."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -24,14 +22,14 @@ def scene(noise: float, seed: int = 0) -> tuple[np.ndarray, Sights]:
     return points, Sights(rotations[where], positions[where], pixels, which)
 
 
-def test_points_come_back() -> None:
+def test_points_come_back():
     points, seen = scene(0.0)
     found = triangulate(CAMERA, seen, 40)
     assert np.abs(found.points - points).max() < 1e-6
     assert found.counts.tolist() == 40 * [12]
 
 
-def test_wrong_keypoints_do_not_matter() -> None:
+def test_wrong_keypoints_do_not_matter():
     points, seen = scene(0.0)
     wrong = np.random.default_rng(1).choice(len(seen.pixels), 40, replace=False)
     seen.pixels[wrong] += (60.0, -35.0)
@@ -41,7 +39,7 @@ def test_wrong_keypoints_do_not_matter() -> None:
     assert np.mean(errors < 1e-2) > 0.9
 
 
-def test_covariances_are_honest() -> None:
+def test_covariances_are_honest():
     """Squared errors in terms of the covariance: three on average."""
     squared = []
     for seed in range(20):
@@ -52,7 +50,7 @@ def test_covariances_are_honest() -> None:
     assert 2.6 < np.mean(squared) < 3.5
 
 
-def test_what_is_not_determined_is_not_told() -> None:
+def test_what_is_not_determined_is_not_told():
     """Seen once; seen from one place only; not seen at all."""
     _, seen = scene(0.1)
     rows = np.flatnonzero(seen.points < 2)

@@ -1,7 +1,5 @@
 """Images of prints in known poses, drawn without the package's own code."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -1,7 +1,5 @@
 """Grids of circles and inverted boards: where their points are, and their order."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -32,15 +30,8 @@ def drawn(grid: CircleGrid) -> Any:
     ("columns", "rows", "asymmetric"), [(5, 4, False), (4, 5, True), (4, 4, True)]
 )
 def test_centres_are_where_they_were_drawn(
-    columns: int,
-    rows: int,
-    asymmetric: bool,
-    inverted: bool,
-    render: Any,
-    look: Any,
-    project: Any,
-    rectangle: Any,
-) -> None:
+    columns, rows, asymmetric, inverted, render, look, project, rectangle
+):
     grid = CircleGrid(columns, rows, 0.03, asymmetric, inverted)
     width, height = grid.extent
     detector = MarkerDetector(MarkerMap(boards=(grid,)))
@@ -54,9 +45,7 @@ def test_centres_are_where_they_were_drawn(
     np.testing.assert_allclose(seen.pixels, project(grid.points, pose), atol=0.4)
 
 
-def test_an_inverted_chessboard(
-    render: Any, look: Any, project: Any, rectangle: Any, chessboard_cells: Any
-) -> None:
+def test_an_inverted_chessboard(render, look, project, rectangle, chessboard_cells):
     board = Chessboard(6, 4, 0.03, inverted=True)
     pose = look(10.0)
     cells = chessboard_cells(7, 5)

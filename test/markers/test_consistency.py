@@ -1,7 +1,5 @@
 """Maps that cannot be true are recognized, alone or by what an image shows; true ones are not."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -55,13 +53,13 @@ def changed(marker_map: MarkerMap, change: Any) -> MarkerMap:
     return MarkerMap(tuple(Marker(m.family, m.id, change(m.corners)) for m in marker_map.markers))
 
 
-def test_true_maps_have_no_fault() -> None:
+def test_true_maps_have_no_fault():
     for true in (corner(), MarkerMap(corner().markers[:6]), MarkerMap(corner().markers[:1])):
         assert problems(true) == []
         assert shown(true, true) is None
 
 
-def test_a_fisheye_lens_is_no_fault_of_the_map() -> None:
+def test_a_fisheye_lens_is_no_fault_of_the_map():
     back = wall("4x4_250", (11, 7), 0.3, 0.1, pose=Pose(np.array([0.5, 1.2, 0.1]), UPRIGHT))
     left = wall(
         "4x4_250", (3, 7), 0.3, 0.1, first_id=100, pose=Pose(np.array([-1.5, 0.5, 0.1]), SIDEWAYS)
@@ -76,20 +74,20 @@ def test_a_fisheye_lens_is_no_fault_of_the_map() -> None:
     assert MapCheck(told).fault(image) is None
 
 
-def test_mirrored_corners_show_in_an_image() -> None:
+def test_mirrored_corners_show_in_an_image():
     true = corner()
     told = changed(true, lambda corners: corners[[1, 0, 3, 2]])
     assert "the map is mirrored: marker 4x4_50 0, " in str(shown(told, true))
 
 
-def test_a_mirrored_room_shows_in_an_image() -> None:
+def test_a_mirrored_room_shows_in_an_image():
     # Each wall by itself is the true one turned, but no room has both.
     true = corner()
     told = changed(true, lambda corners: corners * [-1.0, 1.0, 1.0])
     assert "the map is mirrored: only a left-handed room" in str(shown(told, true))
 
 
-def test_a_few_markers_of_many_at_another_place_show_in_an_image() -> None:
+def test_a_few_markers_of_many_at_another_place_show_in_an_image():
     true = MarkerMap(
         wall("4x4_250", (9, 6), 0.12, 0.04, pose=Pose(np.array([0.5, 2.0, 0.0]), UPRIGHT))
     )
@@ -118,6 +116,6 @@ BEHIND = np.diag([-1.0, 1.0, -1.0])
         ([marker(0, 0)], [Charuco(5, 7, 0.03, 0.02, family("5x5_50"))], "5x5_50 overlap by"),
     ],
 )
-def test_problems_of_a_map(markers: Any, boards: Any, text: str) -> None:
+def test_problems_of_a_map(markers, boards, text):
     (found,) = problems(MarkerMap(tuple(markers), tuple(boards)))
     assert text in found

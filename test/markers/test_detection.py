@@ -1,7 +1,5 @@
 """Corners of rendered markers and boards: where they are, their order, and which are left out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2
@@ -30,9 +28,7 @@ def available() -> list[str]:
 
 
 @pytest.mark.parametrize("name", available())
-def test_corners_of_every_family_are_those_of_the_upright_print(
-    name: str, render: Any, look: Any, project: Any
-) -> None:
+def test_corners_of_every_family_are_those_of_the_upright_print(name, render, look, project):
     marker = Marker.at(name, 0, SIZE)
     detector = MarkerDetector(MarkerMap((marker,)))
     # The camera upright, and turned by a bit more than each quarter.
@@ -44,7 +40,7 @@ def test_corners_of_every_family_are_those_of_the_upright_print(
         np.testing.assert_allclose(found.points, marker.corners)
 
 
-def test_april_tags_are_the_published_ones() -> None:
+def test_april_tags_are_the_published_ones():
     # tag36_11_00000.png of github.com/AprilRobotics/apriltag-imgs, inside its black border.
     expected = """
         ##.#.#
@@ -64,7 +60,7 @@ def test_april_tags_are_the_published_ones() -> None:
 
 
 @pytest.mark.parametrize("blur", [0.5, 1.0])
-def test_corners_have_no_bias(blur: float, render: Any, look: Any, project: Any) -> None:
+def test_corners_have_no_bias(blur, render, look, project):
     rng = np.random.default_rng(5)
     errors, outward = [], []
     for index in range(40):
@@ -90,7 +86,7 @@ def test_corners_have_no_bias(blur: float, render: Any, look: Any, project: Any)
     assert np.sqrt(np.mean(error**2)) < 0.06
 
 
-def test_what_covers_a_corner_does_not_move_it(render: Any, look: Any, project: Any) -> None:
+def test_what_covers_a_corner_does_not_move_it(render, look, project):
     marker = Marker.at("4x4_50", 3, SIZE)
     pose = look()
     image = render([(pattern(marker.family, 3), marker.corners)], pose)
@@ -104,7 +100,7 @@ def test_what_covers_a_corner_does_not_move_it(render: Any, look: Any, project: 
         np.testing.assert_allclose(quads[found], pixels[found[0]], atol=0.25)
 
 
-def test_ids_are_rows_of_the_maps_points(render: Any, look: Any, project: Any) -> None:
+def test_ids_are_rows_of_the_maps_points(render, look, project):
     turned = Pose(np.array([0.0, 0.0, 0.0]), np.diag([-1.0, -1.0, 1.0]))
     walls = wall("4x4_50", (2, 2), 0.06, 0.02, first_id=10, pose=turned)
     board = Chessboard(4, 3, 0.02, Pose(np.array([0.0, 0.13, 0.0])))
@@ -124,7 +120,7 @@ def test_ids_are_rows_of_the_maps_points(render: Any, look: Any, project: Any) -
     np.testing.assert_array_equal(again.pixels, found.pixels)
 
 
-def test_markers_that_are_not_in_the_map_are_named(render: Any, look: Any) -> None:
+def test_markers_that_are_not_in_the_map_are_named(render, look):
     known, other = wall("5x5_50", (2, 1), 0.08, 0.04)
     prints = [(pattern(m.family, m.id), m.corners) for m in (known, other)]
     found = MarkerDetector(MarkerMap((known,))).detect(render(prints, look()))
@@ -133,7 +129,7 @@ def test_markers_that_are_not_in_the_map_are_named(render: Any, look: Any) -> No
     assert found.repeated == ()
 
 
-def test_noise_shows_nothing() -> None:
+def test_noise_shows_nothing():
     noise = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
     marker_map = MarkerMap(
         wall("apriltag_36h11", (10, 10), 0.1, 0.1),
@@ -156,8 +152,8 @@ def detect_board(board: Chessboard, *images: Any) -> list[Any]:
 
 
 def test_chessboard_corners_are_where_they_were_rendered(
-    render: Any, look: Any, project: Any, chessboard_cells: Any, rectangle: Any
-) -> None:
+    render, look, project, chessboard_cells, rectangle
+):
     board = Chessboard(6, 4, 0.03)
     for roll in (-40.0, 0.0, 25.0):
         image = board_image(6, 4, look(roll), render, chessboard_cells, rectangle)
@@ -167,7 +163,7 @@ def test_chessboard_corners_are_where_they_were_rendered(
         assert np.abs(errors.mean(axis=0)).max() < 0.02
 
 
-def test_large_images_are_searched_in_a_small_one(chessboard_cells: Any) -> None:
+def test_large_images_are_searched_in_a_small_one(chessboard_cells):
     # 50 megapixels; squares of 300 px, the first inner corner between pixels 1299 and 1300.
     image = np.full((6144, 8192), 200, np.uint8)
     drawn = np.kron(chessboard_cells(7, 5), np.ones((300, 300)))
@@ -186,8 +182,8 @@ def test_large_images_are_searched_in_a_small_one(chessboard_cells: Any) -> None
 
 
 def test_order_of_a_symmetric_board_is_kept_through_a_full_turn(
-    render: Any, look: Any, project: Any, chessboard_cells: Any, rectangle: Any
-) -> None:
+    render, look, project, chessboard_cells, rectangle
+):
     board, rolls = Chessboard(6, 4, 0.03), np.arange(0.0, 360.0, 30.0)
     poses = [look(roll) for roll in rolls]
     images = [board_image(6, 4, p, render, chessboard_cells, rectangle) for p in poses]
@@ -206,8 +202,8 @@ def test_order_of_a_symmetric_board_is_kept_through_a_full_turn(
 
 
 def test_order_of_other_boards_follows_from_their_colors(
-    render: Any, look: Any, project: Any, chessboard_cells: Any, rectangle: Any
-) -> None:
+    render, look, project, chessboard_cells, rectangle
+):
     for columns, rows in ((5, 4), (4, 5)):
         board = Chessboard(columns, rows, 0.03)
         for roll in (0.0, 80.0, 180.0, 250.0):
@@ -232,9 +228,7 @@ def charuco_cells(board: Charuco) -> Any:
 
 
 @pytest.mark.parametrize(("rows", "legacy"), [(5, False), (6, False), (6, True)])
-def test_charuco_corners_are_those_of_opencvs_board(
-    rows: int, legacy: bool, render: Any, look: Any, project: Any, rectangle: Any
-) -> None:
+def test_charuco_corners_are_those_of_opencvs_board(rows, legacy, render, look, project, rectangle):
     if legacy and not hasattr(cv2.aruco.CharucoBoard, "setLegacyPattern"):
         return  # before OpenCV 4.8, it draws one kind only
     board = Charuco(4, rows, 0.03, 0.02, family("6x6_250"), legacy=legacy)

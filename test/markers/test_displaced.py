@@ -1,7 +1,5 @@
 """A marker that is not where the map has it stands out, and nothing else does."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -45,7 +43,7 @@ def said(
     return check.fault()
 
 
-def test_a_centimetre_is_named_with_its_direction() -> None:
+def test_a_centimetre_is_named_with_its_direction():
     text = said([0.01, 0.0, 0.0])
     assert text is not None
     assert text.startswith("marker 4x4_50 4 is not where the map has it")
@@ -55,13 +53,13 @@ def test_a_centimetre_is_named_with_its_direction() -> None:
     assert text.startswith("marker 4x4_50 0 ")
 
 
-def test_a_right_map_is_not_blamed_for_noise_or_the_shutter() -> None:
+def test_a_right_map_is_not_blamed_for_noise_or_the_shutter():
     assert said(0.0) is None
     assert said(0.0, noise=1.0) is None
     assert said(0.0, spin=4.0) is None
 
 
-def test_a_shaking_rolling_shutter_hides_no_marker() -> None:
+def test_a_shaking_rolling_shutter_hides_no_marker():
     """The fit of detect: what the shutter does is tens of times what the marker does."""
     text = said([0.01, 0.0, 0.0], spin=4.0, fit=_RollingFit())
     assert text is not None
@@ -70,7 +68,7 @@ def test_a_shaking_rolling_shutter_hides_no_marker() -> None:
     assert said(0.0, spin=4.0, fit=_RollingFit()) is None
 
 
-def test_with_two_markers_nobody_knows_which_is_off() -> None:
+def test_with_two_markers_nobody_knows_which_is_off():
     check = LeaveOneOut(MARKERS)
     ids = np.arange(8)
     for _ in range(10):

@@ -1,7 +1,5 @@
 """Corners from edges: exact wherever in the pixels an edge lies, sharp or smeared."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -36,14 +34,14 @@ def moved(image: np.ndarray, truth: np.ndarray, cells: int) -> float:
 
 
 @pytest.mark.parametrize("blur", [0.0, 0.5, 1.0])
-def test_an_edge_along_the_pixels_is_where_it_is(blur: float) -> None:
+def test_an_edge_along_the_pixels_is_where_it_is(blur):
     """Weights by the squared slope draw a sharp edge to the middle of a pixel: 0.15 px."""
     for offset in np.linspace(0.0, 0.95, 20):
         left, top, side = 20.0 + offset, 22.0 - 0.7 * offset, 36.3
         assert error(square(left, top, side, blur), left, top, side) < 0.015
 
 
-def test_noise_costs_hundredths_of_a_pixel() -> None:
+def test_noise_costs_hundredths_of_a_pixel():
     rng, errors = np.random.default_rng(0), []
     for _ in range(40):
         left, top = 20.0 + rng.uniform(0.0, 1.0, 2)
@@ -66,9 +64,7 @@ def ring(left: float, top: float, side: float, smear: tuple[float, float]) -> np
 
 @pytest.mark.parametrize("smear", [(0.7, 0.0), (1.05, 0.4), (0.7, -0.8)])
 @pytest.mark.parametrize("side", [30.0, 45.3])
-def test_a_smeared_edge_is_where_it_was_amid_the_exposure(
-    smear: tuple[float, float], side: float
-) -> None:
+def test_a_smeared_edge_is_where_it_was_amid_the_exposure(smear, side):
     """Smeared by a cell, hardly any black is left between the white of both sides."""
     for offset in np.linspace(0.0, 0.9, 4):
         left, top = 18.0 + offset, 17.0 - 0.7 * offset
@@ -76,12 +72,12 @@ def test_a_smeared_edge_is_where_it_was_amid_the_exposure(
         assert error(image, left, top, side, cells=6) < 0.1
 
 
-def test_light_that_falls_off_across_a_smeared_marker_moves_it_little() -> None:
+def test_light_that_falls_off_across_a_smeared_marker_moves_it_little():
     light = np.linspace(1.0, 0.6, 80)  # a fifth less from side to side
     assert error(ring(20.3, 19.8, 42.0, (1.0, 0.3)) * light, 20.3, 19.8, 42.0, cells=6) < 0.15
 
 
-def test_the_sides_of_a_slanted_marker_keep_clear_of_each_other() -> None:
+def test_the_sides_of_a_slanted_marker_keep_clear_of_each_other():
     """A rhomb of 25 degrees: its rows are a sixth of its height apart, not of its sides."""
     angle, side = np.deg2rad(25.0), 40.0
     along = side * np.array([[1.0, 0.0], [np.cos(angle), np.sin(angle)]])

@@ -1,7 +1,5 @@
 """Map files: what is written is read; every fault is named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ def read(tmp_path: Path, tree: Any) -> MarkerMap:
     return read_marker_map(path)
 
 
-def test_corners_are_those_of_the_print_seen_from_its_front(tmp_path: Path) -> None:
+def test_corners_are_those_of_the_print_seen_from_its_front(tmp_path):
     tree = {"map_frame": "hall", "markers": [MARKER]}
     found = read(tmp_path, tree)
     # From the top left one clockwise; z out of the paper, so that y is up.
@@ -39,7 +37,7 @@ def test_corners_are_those_of_the_print_seen_from_its_front(tmp_path: Path) -> N
     assert found.map_frame == "hall"
 
 
-def test_pose_moves_the_print(tmp_path: Path) -> None:
+def test_pose_moves_the_print(tmp_path):
     place = {"position": [1, 2, 3], "quaternion": TURN.as_quat().tolist()}
     by_matrix = {"position": [1, 2, 3], "rotation": TURN.as_matrix().tolist()}
     still = read(tmp_path, {"map_frame": "map", "markers": [MARKER], "boards": [CHESSBOARD]})
@@ -51,7 +49,7 @@ def test_pose_moves_the_print(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.points, expected, atol=1e-12)
 
 
-def test_boards_go_row_by_row_from_the_top_left() -> None:
+def test_boards_go_row_by_row_from_the_top_left():
     points = Chessboard(6, 4, 0.03).points
     np.testing.assert_allclose(points[0], [-0.075, 0.045, 0], atol=1e-12)
     np.testing.assert_allclose(points[5], [0.075, 0.045, 0], atol=1e-12)
@@ -65,7 +63,7 @@ def test_boards_go_row_by_row_from_the_top_left() -> None:
     np.testing.assert_allclose(legacy.markers[0].points.mean(axis=0), [-0.04, 0.06, 0], atol=1e-12)
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_what_is_written_is_read(tmp_path):
     pose = Pose(np.array([0.3, -2.0, 1.0]), TURN.as_matrix())
     measured = Marker.at("aruco_original", 1000, 0.1, pose).corners + 1e-3 * np.eye(4, 3)
     written = MarkerMap(
@@ -110,10 +108,7 @@ CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
         ({"family": "4x4_50"}, "marker 1 has no id; it has nothing else"),
         ({"family": "4x4_50", "id": 1, "size": 1}, "has no position"),
         ("4x4_50", "marker 1 must be a mapping, found '4x4_50'"),
-        (
-            PLAIN | {"rotation": np.diag([-1.0, 1.0, 1.0]).tolist()},
-            "the rotation mirrors",
-        ),
+        (PLAIN | {"rotation": np.diag([-1.0, 1.0, 1.0]).tolist()}, "the rotation mirrors"),
         ({"family": "4x4_50", "id": 1, "corners": CORNERS[:3]}, "corners must have 4 x 3 values"),
         (
             {"family": "4x4_50", "id": 1, "corners": [CORNERS[k] for k in (0, 2, 1, 3)]},
@@ -122,15 +117,13 @@ CORNERS = [[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
         ({"family": "4x4_50", "id": 1, "corners": CORNERS, "size": 0.5}, "1 m apart, but size is"),
     ],
 )
-def test_faults_of_markers(tmp_path: Path, entry: Any, text: str) -> None:
+def test_faults_of_markers(tmp_path, entry, text):
     with pytest.raises(MarkerMapError, match=text) as error:
         read(tmp_path, {"map_frame": "map", "markers": [entry]})
     assert str(tmp_path / "map.yaml") in str(error.value)
 
 
-def test_points_of_a_board_are_known_as_paper_is_unless_its_file_says_better(
-    tmp_path: Path,
-) -> None:
+def test_points_of_a_board_are_known_as_paper_is_unless_its_file_says_better(tmp_path):
     paper = read(tmp_path, {"map_frame": "map", "boards": [CHESSBOARD]})
     x, y = np.mgrid[-2.5:3, -1.5:2] * 0.03
     rms = np.sqrt(np.mean(x**2 + y**2))
@@ -146,26 +139,8 @@ def test_points_of_a_board_are_known_as_paper_is_unless_its_file_says_better(
     assert mean == pytest.approx(np.sqrt(6 / 30) * alone)
     # Markers are exact: what their places are worth is their survey's to say.
     assert read(tmp_path, {"map_frame": "map", "markers": [MARKER]}).settings == {}
-
-
-@pytest.mark.parametrize(
-    ("entry", "text"),
-    [
-        (CHESSBOARD | {"deviation": -1}, "deviation must be 0 or more metres, found -1"),
-        (CHESSBOARD | {"type": "rings"}, r"board 1 \(rings\): type must be one of chess"),
-        (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\) has no spacing"),
-        (CHESSBOARD | {"columns": 2}, "needs 3x3 inner corners, got 2x4"),
-        (CHESSBOARD | {"columns": 10**9}, "may be 200 squares wide and high, got 1000000000x4"),
-        (CHARUCO | {"rows": 10**9}, "may be 200 squares wide and high, got 3x1000000000"),
-        (CHESSBOARD | {"columns": 2.5}, "columns cannot be 2.5"),
-        (CHARUCO | {"marker": 0.05}, "markers of 0.05 m do not fit into squares of 0.04 m"),
-        (CHARUCO | {"first_id": 95}, "needs the ids 95 to 100; 5x5_100 has 0 to 99"),
-        (CHARUCO | {"family": "5x6"}, "unknown family '5x6'"),
-    ],
-)
-def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
-    with pytest.raises(MarkerMapError, match=text):
-        read(tmp_path, {"map_frame": "map", "boards": [entry]})
+    with pytest.raises(MarkerMapError, match="deviation must be 0 or more metres, found -1"):
+        read(tmp_path, {"map_frame": "map", "boards": [CHESSBOARD | {"deviation": -1}]})
 
 
 @pytest.mark.parametrize(
@@ -182,11 +157,7 @@ def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
             "there twice: as marker 4x4_50 3 and as marker 4x4_1000 3",
         ),
         (
-            {
-                "map_frame": "map",
-                "markers": [MARKER | {"family": "5x5_50"}],
-                "boards": [CHARUCO],
-            },
+            {"map_frame": "map", "markers": [MARKER | {"family": "5x5_50"}], "boards": [CHARUCO]},
             "there twice: as marker 5x5_50 3 and as charuco 3x4 of 5x5_100",
         ),
         (
@@ -196,6 +167,6 @@ def test_faults_of_boards(tmp_path: Path, entry: Any, text: str) -> None:
         ([1, 2], "the map must be a mapping"),
     ],
 )
-def test_faults_of_maps(tmp_path: Path, tree: Any, text: str) -> None:
+def test_faults_of_maps(tmp_path, tree, text):
     with pytest.raises(MarkerMapError, match=text):
         read(tmp_path, tree)

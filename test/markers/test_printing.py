@@ -1,9 +1,6 @@
 """Pages are true to scale and hold what their map says: the detector reads them."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -30,7 +27,7 @@ PIXEL = 0.0254 / 300  # m, of the PNG files
         MarkerMap(boards=(Charuco(5, 6, 0.035, 0.025, family("5x5_100"), 7, True),)),
     ],
 )
-def test_a_page_is_as_its_map(marker_map: MarkerMap, tmp_path: Path) -> None:
+def test_a_page_is_as_its_map(marker_map, tmp_path):
     (page,) = plan(marker_map)
     (file,) = write_pages([page], tmp_path / "page.png")
     image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
@@ -46,7 +43,7 @@ def test_a_page_is_as_its_map(marker_map: MarkerMap, tmp_path: Path) -> None:
     assert upright == (page.height > page.width)
 
 
-def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path: Path) -> None:
+def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path):
     marker_map = MarkerMap(wall("4x4_50", (3, 1), 0.12, 0.1))
     pages = plan(marker_map)
     assert len(pages) == 3
@@ -63,7 +60,7 @@ def test_markers_that_do_not_fit_together_get_pages_of_their_own(tmp_path: Path)
     assert len(page.figures) == 4
 
 
-def test_pdf_has_the_size_of_the_paper(tmp_path: Path) -> None:
+def test_pdf_has_the_size_of_the_paper(tmp_path):
     pages = plan(MarkerMap(wall("4x4_50", (3, 1), 0.12, 0.1)), "letter")
     (file,) = write_pages(pages, tmp_path / "wall.pdf")
     boxes = re.findall(rb"/MediaBox \[ ?0 0 ([\d.]+) ([\d.]+) ?\]", file.read_bytes())
@@ -77,7 +74,7 @@ def standing() -> Any:
     return Pose(np.zeros(3), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]))
 
 
-def test_a_page_tells_how_the_map_lies_on_it() -> None:
+def test_a_page_tells_how_the_map_lies_on_it():
     (page,) = plan(MarkerMap(wall("4x4_50", (2, 3), 0.06, 0.02, pose=standing())))
     assert page.axes is not None
     assert (page.axes.right, page.axes.up, page.axes.out) == ("+x", "+z", "-y")

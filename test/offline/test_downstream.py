@@ -4,8 +4,6 @@ The flight is the independent simulator's; laws of motion and the truth judge, i
 who listen.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,13 +19,12 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.outputs import Localized, messages
-from rs_localizer.io.px4 import vehicle_odometry
 from rs_localizer.io.recording import CAMERA_FRAME, write_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.jumps import Jumps
+from rs_localizer.pipeline.px4 import Jumps, vehicle_odometry
 from rs_localizer.settings import build, load_params_file
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -57,7 +54,7 @@ def write_tf(
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+def flight(tmp_path_factory) -> Flight:
     path = tmp_path_factory.mktemp("flight") / "flight"
     frames = fusion.fly(1, LENGTH, 3)
     truth = fusion.true_states(frames.first)
@@ -95,11 +92,11 @@ def replayed(flight: Flight, config: NodeConfig) -> tuple[list[Localized], Frame
 
 
 @pytest.fixture(scope="module")
-def frames(flight: Flight) -> list[Localized]:
+def frames(flight) -> list[Localized]:
     return replayed(flight, NodeConfig(readout_time=0.03, base_frame="base_link"))[0]
 
 
-def test_a_flight_is_no_jump(frames: list[Localized]) -> None:
+def test_a_flight_is_no_jump(frames):
     jumps = Jumps(NodeConfig)
     assert [jumps.add(frame) for frame in frames] == [0] * LENGTH
 
@@ -116,7 +113,7 @@ def turns(found: Any, true: Any) -> Array:
     return vectors
 
 
-def test_odometry_is_that_of_the_body_in_the_map(flight: Flight, frames: list[Localized]) -> None:
+def test_odometry_is_that_of_the_body_in_the_map(flight, frames):
     """For mavros and robot_localization, which turn it into their frames themselves."""
     odometry = [messages(frame, make_message)["odometry"] for frame in frames][SETTLED]
     assert {(m.header.frame_id, m.child_frame_id) for m in odometry} == {("map", "base_link")}
@@ -144,7 +141,7 @@ def vars_of(vector: SimpleNamespace) -> tuple[float, float, float]:
     return vector.x, vector.y, vector.z
 
 
-def test_px4_gets_the_same_in_its_axes(flight: Flight, frames: list[Localized]) -> None:
+def test_px4_gets_the_same_in_its_axes(flight, frames):
     fields = [vehicle_odometry(frame, "ned", 0, frame.stamp_ns) for frame in frames][SETTLED]
 
     def column(name: str) -> Array:
@@ -164,7 +161,7 @@ def test_px4_gets_the_same_in_its_axes(flight: Flight, frames: list[Localized]) 
     assert np.median(np.abs(rates)) < np.deg2rad(5.0)
 
 
-def test_px4s_own_laws_of_motion_hold(frames: list[Localized]) -> None:
+def test_px4s_own_laws_of_motion_hold(frames):
     """Velocities in the body are how positions and attitudes change: without any truth."""
     fields = [vehicle_odometry(frame, "ned", 0, frame.stamp_ns) for frame in frames][SETTLED]
     seconds = np.diff([1e-6 * item["timestamp_sample"] for item in fields])[:, None]
@@ -179,7 +176,7 @@ def test_px4s_own_laws_of_motion_hold(frames: list[Localized]) -> None:
     assert np.sqrt(np.mean((turned - expected) ** 2)) < 0.4 * np.sqrt(np.mean(turned**2))
 
 
-def test_nav2_finds_the_robot_by_its_odometry(flight: Flight) -> None:
+def test_nav2_finds_the_robot_by_its_odometry(flight):
     """With config/nav2.yaml: map -> odom, with odom -> base_link of that moment, is the pose."""
     config = build(load_params_file(CONFIG / "nav2.yaml") | {"readout_time": 0.03})
     found, used = replayed(flight, config)

@@ -1,7 +1,5 @@
 """Offline, a frame waits until the recording has its readings, and nothing changes its place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from rs_localizer.offline.replay import Item, imu_first
@@ -32,7 +30,7 @@ def recording() -> list[Item]:
     return sorted([*readings, *frames, *infos], key=lambda item: item[1])
 
 
-def test_a_frame_comes_when_its_readings_have() -> None:
+def test_a_frame_comes_when_its_readings_have():
     out = played(recording(), lambda name: 10)
     assert [name for name in out if name[0] != "r"] == ["i0", "f0", "i1", "f1", "i2", "f2"]
     assert out.index("f0") == out.index("r4") + 1  # 35 ms lie between r3 and r4
@@ -40,14 +38,14 @@ def test_a_frame_comes_when_its_readings_have() -> None:
     assert [name for name in out if name[0] == "r"] == [f"r{i}" for i in range(12)]
 
 
-def test_those_behind_wait_too() -> None:
+def test_those_behind_wait_too():
     out = played(recording(), lambda name: 60 if name == "f0" else 0)
     assert [name for name in out if name[0] != "r"] == ["i0", "f0", "i1", "f1", "i2", "f2"]
     assert out.index("f0") == out.index("r9") + 1
     assert out.index("f1") == out.index("f0") + 2
 
 
-def test_a_frame_whose_readings_never_come_goes_on() -> None:
+def test_a_frame_whose_readings_never_come_goes_on():
     items = recording()
     assert played(items, lambda name: 10_000)[-5:] == ["f0", "i1", "f1", "i2", "f2"]  # at its end
     late = [*items, ("info", 1100 * MS, "last"), ("imu", 1200 * MS, "r")]
@@ -56,6 +54,6 @@ def test_a_frame_whose_readings_never_come_goes_on() -> None:
     assert out[-1] == "r"
 
 
-def test_without_an_imu_nothing_waits() -> None:
+def test_without_an_imu_nothing_waits():
     items = [item for item in recording() if item[0] != "imu"]
     assert played(items, lambda name: 10_000, imu=None) == [item[2] for item in items]

@@ -1,7 +1,5 @@
 """Pose and twist at a moment in plain NumPy: what the kernels are compared with."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rs_localizer.core import so3

@@ -1,8 +1,5 @@
 """From message to pose: refusals and their reasons, times, changes of camera and settings."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime, VelocityPrior
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -32,8 +29,6 @@ from rs_localizer.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
-Make = Callable[..., SimpleNamespace]
-
 FIELDS = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]
 READOUT_TIME = 0.03
 MOTION = Motion(
@@ -47,7 +42,7 @@ MOTION = Motion(
 class MockLocalizer(Localizer):
     """Knows one motion, keeps every second point, and remembers how it was made."""
 
-    made: list[MockLocalizer]
+    made: list["MockLocalizer"]
 
     def __init__(self, camera: Camera, config: LocalizerConfig) -> None:
         if config.solver == "r9p":
@@ -91,14 +86,14 @@ class MockLocalizer(Localizer):
 
 
 @pytest.fixture
-def mock(monkeypatch: pytest.MonkeyPatch) -> type[MockLocalizer]:
+def mock(monkeypatch) -> type[MockLocalizer]:
     MockLocalizer.made = []
-    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", MockLocalizer)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", MockLocalizer)
     return MockLocalizer
 
 
 @pytest.fixture
-def cloud(make_cloud_message: Make) -> SimpleNamespace:
+def cloud(make_cloud_message) -> SimpleNamespace:
     rows = [[i, i, i, 100.0 + i, 200.0] for i in range(8)]
     return make_cloud_message(rows, FIELDS, point_step=40, stamp=(5, 0))
 
@@ -115,7 +110,7 @@ def refused(result: Localized | Refusal) -> tuple[str, str]:
 
 
 @pytest.mark.usefixtures("mock")
-def test_reasons_of_refusals(cloud: SimpleNamespace, make_camera_info: Make) -> None:
+def test_reasons_of_refusals(cloud, make_camera_info):
     frames = FrameLocalizer(NodeConfig())
     assert refused(frames.localize(cloud))[0] == "no_camera_info"
     with pytest.raises(MessageError, match="not calibrated"):
@@ -139,9 +134,7 @@ def test_reasons_of_refusals(cloud: SimpleNamespace, make_camera_info: Make) -> 
 
 
 @pytest.mark.usefixtures("mock")
-def test_inliers_are_the_rows_that_were_kept(
-    make_cloud_message: Make, make_camera_info: Make
-) -> None:
+def test_inliers_are_the_rows_that_were_kept(make_cloud_message, make_camera_info):
     rows = [[i, i, i, 100.0 + i, 200.0] for i in range(8)]
     rows[0][1] = rows[3][4] = float("nan")
     frames = FrameLocalizer(NodeConfig())
@@ -155,72 +148,8 @@ def test_inliers_are_the_rows_that_were_kept(
 
 
 @pytest.mark.usefixtures("mock")
-@pytest.mark.parametrize("stamp", [(5, 0), (0, 0)])
-@pytest.mark.parametrize("stamp_offset", [0.0, 0.004, -0.02])
 @pytest.mark.parametrize("pose_time", list(PoseTime))
-@pytest.mark.parametrize("direction", list(ScanDirection))
-@pytest.mark.parametrize("region", [None, (40, 100, 320, 300)])
-def test_pose_and_twist_are_those_of_the_published_time(
-    make_cloud_message: Make,
-    make_camera_info: Make,
-    stamp: tuple[int, int],
-    stamp_offset: float,
-    pose_time: str,
-    direction: str,
-    region: tuple[int, int, int, int] | None,
-) -> None:
-    frames = FrameLocalizer(
-        NodeConfig(
-            readout_time=READOUT_TIME,
-            scan_direction=direction,
-            stamp_offset=stamp_offset,
-            pose_time=pose_time,
-        )
-    )
-    x, y, width, height = region or (0, 0, 0, 0)
-    roi = SimpleNamespace(x_offset=x, y_offset=y, width=width, height=height)
-    frames.calibrate(read_camera_info(make_camera_info(roi=roi)))
-    rows = [[1.0, 2.0, 3.0, 100.0, 200.0]] * 8
-    message = make_cloud_message(rows, FIELDS, point_step=40, stamp=stamp)
-    frame = localized(frames.localize(message))
-
-    # Lines that the shutter passes from the first one that is delivered to the middle of the
-    # sensor, whose exposure is tau = 0.
-    width, height = (width, height) if region else (640, 480)
-    lines = {
-        "top_to_bottom": (239.5 - y) / 479,
-        "bottom_to_top": (y + height - 1 - 239.5) / 479,
-        "left_to_right": (319.5 - x) / 639,
-        "right_to_left": (x + width - 1 - 319.5) / 639,
-    }[direction]
-    middle = stamp[0] + stamp_offset + READOUT_TIME * lines
-    published = frame.stamp_ns * 1e-9
-    if pose_time == PoseTime.STAMP:
-        assert frame.stamp_ns == frame.input_stamp_ns == stamp[0] * 1_000_000_000
-    else:
-        assert published == pytest.approx(middle, abs=1e-9)
-
-    def pose(seconds: float) -> tuple[Array, Array]:
-        rotation, translation = MOTION.at((seconds - middle) / READOUT_TIME)
-        return rotation.T, -rotation.T @ translation
-
-    rotation, position = pose(published)
-    assert np.allclose(frame.pose.rotation, rotation, atol=1e-6)
-    assert np.allclose(frame.pose.position, position, atol=1e-6)
-    step = 1e-5
-    before, after = pose(published - step), pose(published + step)
-    assert frame.twist is not None
-    linear = rotation.T @ (after[1] - before[1]) / (2 * step)
-    angular = Rotation.from_matrix(before[0].T @ after[0]).as_rotvec() / (2 * step)
-    assert np.allclose(frame.twist.linear, linear, atol=1e-5)
-    assert np.allclose(frame.twist.angular, angular, atol=1e-5)
-
-
-@pytest.mark.usefixtures("mock")
-@pytest.mark.parametrize("pose_time", list(PoseTime))
-def test_without_a_readout_time_there_is_a_pose_but_no_twist(
-    cloud: SimpleNamespace, make_camera_info: Make, pose_time: str
-) -> None:
+def test_without_a_readout_time_there_is_a_pose_but_no_twist(cloud, make_camera_info, pose_time):
     frames = FrameLocalizer(NodeConfig(stamp_offset=0.5, pose_time=pose_time))
     frames.calibrate(read_camera_info(make_camera_info()))
     frame = localized(frames.localize(cloud))
@@ -233,9 +162,7 @@ def test_without_a_readout_time_there_is_a_pose_but_no_twist(
     assert np.allclose(frame.pose.position, -rotation.T @ translation)
 
 
-def test_a_new_camera_counts_from_the_next_frame_on(
-    cloud: SimpleNamespace, make_camera_info: Make, mock: type[MockLocalizer]
-) -> None:
+def test_a_new_camera_counts_from_the_next_frame_on(cloud, make_camera_info, mock):
     notices: list[tuple[str, str]] = []
     frames = FrameLocalizer(
         NodeConfig(readout_time=READOUT_TIME, scan_direction="left_to_right"),
@@ -259,9 +186,7 @@ def test_a_new_camera_counts_from_the_next_frame_on(
     assert localized(frames.localize(cloud)).body_frame == "right_eye"
 
 
-def test_new_settings_count_from_the_next_frame_on(
-    cloud: SimpleNamespace, make_camera_info: Make, mock: type[MockLocalizer]
-) -> None:
+def test_new_settings_count_from_the_next_frame_on(cloud, make_camera_info, mock):
     frames = FrameLocalizer(NodeConfig())
     frames.calibrate(read_camera_info(make_camera_info(width=320)))
     assert localized(frames.localize(cloud)).twist is None
@@ -275,9 +200,7 @@ def test_new_settings_count_from_the_next_frame_on(
     assert localized(frames.localize(cloud)).twist is not None
 
 
-def test_a_jump_of_time_and_another_map_start_afresh(
-    mock: type[MockLocalizer], cloud: SimpleNamespace, make_camera_info: Make
-) -> None:
+def test_a_jump_of_time_and_another_map_start_afresh(mock, cloud, make_camera_info):
     notices: list[tuple[str, str]] = []
     frames = FrameLocalizer(
         NodeConfig(readout_time=READOUT_TIME), lambda *words: notices.append(words)
@@ -330,9 +253,7 @@ def simulated(direction: str, **settings: Any) -> list[tuple[Any, Any]]:
 
 @pytest.mark.parametrize("pose_time", list(PoseTime))
 @pytest.mark.parametrize("direction", list(ScanDirection))
-def test_signs_and_frames_against_the_true_motion(
-    make_camera_info: Make, direction: str, pose_time: str
-) -> None:
+def test_signs_and_frames_against_the_true_motion(make_camera_info, direction, pose_time):
     """The real localizer on simulated messages; velocities by differences of true poses."""
     frames = FrameLocalizer(
         # Exact pixels count as good to a hundredth, beside which the usual prior weighs something.
@@ -360,7 +281,7 @@ def test_signs_and_frames_against_the_true_motion(
         assert np.allclose(frame.twist.angular, angular, atol=1e-6)
 
 
-def test_no_more_than_max_points_are_used_and_that_is_said_once() -> None:
+def test_no_more_than_max_points_are_used_and_that_is_said_once():
     camera = Camera(640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]))
     rows = np.zeros(3000, [(name, "<f8") for name in "xyzuv"])
     rng = np.random.default_rng(0)

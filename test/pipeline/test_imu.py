@@ -1,7 +1,5 @@
 """An IMU that stops, lies, is late or is lost now and then: no frame is lost, none is wrong."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math
@@ -22,7 +20,7 @@ from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
-from rs_localizer.io.messages import MessageError, stamp_ns
+from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.transforms import TransformTree
 from rs_localizer.offline.replay import imu_first
@@ -58,7 +56,7 @@ class Flight:
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+def flight(tmp_path_factory) -> Flight:
     path = tmp_path_factory.mktemp("bags") / "flight"
     assert main(["simulate", str(path), *FLIGHT]) == 0
     return Flight(path)
@@ -147,7 +145,7 @@ def later(message: Any, seconds: float) -> Any:
     return result
 
 
-def test_it_makes_poses_better(flight: Flight) -> None:
+def test_it_makes_poses_better(flight):
     both, alone = fly(flight), fly(flight, lambda message, time: ())
     both.assert_none_is_lost_or_wrong(count(flight))
     assert both.state is not None
@@ -204,7 +202,7 @@ FAULTS: dict[str, tuple[Change, ImuReason]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_the_camera_goes_on_alone(flight: Flight, fault: str) -> None:
+def test_the_camera_goes_on_alone(flight, fault):
     change, reason = FAULTS[fault]
     flown = fly(flight, change)
     flown.assert_none_is_lost_or_wrong(count(flight))
@@ -215,7 +213,7 @@ def test_the_camera_goes_on_alone(flight: Flight, fault: str) -> None:
     assert (flown.state.unused is not None) == lasts
 
 
-def test_a_gyroscope_at_the_end_of_its_range(tmp_path: Path) -> None:
+def test_a_gyroscope_at_the_end_of_its_range(tmp_path):
     """A camera that is swung faster and faster: from some moment on its gyroscope lies."""
     path = tmp_path / "swung"
     poses = swinging(tmp_path / "poses.txt")
@@ -240,7 +238,7 @@ def swinging(path: Path) -> Path:
     return path
 
 
-def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight: Flight) -> None:
+def test_a_wrong_mounting_is_noticed_and_told_with_its_angle(flight):
     upside_down = copy.deepcopy(flight.mounting)
     rotation = upside_down.transforms[0].transform.rotation
     wrong = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w])
@@ -267,7 +265,7 @@ def alternating() -> Change:
     return change
 
 
-def test_two_frame_ids_in_turns_are_named(flight: Flight) -> None:
+def test_two_frame_ids_in_turns_are_named(flight):
     flown = fly(flight, alternating())
     flown.assert_none_is_lost_or_wrong(count(flight))
     assert flown.state is not None
@@ -277,9 +275,7 @@ def test_two_frame_ids_in_turns_are_named(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize(("down", "degrees"), [((0.0, 0.0, -1.0), 0.0), ((0.0, 1.0, 0.0), 90.0)])
-def test_gravity_is_compared_with_the_map(
-    flight: Flight, down: tuple[float, ...], degrees: float
-) -> None:
+def test_gravity_is_compared_with_the_map(flight, down, degrees):
     imu = Imu(gravity=True)
     flown = fly(flight, config=NodeConfig(readout_time=READOUT_TIME, imu=imu, gravity_in_map=down))
     assert flown.state is not None
@@ -287,20 +283,8 @@ def test_gravity_is_compared_with_the_map(
     assert math.degrees(flown.state.gravity) == pytest.approx(degrees, abs=5.0)
 
 
-def test_no_covariance_is_no_fault(flight: Flight) -> None:
-    def change(message: Any, time: float) -> Iterable[Any]:
-        result = copy.deepcopy(message)
-        result.angular_velocity_covariance[:] = 0.0
-        result.linear_acceleration_covariance[:] = 0.0
-        return (result,)
-
-    flown, told = fly(flight, change), fly(flight)
-    for a, b in zip(flown.frames, told.frames, strict=True):
-        assert np.array_equal(a.pose.rotation, b.pose.rotation)
-
-
 @pytest.mark.bench
-def test_two_hundred_interruptions(flight: Flight) -> None:
+def test_two_hundred_interruptions(flight):
     rng = np.random.default_rng(0)
     starts = np.sort(rng.uniform(0.0, 3.0, 200))
     ends = starts + rng.choice([0.003, 0.01, 0.03, 0.1], 200, p=[0.55, 0.3, 0.1, 0.05])
@@ -330,7 +314,7 @@ def test_two_hundred_interruptions(flight: Flight) -> None:
     assert sum(frame.estimate.tracked for frame in flown.frames) >= count(flight) - 2
 
 
-def test_frames_that_stand_alone_use_it_too(flight: Flight) -> None:
+def test_frames_that_stand_alone_use_it_too(flight):
     config = NodeConfig(readout_time=READOUT_TIME, tracking=False)
     both, alone = fly(flight, config=config), fly(flight, lambda message, time: (), config)
     both.assert_none_is_lost_or_wrong(count(flight))
@@ -340,9 +324,7 @@ def test_frames_that_stand_alone_use_it_too(flight: Flight) -> None:
     assert np.median(both.errors()[0]) < 0.75 * np.median(alone.errors()[0])
 
 
-def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_is_told(
-    flight: Flight,
-) -> None:
+def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_is_told(flight):
     for config, reason in (
         (NodeConfig(), ImuReason.NO_READOUT_TIME),
         (NodeConfig(readout_time=READOUT_TIME, solver="p3p"), ImuReason.NOT_TRACKING),
@@ -352,12 +334,3 @@ def test_without_a_readout_time_or_for_a_global_shutter_it_is_not_used_and_that_
         assert flown.state.unused is not None
         assert flown.state.unused.reason == reason
         assert flown.notices[reason] == 1
-
-
-def test_bad_messages_are_told_and_the_others_count(flight: Flight) -> None:
-    frames = FrameLocalizer(CONFIG)
-    message = next(copy.deepcopy(m) for topic, _, m in flight.items if topic == "/imu")
-    message.angular_velocity.x = math.nan
-    with pytest.raises(MessageError, match="angular_velocity is not finite"):
-        frames.imu.add(read_imu(message))
-    assert frames.imu.frame == ""

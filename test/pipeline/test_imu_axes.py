@@ -1,7 +1,5 @@
 """From the axes of the IMU to those of the camera, on a fixed mounting and on one that moves."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -34,7 +32,7 @@ def tree(samples: dict[int, Rotation], static: bool) -> TransformTree:
     return found
 
 
-def test_a_fixed_mounting_turns_rates_and_forces() -> None:
+def test_a_fixed_mounting_turns_rates_and_forces():
     mounting = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True)
     rates, forces = RNG.normal(size=(2, len(TIMES), 3))
     found = in_camera_axes(
@@ -46,7 +44,7 @@ def test_a_fixed_mounting_turns_rates_and_forces() -> None:
     assert found.times_ns is TIMES
 
 
-def test_one_frame_needs_no_transform() -> None:
+def test_one_frame_needs_no_transform():
     rates = RNG.normal(size=(len(TIMES), 3))
     empty = TransformTree()
     found = in_camera_axes(readings(rates), TIMES, empty, ("a", "a"), EXPOSURE, 0)
@@ -55,7 +53,7 @@ def test_one_frame_needs_no_transform() -> None:
         in_camera_axes(readings(rates), TIMES, empty, FRAMES, EXPOSURE, 0)
 
 
-def test_a_head_that_turns_the_camera_turns_its_rates() -> None:
+def test_a_head_that_turns_the_camera_turns_its_rates():
     """An IMU that rests in the world, and a camera that turns on it: it has the camera's rate."""
     begin = Rotation.from_euler("xyz", [20.0, -70.0, 140.0], degrees=True)
     turn = np.array([0.3, -1.0, 0.5])  # rad/s, of the camera, in its own axes
@@ -79,7 +77,7 @@ def test_a_head_that_turns_the_camera_turns_its_rates() -> None:
     np.testing.assert_allclose(found.specific_force, true.apply([0.0, 0.0, 9.8]), atol=1e-5)
 
 
-def test_a_mounting_that_is_not_known_yet_is_none() -> None:
+def test_a_mounting_that_is_not_known_yet_is_none():
     old = {NOW - ms * MS: Rotation.identity() for ms in (40, 20)}
     rates = np.zeros((len(TIMES), 3))
     with pytest.raises(TransformError, match="is known from"):

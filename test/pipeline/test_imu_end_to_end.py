@@ -3,8 +3,6 @@
 The world is the test's own: SciPy's rotations, a motion of sines, and a pinhole camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -96,9 +94,7 @@ def measured(stamp_ns: int, rate: Array) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize("direction", ROW_TIME)
-def test_pose_and_twist_are_right_whatever_is_turned_or_late(
-    direction: str, make_camera_info: Callable[..., SimpleNamespace]
-) -> None:
+def test_pose_and_twist_are_right_whatever_is_turned_or_late(direction, make_camera_info):
     tree = TransformTree()
     mounting = Transform(CAMERA_FROM_IMU.as_matrix(), np.array([0.1, 0.2, 0.3]))
     transform = make_transform(make_message, 0, "camera", "imu", mounting)

@@ -1,14 +1,12 @@
 """What is odd about a frame is said, and what is usual is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from rs_localizer.core.camera import Camera, Roi
 from rs_localizer.core.lens import LensError
 from rs_localizer.io.clouds import Correspondences
-from rs_localizer.pipeline.input_checks import lens_is_off, oddities
+from rs_localizer.pipeline.frames import lens_is_off, oddities
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera(640, 480, K)
@@ -26,12 +24,12 @@ def cloud(
     return Correspondences(0, frame, points, pixels, None, 0, table)
 
 
-def test_nothing_is_odd() -> None:
+def test_nothing_is_odd():
     assert oddities(cloud(), CAMERA, "camera") == {}
     assert oddities(cloud(pixel=(640.2, 480.1)), CAMERA, "camera") == {}  # a tracker's slack
 
 
-def test_the_cameras_own_frame() -> None:
+def test_the_cameras_own_frame():
     (text,) = oddities(cloud(frame="camera"), CAMERA, "camera").values()
     assert "header.frame_id of the cloud (or map) must name the frame of x, y, z" in text
 
@@ -40,9 +38,7 @@ def test_the_cameras_own_frame() -> None:
     ("largest", "kind", "step"),
     [(8000.0, "<f4", None), (9000.0, "<f4", "1 mm"), (500e3, "<f4", "31 mm"), (4e6, "<f8", None)],
 )
-def test_coordinates_that_single_precision_cannot_tell(
-    largest: float, kind: str, step: str | None
-) -> None:
+def test_coordinates_that_single_precision_cannot_tell(largest, kind, step):
     found = oddities(cloud(largest, kind), CAMERA, "camera")
     if step is None:
         assert found == {}
@@ -52,7 +48,7 @@ def test_coordinates_that_single_precision_cannot_tell(
         assert found["coarse_coordinates"].startswith(text)
 
 
-def test_pixels_of_another_resolution() -> None:
+def test_pixels_of_another_resolution():
     found = oddities(cloud(pixel=(1200.0, 700.0)), CAMERA, "camera")
     assert found == {
         "pixels_outside": "1 of 2 pixels lie outside the 640 x 480 of camera_info, as (1200, 700): "
@@ -63,7 +59,7 @@ def test_pixels_of_another_resolution() -> None:
     assert "2 of 2 pixels lie outside the 200 x 150" in found["pixels_outside"]
 
 
-def test_a_lens_that_is_off_is_said_in_pixels() -> None:
+def test_a_lens_that_is_off_is_said_in_pixels():
     text = lens_is_off(LensError(np.array([-0.02, 0.0]), np.eye(2), 400.0))
     assert "recalibrate the lens" in text
     assert "up to 8.0 px" in text

@@ -1,7 +1,5 @@
 """The list of inputs, and what is derived from it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,7 +23,7 @@ def bag(**topics: str) -> Any:
     return SimpleNamespace(path="bag", topics={f"/{name}": kind for name, kind in topics.items()})
 
 
-def test_the_page_of_the_node_has_every_input_with_its_type() -> None:
+def test_the_page_of_the_node_has_every_input_with_its_type():
     rows = re.findall(
         r"^\| in \| `(\w+)`.*? \| (.*?) \|", (ROOT / "docs" / "node.md").read_text(), re.M
     )
@@ -34,13 +32,13 @@ def test_the_page_of_the_node_has_every_input_with_its_type() -> None:
         assert kind.startswith(INPUTS[name].type.replace("/msg/", "/"))
 
 
-def test_the_launch_file_has_every_input() -> None:
+def test_the_launch_file_has_every_input():
     text = (ROOT / "launch" / "localizer.launch.py").read_text()
     assert set(re.findall(r"^    \"(\w+)\": \"", text, re.M)) == set(INPUTS)
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name: str) -> None:
+def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name):
     item = INPUTS[name]
     nameless = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
     sizes = dict.fromkeys(("height", "width", "point_step", "row_step", "is_bigendian"), 1)
@@ -52,7 +50,7 @@ def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name: str) 
     assert (refusal.reason in NO_FRAMES) == (item.role != Role.FRAMES)
 
 
-def test_topics_are_found_by_name_then_by_type() -> None:
+def test_topics_are_found_by_name_then_by_type():
     topics = find_topics(bag(odd=CLOUD, camera_info=INFO))
     assert topics.of == {"camera_info": "/camera_info", "correspondences": "/odd"}
     assert topics.frames == "/odd"
@@ -67,7 +65,7 @@ def test_topics_are_found_by_name_then_by_type() -> None:
     assert given.inputs["/odd"] is INPUTS["keypoints"]
 
 
-def test_what_is_not_there_or_not_clear_is_said() -> None:
+def test_what_is_not_there_or_not_clear_is_said():
     with pytest.raises(BagError, match="CameraInfo for the camera_info"):
         find_topics(bag(correspondences=CLOUD))
     with pytest.raises(BagError, match="choose with --correspondences or --keypoints"):

@@ -1,7 +1,5 @@
 """Jumps are poses that do not follow from the last one; all else is a filter's daily bread."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -10,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose, Twist
-from rs_localizer.pipeline.jumps import Jumps
+from rs_localizer.pipeline.px4 import Jumps
 
 PERIOD = 1 / 30
 
@@ -40,7 +38,7 @@ def jumps() -> Jumps:
     return Jumps(NodeConfig)
 
 
-def test_a_flight_that_goes_on_has_none(jumps: Jumps) -> None:
+def test_a_flight_that_goes_on_has_none(jumps):
     velocity, rate = np.array([5.0, 0.0, 0.0]), np.array([0.0, 0.0, 2.0])
     position, rng = np.zeros(3), np.random.default_rng(0)
     for index in range(60):
@@ -56,24 +54,24 @@ def test_a_flight_that_goes_on_has_none(jumps: Jumps) -> None:
 @pytest.mark.parametrize(
     ("position", "turn"), [((0.0, 0.3, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0))]
 )
-def test_a_step_that_nobody_makes_is_one(jumps: Jumps, position: Any, turn: Any) -> None:
+def test_a_step_that_nobody_makes_is_one(jumps, position, turn):
     jumps.add(frame(0.0, twist=twist()))
     assert jumps.add(frame(PERIOD, position, turn, twist=twist())) == 1
     assert jumps.add(frame(2 * PERIOD, position, turn, twist=twist())) == 1  # it stays there
 
 
-def test_after_a_gap_a_camera_may_be_elsewhere(jumps: Jumps) -> None:
+def test_after_a_gap_a_camera_may_be_elsewhere(jumps):
     jumps.add(frame(0.0, twist=twist()))
     assert jumps.add(frame(1.0, (0.3, 0.0, 0.0), twist=twist())) == 0
 
 
-def test_without_a_twist_any_camera_may_move(jumps: Jumps) -> None:
+def test_without_a_twist_any_camera_may_move(jumps):
     jumps.add(frame(0.0))
     assert jumps.add(frame(PERIOD, (0.1, 0.0, 0.0), (0.2, 0.0, 0.0))) == 0  # 3 m/s, 6 rad/s
     assert jumps.add(frame(2 * PERIOD, (2.0, 0.0, 0.0))) == 1
 
 
-def test_another_map_and_a_clock_that_goes_back_are_jumps(jumps: Jumps) -> None:
+def test_another_map_and_a_clock_that_goes_back_are_jumps(jumps):
     jumps.add(frame(1.0))
     assert jumps.add(frame(1.0 + PERIOD, map_frame="other")) == 1
     assert jumps.add(frame(0.0, map_frame="other")) == 2

@@ -1,13 +1,11 @@
 """From keypoints to a pose: maps that are late, missing, replaced or unfit, and what is said."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
@@ -21,8 +19,7 @@ from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
@@ -84,9 +81,7 @@ def localized(result: Localized | Refusal, truth: SimulatedFrame) -> Localized:
 
 @pytest.mark.parametrize("tracking", [True, False])
 @pytest.mark.parametrize("names", [("id",), ("descriptor",), ("id", "descriptor")])
-def test_the_true_pose(
-    frames: list[SimulatedFrame], make_camera_info: Any, names: tuple[str, ...], tracking: bool
-) -> None:
+def test_the_true_pose(frames, make_camera_info, names, tracking):
     node = localizer(make_camera_info, tracking=tracking)
     node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames:
@@ -104,28 +99,7 @@ def test_the_true_pose(
         assert result.estimate.tracked == (tracking and frame is not frames[0])
 
 
-def test_by_id_and_by_correspondences_is_the_same(
-    frames: list[SimulatedFrame], make_camera_info: Any
-) -> None:
-    """Keypoints by id are correspondences that are put together here."""
-    one, other = localizer(make_camera_info), localizer(make_camera_info)
-    one.use_map(read_map(map_cloud(LANDMARKS)))
-    for frame in frames[:4]:
-        rows = np.zeros(len(frame.ids), [(n, "<f8") for n in "xyz"] + [("u", "<f4"), ("v", "<f4")])
-        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
-            rows[name] = column
-        expected = localized(
-            other.localize(make_cloud(make_message, frame.stamp_ns, "map", rows)), frame
-        )
-        found = localized(one.localize_keypoints(keypoints(frame, "id")), frame)
-        assert found.pose.position.tolist() == expected.pose.position.tolist()
-        assert found.pose.covariance.tolist() == expected.pose.covariance.tolist()
-        assert found.inliers["residual"].tolist() == expected.inliers["residual"].tolist()
-
-
-def test_a_map_that_is_missing_and_comes_late(
-    frames: list[SimulatedFrame], make_camera_info: Any
-) -> None:
+def test_a_map_that_is_missing_and_comes_late(frames, make_camera_info):
     notices = Notices()
     node = localizer(make_camera_info, notices)
     assert node.missing == ()
@@ -143,7 +117,7 @@ def test_a_map_that_is_missing_and_comes_late(
     assert notices == []
 
 
-def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
+def test_a_map_that_is_replaced(frames, make_camera_info):
     notices = Notices()
     node = localizer(make_camera_info, notices)
     node.use_map(read_map(map_cloud(LANDMARKS)))
@@ -180,7 +154,7 @@ def test_a_map_that_is_replaced(frames: list[SimulatedFrame], make_camera_info: 
     assert len(notices) == 3
 
 
-def test_keypoints_that_give_no_pose(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
+def test_keypoints_that_give_no_pose(frames, make_camera_info):
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(LANDMARKS)))
     message = keypoints(frames[0], "id")
@@ -211,9 +185,7 @@ def test_keypoints_that_give_no_pose(frames: list[SimulatedFrame], make_camera_i
     localized(node.localize_keypoints(keypoints(frames[0], "id")), frames[0])
 
 
-def test_a_wrong_prediction_is_found_out(
-    frames: list[SimulatedFrame], make_camera_info: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
     """The camera is carried elsewhere between two frames: nothing is where it is predicted."""
     asked: list[bool] = []
 
@@ -222,7 +194,7 @@ def test_a_wrong_prediction_is_found_out(
             asked.append(arguments[3] is not None)
             return super().match(*arguments)
 
-    monkeypatch.setattr(rs_localizer.pipeline.landmarks, "Matcher", Asked)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Matcher", Asked)
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:
@@ -240,7 +212,7 @@ def test_a_wrong_prediction_is_found_out(
     assert asked == [True, False, True]
 
 
-def test_settings_of_matching(frames: list[SimulatedFrame], make_camera_info: Any) -> None:
+def test_settings_of_matching(frames, make_camera_info):
     notices = Notices()
     node = localizer(
         make_camera_info, notices, matching=Matching(max_keypoints=50, by="descriptor")
@@ -255,9 +227,7 @@ def test_settings_of_matching(frames: list[SimulatedFrame], make_camera_info: An
     localized(node.localize_keypoints(keypoints(frames[1], "id")), frames[1])
 
 
-def test_coordinates_far_from_the_origin_keep_their_digits(
-    frames: list[SimulatedFrame], make_camera_info: Any
-) -> None:
+def test_coordinates_far_from_the_origin_keep_their_digits(frames, make_camera_info):
     away = np.array([4e6, 5e5, 100.0])
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(Map(POINTS + away, IDS, LANDMARKS.descriptors, "utm"))))

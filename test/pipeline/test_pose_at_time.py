@@ -1,7 +1,5 @@
 """Pose, twist and covariances at a moment, against finite differences of the motion model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -117,7 +115,7 @@ def numerical_jacobian(
 
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
-def test_pose(rate: float, tau: float) -> None:
+def test_pose(rate, tau):
     motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
     rotation, position = pose(motion, tau)
     result = pose_at(motion, tau)
@@ -127,25 +125,16 @@ def test_pose(rate: float, tau: float) -> None:
 
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
-def test_twist_is_the_rate_of_change_of_the_pose(rate: float, tau: float) -> None:
+def test_twist_is_the_rate_of_change_of_the_pose(rate, tau):
     motion = estimate(rate, acceleration=0.2 * rate, shake=0.003)
     result = twist_at(motion, tau, READOUT_TIME)
     expected = twist(motion, tau)
     assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
 
 
-def test_many_rows_are_single_rows() -> None:
-    motion, taus = estimate(0.5, acceleration=0.1, shake=0.003), np.array([-0.5, 0.0, 0.37])
-    rotations, translations = motion.at_rows(taus)
-    for tau, rotation, translation in zip(taus, rotations, translations, strict=True):
-        map_from_camera, position = pose(motion, tau)
-        assert np.allclose(rotation.T, map_from_camera, atol=1e-13)
-        assert np.allclose(-rotation.T @ translation, position, atol=1e-13)
-
-
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
-def test_pose_covariance(rate: float, tau: float) -> None:
+def test_pose_covariance(rate, tau):
     motion = estimate(rate)
     jacobian = numerical_jacobian(lambda error: pose_error(motion, tau, error), 1e-5)
     expected = jacobian @ motion.joint_covariance @ jacobian.T
@@ -154,7 +143,7 @@ def test_pose_covariance(rate: float, tau: float) -> None:
 
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
-def test_twist_covariance(rate: float, tau: float) -> None:
+def test_twist_covariance(rate, tau):
     motion = estimate(rate)
     # Far outside the readout there is no shaking.
     covariance = motion.joint_covariance[:18, :18]
@@ -167,7 +156,7 @@ def test_twist_covariance(rate: float, tau: float) -> None:
 
 @pytest.mark.parametrize("tau", [-0.5, 0.2, 0.5])
 @pytest.mark.parametrize(("acceleration", "shake"), [(0.01, 0.0), (0.0, 0.001), (0.05, 0.001)])
-def test_covariances_of_an_uneven_motion(acceleration: float, shake: float, tau: float) -> None:
+def test_covariances_of_an_uneven_motion(acceleration, shake, tau):
     """To first order of acceleration (the default deviation is 0.01) and shaking."""
     motion = estimate(0.2, acceleration=acceleration, shake=shake)
     for found, function, step in (
@@ -180,37 +169,6 @@ def test_covariances_of_an_uneven_motion(acceleration: float, shake: float, tau:
         scale = np.sqrt(np.diag(expected))
         assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale),
                            atol=0.005)  # fmt: skip
-
-
-def test_covariances_cover_what_is_published() -> None:
-    # No derivative at all: the scatter of poses and twists of many disturbed motions.
-    motion, tau = estimate(0.5, acceleration=0.01, shake=0.003), -0.5
-    rng = np.random.default_rng(3)
-    errors = rng.multivariate_normal(
-        np.zeros(3 * len(DEVIATIONS)), 0.01 * motion.joint_covariance, size=4000
-    )
-    poses = np.array([pose_error(motion, tau, error) for error in errors])
-    now = twist(motion, tau)
-    twists = np.array([twist(disturbed(motion, error), tau) - now for error in errors])
-    for scatter, covariance in (
-        (poses, 0.01 * pose_at(motion, tau).covariance),
-        (twists, 0.01 * twist_at(motion, tau, READOUT_TIME).covariance),
-    ):
-        squares = np.einsum("ni,ij,nj->n", scatter, np.linalg.inv(covariance), scatter)
-        # Chi-square of six degrees of freedom: mean 6, and 5 % beyond 12.59.
-        assert np.mean(squares) == pytest.approx(6.0, abs=0.25)
-        assert np.mean(squares > 12.59) == pytest.approx(0.05, abs=0.015)
-
-
-@pytest.mark.parametrize("tau", TAUS)
-def test_covariances_are_symmetric(tau: float) -> None:
-    motion = estimate(0.5)
-    for covariance in (
-        pose_at(motion, tau).covariance,
-        twist_at(motion, tau, READOUT_TIME).covariance,
-    ):
-        assert np.array_equal(covariance, covariance.T)
-        assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
 
 
 def test_an_uncertain_readout_time_enters_both_covariances():
@@ -241,7 +199,7 @@ def test_an_uncertain_readout_time_enters_both_covariances():
 
 
 @pytest.mark.parametrize("tau", [-0.67, -2.5, 0.7])
-def test_nothing_runs_away_beyond_the_rows(tau: float) -> None:
+def test_nothing_runs_away_beyond_the_rows(tau):
     # A stamp outside the exposure, as of cameras that stamp its start; shaking of high
     # frequencies, and a gyroscope whose samples end with the rows.
     rng = np.random.default_rng(0)
@@ -266,9 +224,7 @@ def test_nothing_runs_away_beyond_the_rows(tau: float) -> None:
 
 @pytest.mark.parametrize("rate_error", [None, 1e-9 * np.eye(3), np.eye(3)])
 @pytest.mark.parametrize("tau", [-0.5, 0.0, 0.31])
-def test_the_kernels_are_plain_arithmetic_beside_a_gyroscope(
-    rate_error: Array | None, tau: float
-) -> None:
+def test_the_kernels_are_plain_arithmetic_beside_a_gyroscope(rate_error, tau):
     samples = np.linspace(-0.6, 0.6, 25)
     rates = 0.1 * np.sin(np.outer(samples, [20.0, 25.0, 30.0]) + 1.0)
     known = KnownTurn.of(samples, rates, rate_noise=0.003, delay=0.02)

@@ -1,7 +1,5 @@
 """Alarms of a wrong readout time, and finding it, while frames are localized; hand motion."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace as changed
 from functools import cache
@@ -70,7 +68,7 @@ def watched(count: int = FRAMES, **settings: Any) -> tuple[FrameLocalizer, list[
 
 @pytest.mark.parametrize("tracking", [True, False])
 @pytest.mark.parametrize("factor", [0.8, 1.2])
-def test_a_wrong_readout_time_is_said_once(factor: float, tracking: bool) -> None:
+def test_a_wrong_readout_time_is_said_once(factor, tracking):
     frames, notices = watched(readout_time=factor * READOUT, tracking=tracking)
     assert len(notices) == 1
     assert notices[0].startswith("estimated readout time ")
@@ -91,7 +89,7 @@ def test_a_wrong_readout_time_is_said_once(factor: float, tracking: bool) -> Non
     assert known < (factor * READOUT / error) ** 2
 
 
-def test_the_right_one_is_confirmed() -> None:
+def test_the_right_one_is_confirmed():
     frames, notices = watched(readout_time=READOUT)
     assert notices == []
     assert frames.readout_watch.fault == ""
@@ -101,7 +99,7 @@ def test_the_right_one_is_confirmed() -> None:
     assert abs(found.readout_time - READOUT) < 4.0 * found.deviation
 
 
-def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm() -> None:
+def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
     # Its images were exposed 5 ms rms beside their stamps; `calibrate` says 12.9 +- 1.1 ms.
     notices: list[str] = []
     frames = FrameLocalizer(NodeConfig(readout_time=0.0129), lambda name, _: notices.append(name))
@@ -112,7 +110,7 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm() -> None:
 
 
 @pytest.mark.parametrize("tracking", [True, False])
-def test_a_reversed_scan_is_said_and_covariances_hold(tracking: bool) -> None:
+def test_a_reversed_scan_is_said_and_covariances_hold(tracking):
     given = {"readout_time": READOUT, "tracking": tracking}
     frames, (text,) = watched(FRAMES - 1, scan_direction="bottom_to_top", **given)
     assert "against scan_direction bottom_to_top" in text
@@ -137,7 +135,7 @@ def within(error: np.ndarray, covariance: np.ndarray) -> bool:
     return bool(error @ np.linalg.solve(covariance, error) < 16.8)  # 99 % of six
 
 
-def test_a_global_shutter_has_no_twist() -> None:
+def test_a_global_shutter_has_no_twist():
     frames = FrameLocalizer(NodeConfig(readout_time=READOUT))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         for (_, found), _ in zip(replay(bag, find_topics(bag), frames), range(40), strict=False):
@@ -147,7 +145,7 @@ def test_a_global_shutter_has_no_twist() -> None:
 
 
 @pytest.mark.parametrize("tracking", [True, False])
-def test_a_global_shutter_is_known_within_a_second_and_stays_one(tracking: bool) -> None:
+def test_a_global_shutter_is_known_within_a_second_and_stays_one(tracking):
     frames = FrameLocalizer(NodeConfig(readout_time=READOUT, tracking=tracking))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         for (_, found), _ in zip(replay(bag, find_topics(bag), frames), range(30), strict=False):
@@ -158,7 +156,7 @@ def test_a_global_shutter_is_known_within_a_second_and_stays_one(tracking: bool)
 
 
 @pytest.mark.parametrize("change", ["reset", "settings", "camera", "map"])
-def test_what_changes_starts_afresh(change: str) -> None:
+def test_what_changes_starts_afresh(change):
     frames, notices = watched(40, readout_time=0.8 * READOUT)
     assert notices
     if change == "reset":
@@ -176,14 +174,14 @@ def test_what_changes_starts_afresh(change: str) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"solver": "p3p", "readout_time": READOUT}])
-def test_nothing_is_measured_that_nobody_uses(settings: dict[str, Any]) -> None:
+def test_nothing_is_measured_that_nobody_uses(settings):
     frames, notices = watched(30, **settings)
     assert frames.readout_watch.measured is None
     assert notices == []
 
 
 @pytest.mark.parametrize("direction", ["top_to_bottom", "bottom_to_top"])
-def test_the_readout_time_from_nothing(direction: str) -> None:
+def test_the_readout_time_from_nothing(direction):
     given = {"estimate_readout_time": True, "scan_direction": direction}
     frames, notices = watched(FRAMES - 1, **given)
     assert len(notices) == 1
@@ -214,7 +212,7 @@ def sideways(count: int, **settings: Any) -> tuple[FrameLocalizer, list[str], li
 
 
 @pytest.mark.parametrize("tracking", [True, False])
-def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking: bool) -> None:
+def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking):
     # Before: more than half of the frames had poses 0.5 to 2.5 degrees off, all beyond 5 sigma,
     # and the advice was to calibrate again, or that the shutter is a global one.
     frames, notices, posed = sideways(FRAMES, readout_time=READOUT, tracking=tracking)
@@ -229,7 +227,7 @@ def test_the_wrong_axis_is_named_and_no_pose_comes_of_it(tracking: bool) -> None
     assert tracking or not any("global" in text for text in notices)
 
 
-def test_the_axis_is_found_with_the_readout_time() -> None:
+def test_the_axis_is_found_with_the_readout_time():
     frames, _, posed = sideways(110, estimate_readout_time=True)
     assert frames.config.scan_direction == "left_to_right"
     assert frames.config.readout_time == pytest.approx(READOUT, rel=0.06)

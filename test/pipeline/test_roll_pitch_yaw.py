@@ -1,7 +1,5 @@
 """Covariances about roll, pitch and yaw are those of these angles, by drawing poses."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -11,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
 from rs_localizer.io.transforms import TransformTree
-from rs_localizer.pipeline.body import about_angles
-from rs_localizer.pipeline.published import of_body
+from rs_localizer.pipeline.published import about_angles, of_body
 
 
 def pose(roll: float, pitch: float, yaw: float, root: Any) -> Pose:
@@ -23,7 +20,7 @@ def pose(roll: float, pitch: float, yaw: float, root: Any) -> Pose:
 @pytest.mark.parametrize(
     "angles", [(0.0, 0.0, 90.0), (10.0, -20.0, 130.0), (-40.0, 60.0, -70.0), (170.0, 5.0, 0.0)]
 )
-def test_the_angles_scatter_as_it_says(angles: tuple[float, float, float]) -> None:
+def test_the_angles_scatter_as_it_says(angles):
     rng = np.random.default_rng(1)
     root = 1e-3 * rng.normal(size=(6, 6))
     true = pose(*angles, root)
@@ -37,17 +34,17 @@ def test_the_angles_scatter_as_it_says(angles: tuple[float, float, float]) -> No
     np.testing.assert_allclose(found / size, drawn / size, atol=0.04)
 
 
-def test_ahead_it_is_the_same() -> None:
+def test_ahead_it_is_the_same():
     level = pose(0.0, 0.0, 0.0, np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
     np.testing.assert_allclose(about_angles(level).covariance, level.covariance, atol=1e-15)
 
 
-def test_straight_up_it_stays() -> None:
+def test_straight_up_it_stays():
     up = pose(0.0, -89.9, 0.0, np.eye(6))
     assert about_angles(up) is up
 
 
-def test_it_is_published_when_it_is_asked_for() -> None:
+def test_it_is_published_when_it_is_asked_for():
     unused: Any = None
     side = pose(0.0, 0.0, 90.0, np.diag([1.0, 1.0, 1.0, 0.1, 0.2, 0.3]))
     frame = Localized(5, 5, "map", "camera", side, None, unused, 0, unused)

@@ -1,11 +1,8 @@
 """Signals at any moment: an orderly end, and nothing that is not whole."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -29,7 +26,7 @@ with StopSignals():
 """
 
 
-def test_random_signals() -> None:
+def test_random_signals():
     ended = list(campaign(10, seed=1, commands=("replay", "detect", "markers")))
     assert [one for one in ended if one.fault] == []
     assert any(one.code > 128 for one in ended)
@@ -37,7 +34,7 @@ def test_random_signals() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("body", ["import numba.fake", "Finalized()"])
-def test_no_interrupt_is_lost(tmp_path: Path, number: int, body: str) -> None:
+def test_no_interrupt_is_lost(tmp_path, number, body):
     """Nor raised where code from C would lose it, or be left half done."""
     folder = f"{tmp_path}"
     package = tmp_path / "numba"
@@ -55,7 +52,7 @@ def test_no_interrupt_is_lost(tmp_path: Path, number: int, body: str) -> None:
     assert ended.returncode == 0
 
 
-def test_who_compiles_for_long_is_ended(tmp_path: Path) -> None:
+def test_who_compiles_for_long_is_ended(tmp_path):
     (tmp_path / "numba.py").write_text("import time\ntime.sleep(60)\n")
     body = (
         "import threading; threading.Timer(0.5, os.kill, (os.getpid(), 15)).start(); import numba"

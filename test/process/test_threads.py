@@ -1,7 +1,5 @@
 """Programs of this package keep linear algebra in one thread; BLAS itself is asked."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -52,9 +50,9 @@ def many() -> list[int]:
 
 
 @pytest.mark.parametrize("program", [COMMAND, NODE])
-def test_one_thread(program: str, many: list[int]) -> None:
+def test_one_thread(program, many):
     assert threads(program) == [1] * len(many)
 
 
-def test_the_user_decides(many: list[int]) -> None:
+def test_the_user_decides(many):
     assert threads(COMMAND, OPENBLAS_NUM_THREADS="2") == [2] * len(many)

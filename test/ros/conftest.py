@@ -1,7 +1,5 @@
 """A real node in its own process, and a peer that talks to it over DDS."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os
@@ -131,7 +129,7 @@ class Peer:
 
 
 @pytest.fixture
-def start_node(tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
+def start_node(tmp_path) -> Iterator[Callable[..., NodeProcess]]:
     started: list[NodeProcess] = []
 
     def start(*arguments: str, run: str = RUN, **environment: str) -> NodeProcess:

@@ -1,7 +1,5 @@
 """``localizer --help`` and ``--version`` answer, and start no node."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -21,7 +19,7 @@ from rs_localizer.settings import settings
         ("feature_detector", FeatureConfig),
     ],
 )
-def test_help_names_every_parameter_with_its_default(name: str, kind: type) -> None:
+def test_help_names_every_parameter_with_its_default(name, kind):
     text = answer(name, ["--help"])
     assert text is not None
     assert f"ros2 run rs_localizer {name} --ros-args" in text
@@ -32,7 +30,7 @@ def test_help_names_every_parameter_with_its_default(name: str, kind: type) -> N
 
 
 @pytest.mark.parametrize(("function", "word"), [("main", "--version"), ("marker_detector", "-h")])
-def test_the_executables(function: str, word: str) -> None:
+def test_the_executables(function, word):
     code = f"import sys; from rs_localizer.ros.main import {function} as f; sys.exit(f([{word!r}]))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False

@@ -1,7 +1,5 @@
 """Work by several threads comes back in order, a few at a time; images survive their encoding."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -10,7 +8,7 @@ import pytest
 from rs_localizer.simulation.image_sequence import in_order
 
 
-def test_results_come_in_order_and_few_wait() -> None:
+def test_results_come_in_order_and_few_wait():
     started: list[int] = []
 
     def work(item: int) -> int:
@@ -25,7 +23,7 @@ def test_results_come_in_order_and_few_wait() -> None:
     assert list(results) == [item**2 for item in range(3, 200)]
 
 
-def test_an_error_ends_the_work() -> None:
+def test_an_error_ends_the_work():
     before = threading.active_count()
 
     def work(item: int) -> int:

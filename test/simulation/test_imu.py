@@ -1,7 +1,5 @@
 """The simulated IMU against the motion itself: what it measures, integrated, is the motion."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -25,7 +23,7 @@ def steady(duration: float) -> ConstantVelocity:
     )
 
 
-def test_the_motion_comes_back_when_it_is_integrated() -> None:
+def test_the_motion_comes_back_when_it_is_integrated():
     """Dead reckoning by the midpoint rule, over a second of a hand that shakes."""
     hand = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     motion = Shaken(hand, math.radians(0.3), 60.0, np.array([0.6, 0.0, 0.8]), 1.0)
@@ -53,7 +51,7 @@ def test_the_motion_comes_back_when_it_is_integrated() -> None:
     assert np.linalg.norm(there - start.positions[0]) > 0.1  # it has been somewhere
 
 
-def test_a_steady_turn_pulls_towards_its_centre() -> None:
+def test_a_steady_turn_pulls_towards_its_centre():
     track = simulate_imu(steady(0.5), PERFECT, LEVER, RNG)
     turn = np.array([0.3, -1.0, 0.7])
     np.testing.assert_allclose(track.angular_velocities @ CAMERA_FROM_IMU.T - turn, 0.0, atol=1e-12)
@@ -63,7 +61,7 @@ def test_a_steady_turn_pulls_towards_its_centre() -> None:
     np.testing.assert_allclose(track.specific_forces @ CAMERA_FROM_IMU.T, up + inwards, atol=1e-6)
 
 
-def test_noise_bias_and_clock_are_those_that_were_asked_for() -> None:
+def test_noise_bias_and_clock_are_those_that_were_asked_for():
     settings = ImuSettings(400.0, 2e-3, 0.02, 1e-3, 0.05, 0.1, time_offset=-0.007)
     track = simulate_imu(steady(50.0), settings, LEVER, np.random.default_rng(1))
     clean = simulate_imu(steady(50.0), ImuSettings(400.0, *[0.0] * 5), LEVER, RNG)
@@ -78,7 +76,7 @@ def test_noise_bias_and_clock_are_those_that_were_asked_for() -> None:
     assert np.std(force - force.mean(axis=0)) == pytest.approx(0.05 * 20.0, rel=0.02)
 
 
-def test_a_shaken_camera_turns_as_its_poses_do() -> None:
+def test_a_shaken_camera_turns_as_its_poses_do():
     motion = shaken(steady(2.0), [(0.3, 60.0), (0.1, 120.0)], np.random.default_rng(2))
     at, h = np.linspace(0.1, 1.9, 50), 1e-6
     now = motion.state(10**18, at)

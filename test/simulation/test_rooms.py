@@ -1,7 +1,5 @@
 """The room with markers: they are read where its map says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -25,15 +23,13 @@ def motion() -> RecordedMotion:
 
 
 @pytest.fixture(scope="module")
-def scene(motion: RecordedMotion) -> Scene:
+def scene(motion) -> Scene:
     return marked_room(sampled_states(motion))
 
 
 # When the camera looks at the walls, one after the other (s).
 @pytest.mark.parametrize("seconds", [28.5, 31.0, 35.0, 38.0])
-def test_markers_are_read_where_they_are(
-    motion: RecordedMotion, scene: Scene, seconds: float
-) -> None:
+def test_markers_are_read_where_they_are(motion, scene, seconds):
     """Unmirrored, and to within a few hundredths of a pixel."""
     assert scene.marker_map is not None
     stamp = motion.intervals_ns[0][0] + round(1e9 * seconds)

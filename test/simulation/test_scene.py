@@ -1,7 +1,5 @@
 """The room surrounds the way, leaves it free, and has depth."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rs_localizer.simulation.scene import room
@@ -9,7 +7,7 @@ from rs_localizer.simulation.scene import room
 WAY = np.stack([np.linspace(-2, 2, 50), np.linspace(0, 1, 50), np.ones(50)], axis=1)
 
 
-def test_room_surrounds_the_way_and_leaves_it_free() -> None:
+def test_room_surrounds_the_way_and_leaves_it_free():
     points = room(WAY, np.random.default_rng(1), count=4000)
     assert points.shape == (4000, 3)
     assert np.all(points.min(axis=0) < WAY.min(axis=0) - 1.4)

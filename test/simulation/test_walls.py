@@ -1,7 +1,5 @@
 """Scenes: markers are where their map says, and most of a real motion sees them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -33,7 +31,7 @@ def pixels(corners: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> n
 
 
 @pytest.mark.parametrize("wall", [0, 1, 2])
-def test_markers_are_where_the_map_says(way: TrueState, wall: int) -> None:
+def test_markers_are_where_the_map_says(way, wall):
     """OpenCV reads each of them, upright and unmirrored, at the corners of the map."""
     scene = three_walls(way)
     plane = scene.planes[wall]
@@ -61,7 +59,7 @@ def detect(image: np.ndarray, dictionary: object) -> dict[int, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", list(SCENES))
-def test_every_scene_shows_something_before_the_camera(name: str) -> None:
+def test_every_scene_shows_something_before_the_camera(name):
     motion = ConstantVelocity(np.array([0.0, 0.5, 0.0]), np.array([0.3, 0.0, 0.0]), 1.0)
     scene = SCENES[name](sampled_states(motion))
     image = Renderer(CAMERA, scene.planes).image(motion, 0)

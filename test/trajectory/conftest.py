@@ -1,7 +1,5 @@
 """Makes the tests' own projector importable."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

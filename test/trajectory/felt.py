@@ -4,8 +4,6 @@ Nothing of it is the package's code, but for the spline that the camera's motion
 The map has a size and an orientation of its own: gravity points anywhere in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,7 +37,7 @@ class Felt:
     way: float = WAY
 
     @staticmethod
-    def random(seed: int, **other: Any) -> Felt:
+    def random(seed: int, **other: Any) -> "Felt":
         rng = np.random.default_rng(seed)
         frequencies = 2.0 * np.pi * rng.uniform(0.15, 1.3, (6, 4))
         return Felt(frequencies, rng.uniform(0.0, 6.28, (6, 4)), **other)

@@ -4,8 +4,6 @@ Motion: sums of sines in each of three rotation angles and three coordinates. Le
 radial and tangential distortion. The row of each point is found by bisection.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +23,7 @@ class Motion:
     phases: np.ndarray
 
     @staticmethod
-    def random(rng: np.random.Generator, turn: float = 0.14, way: float = 0.08) -> Motion:
+    def random(rng: np.random.Generator, turn: float = 0.14, way: float = 0.08) -> "Motion":
         """Hand motion: some 70 deg/s and 9 rad/s^2 at the default."""
         shape = (6, 4)
         frequencies = 2.0 * np.pi * rng.uniform(0.3, 2.0, shape)

@@ -1,7 +1,5 @@
 """The prior of the accelerations against dense covariances, and what an estimate says of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import projector
 from scipy.linalg import toeplitz
@@ -55,7 +53,7 @@ def by_hand(spline: Spline, fading: float) -> float:
     return float(cost)
 
 
-def test_the_prior_is_that_of_accelerations_that_fade() -> None:
+def test_the_prior_is_that_of_accelerations_that_fade():
     spline = two_stretches()
     for fading in (0.0, FADING):
         freedom = Freedom(angular_acceleration=ANGULAR, linear_acceleration=LINEAR, fading=fading)
@@ -69,7 +67,7 @@ def test_the_prior_is_that_of_accelerations_that_fade() -> None:
             np.testing.assert_allclose(normal.slope[k], slope, rtol=1e-5, atol=1e-4)
 
 
-def test_the_keypoints_tell_as_many_numbers_as_the_trace_says() -> None:
+def test_the_keypoints_tell_as_many_numbers_as_the_trace_says():
     rng = np.random.default_rng(1)
     motion, camera = projector.Motion.random(rng), make_camera()
     frames = projector.record(rng, motion, projector.room(rng, 60), readout=0.03, seconds=0.6)

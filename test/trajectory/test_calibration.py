@@ -1,7 +1,5 @@
 """Calibration of whole recordings of the tests' own projector, and of the real ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -40,7 +38,7 @@ def agrees(found: Calibration, readout: float, least: float) -> None:
 
 
 @pytest.mark.parametrize(("points", "outliers", "noise"), [("board", 0.0, 0.1), ("room", 0.3, 0.5)])
-def test_readout_time_and_direction(points: str, outliers: float, noise: float) -> None:
+def test_readout_time_and_direction(points, outliers, noise):
     found = calibrate(CAMERA, list(recording(0.02, points, outliers=outliers, noise=noise)))
     agrees(found, 0.02, 1e-4)
     assert verdict.scan_direction(found) == "top_to_bottom"
@@ -49,7 +47,7 @@ def test_readout_time_and_direction(points: str, outliers: float, noise: float) 
     assert verdict.refusal(found) == ""
 
 
-def test_the_reversed_direction_is_found() -> None:
+def test_the_reversed_direction_is_found():
     found = calibrate(CAMERA, list(recording(-0.02)))
     agrees(found, -0.02, 1e-4)
     assert verdict.scan_direction(found) == "bottom_to_top"
@@ -70,7 +68,7 @@ def says_what_it_holds(found: Calibration) -> None:
     assert any("map's 500 points" in remark for remark in verdict.remarks(held))
 
 
-def test_a_global_shutter_is_one() -> None:
+def test_a_global_shutter_is_one():
     found = calibrate(CAMERA, list(recording(0.0)))
     assert found.global_shutter
     assert abs(found.readout_time) < 3.0 * found.deviation < 3e-4
@@ -82,13 +80,13 @@ def test_a_global_shutter_is_one() -> None:
     assert verdict.readout_time(replace(processed, readout_time=0.004)) == 0.004
 
 
-def test_a_camera_at_rest_determines_nothing() -> None:
+def test_a_camera_at_rest_determines_nothing():
     found = calibrate(CAMERA, list(recording(0.02, turn=1e-5, seconds=1.2)))
     assert not found.determined
     assert "not observable" in verdict.refusal(found)
 
 
-def test_irregular_stamps_are_noticed_and_do_little_harm() -> None:
+def test_irregular_stamps_are_noticed_and_do_little_harm():
     rng = np.random.default_rng(1)
     images = [
         replace(image, stamp_ns=image.stamp_ns + round(3e6 * rng.normal()))
@@ -101,7 +99,7 @@ def test_irregular_stamps_are_noticed_and_do_little_harm() -> None:
     assert any("irregular" in remark for remark in verdict.remarks(found))
 
 
-def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree() -> None:
+def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
     """Stabilisation: a part of the motion is taken out of the images, more or less of it."""
     images = list(recording(0.02, seconds=1.3)) + [
         replace(image, stamp_ns=image.stamp_ns + 10**10)
@@ -113,7 +111,7 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree() -> None:
     assert not any("times less likely" in remark for remark in verdict.remarks(found))
 
 
-def test_two_parts_are_too_few_and_a_principal_point_lies_inside() -> None:
+def test_two_parts_are_too_few_and_a_principal_point_lies_inside():
     found = calibrate(CAMERA, list(recording(0.02)))
     assert verdict.refusal(found) == ""
     short = replace(found, blocks=found.blocks[:2])
@@ -125,7 +123,7 @@ def test_two_parts_are_too_few_and_a_principal_point_lies_inside() -> None:
     assert "outside the image" in verdict.refusal(replace(found, fit=replace(fit, camera=beside)))
 
 
-def test_images_without_the_board_are_not_missing() -> None:
+def test_images_without_the_board_are_not_missing():
     images = list(recording(0.02))
     nothing = np.zeros((0, 3)), np.zeros((0, 2))
     images[30:33] = [Observed(image.stamp_ns, *nothing) for image in images[30:33]]
@@ -134,7 +132,7 @@ def test_images_without_the_board_are_not_missing() -> None:
     assert found.images == len(images) - 3
 
 
-def test_a_bent_board_is_found_and_its_lens_with_it() -> None:
+def test_a_bent_board_is_found_and_its_lens_with_it():
     """A board that is bent by 1 %: shape and lens, and what the lens is off by."""
     rng = np.random.default_rng(3)
     flat = projector.board(8, 6, 0.12)
@@ -158,7 +156,7 @@ def test_a_bent_board_is_found_and_its_lens_with_it() -> None:
         assert error < 4.0 * deviation
 
 
-def test_a_lens_from_nothing() -> None:
+def test_a_lens_from_nothing():
     images = list(recording(0.02, seconds=3.0, turn=0.15))
     camera = first_lens((projector.WIDTH, projector.HEIGHT), in_order(images))
     assert camera.K[0, 0] == pytest.approx(projector.FOCAL, rel=0.3)
@@ -172,7 +170,7 @@ def test_a_lens_from_nothing() -> None:
 
 
 @pytest.mark.parametrize("model", ["equidistant", "plumb_bob"])
-def test_the_distortion_model_is_that_of_the_lens(model: str) -> None:
+def test_the_distortion_model_is_that_of_the_lens(model):
     """A fisheye of 150 degrees that shows a board in every direction; and an ordinary lens."""
     rng, flat = np.random.default_rng(2), projector.board(8, 6, 0.05, 0.0)
     camera = CAMERA
@@ -194,7 +192,7 @@ def test_the_distortion_model_is_that_of_the_lens(model: str) -> None:
     np.testing.assert_allclose(found.distort(corner)[0], camera.distort(corner)[0], atol=1.0)
 
 
-def test_too_little_is_refused_with_figures() -> None:
+def test_too_little_is_refused_with_figures():
     images = list(recording())
     with pytest.raises(ValueError, match="5 images show the map, at least 20"):
         calibrate(CAMERA, images[:5])
@@ -203,7 +201,7 @@ def test_too_little_is_refused_with_figures() -> None:
         calibrate(CAMERA, elsewhere)
 
 
-def test_stamps_of_an_even_camera_with_missing_images() -> None:
+def test_stamps_of_an_even_camera_with_missing_images():
     times = np.delete(np.arange(100) / 30.0, [10, 11, 50])
     found = examine(times)
     assert found.interval == pytest.approx(1 / 30, rel=1e-9)

@@ -1,7 +1,5 @@
 """The estimator: its normal equations against differences, its results against an own projector."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -97,7 +95,7 @@ def as_dense(normal: Normal) -> np.ndarray:
 
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
 @pytest.mark.parametrize("distortion", ["plumb_bob", "equidistant"])
-def test_the_normal_matrix_is_the_derivative_of_the_slope(direction: str, distortion: str) -> None:
+def test_the_normal_matrix_is_the_derivative_of_the_slope(direction, distortion):
     problem, state = small_problem(np.random.default_rng(0), direction, distortion)
     _, normal = problem.normal(state, 1.0)
     controls, border = len(normal.slope), problem.border
@@ -116,7 +114,7 @@ def test_the_normal_matrix_is_the_derivative_of_the_slope(direction: str, distor
         np.testing.assert_allclose(numeric / scale, dense[k] / scale, atol=2e-4)
 
 
-def test_steps_and_covariances_are_those_of_the_dense_system() -> None:
+def test_steps_and_covariances_are_those_of_the_dense_system():
     problem, state = small_problem(np.random.default_rng(1))
     _, normal = problem.normal(state, 1.0)
     normal.slope[:] = np.random.default_rng(2).normal(size=len(normal.slope))
@@ -135,7 +133,7 @@ def test_steps_and_covariances_are_those_of_the_dense_system() -> None:
         np.testing.assert_allclose(covariance, inverse[at, at], rtol=1e-5, atol=1e-9)
 
 
-def test_truth_without_noise() -> None:
+def test_truth_without_noise():
     rng = np.random.default_rng(3)
     motion, camera = projector.Motion.random(rng, 0.03, 0.02), make_camera()
     frames = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=2.0,
@@ -153,7 +151,7 @@ def test_truth_without_noise() -> None:
 
 
 @pytest.mark.parametrize(("readout", "outliers", "axis"), [(0.03, 0.0, 1), (-0.02, 0.3, 0)])
-def test_noise_outliers_directions(readout: float, outliers: float, axis: int) -> None:
+def test_noise_outliers_directions(readout, outliers, axis):
     rng = np.random.default_rng(4)
     motion = projector.Motion.random(rng)
     camera = make_camera(scan_direction="top_to_bottom" if axis else "left_to_right")
@@ -180,7 +178,7 @@ def test_noise_outliers_directions(readout: float, outliers: float, axis: int) -
         assert 0.5 < squared.mean() < 2.0
 
 
-def test_a_wrong_lens_and_a_bent_board_are_found() -> None:
+def test_a_wrong_lens_and_a_bent_board_are_found():
     rng = np.random.default_rng(5)
     motion, flat = projector.Motion.random(rng, 0.2, 0.12), projector.board(6, 5, 0.16)
     bent = flat + np.column_stack([np.zeros((len(flat), 2)), 4e-3 * np.sin(5.0 * flat[:, 0])])
@@ -197,7 +195,7 @@ def test_a_wrong_lens_and_a_bent_board_are_found() -> None:
     assert found.deviation == pytest.approx(0.1, rel=0.1)
 
 
-def test_images_with_times_of_their_own() -> None:
+def test_images_with_times_of_their_own():
     """Stamps that are 3 ms off: without the images' own times the readout time pays for it."""
     rng = np.random.default_rng(6)
     motion, camera = projector.Motion.random(rng), make_camera()

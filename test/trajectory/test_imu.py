@@ -1,7 +1,5 @@
 """A gyroscope beside the camera: derivatives, what is found of it, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +35,7 @@ def spline_of(motion: projector.Motion, seconds: float, spacing: float) -> Splin
     return Spline(layout, *motion.pose(layout.control_times()))
 
 
-def test_derivatives_are_those_of_the_errors() -> None:
+def test_derivatives_are_those_of_the_errors():
     rng = np.random.default_rng(0)
     motion = projector.Motion.random(rng)
     mount = GyroMount(CAMERA_FROM_IMU, BIAS, 0.003, rng.normal(0.0, 0.05, 6))
@@ -64,7 +62,7 @@ def test_derivatives_are_those_of_the_errors() -> None:
             np.testing.assert_allclose(turns.by_controls[sample, :, k], numeric[sample], atol=1e-5)
 
 
-def test_offset_rotation_and_bias_are_found() -> None:
+def test_offset_rotation_and_bias_are_found():
     """An offset of 5 ms to 0.1 ms, although the gyroscope's scales are 1 % off."""
     rng, seconds, readout = np.random.default_rng(3), 3.0, 0.02
     motion = projector.Motion.random(rng)
@@ -92,7 +90,7 @@ def test_offset_rotation_and_bias_are_found() -> None:
     assert abs(found.readout_time - readout) < 4.0 * found.deviation < 2e-4
 
 
-def test_a_turn_about_one_axis_leaves_the_rotation_about_it_open() -> None:
+def test_a_turn_about_one_axis_leaves_the_rotation_about_it_open():
     """A rotation that is given stands in where the motion says nothing."""
     rng = np.random.default_rng(2)
     motion = projector.Motion.random(rng)
@@ -104,7 +102,7 @@ def test_a_turn_about_one_axis_leaves_the_rotation_about_it_open() -> None:
     assert between.magnitude() < np.radians(3.0)
 
 
-def test_what_does_not_go_together_is_refused() -> None:
+def test_what_does_not_go_together_is_refused():
     rng = np.random.default_rng(1)
     motion, other = projector.Motion.random(rng), projector.Motion.random(rng)
     spline = spline_of(motion, 3.0, 1 / 30)

@@ -1,7 +1,5 @@
 """Metres and gravity from an accelerometer: the equations, what is found, and how honest it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +35,7 @@ def means_of(felt: Felt, noise: float = 0.0, seed: int = 0, spacing: float = 0.1
     )
 
 
-def test_both_sides_are_the_same_number() -> None:
+def test_both_sides_are_the_same_number():
     """``s p'' + (R l)'' = R C (f - b) + g`` of all means, by the test's own truth."""
     felt = Felt.random(0)
     for part in means_of(felt):
@@ -48,7 +46,7 @@ def test_both_sides_are_the_same_number() -> None:
         assert np.std(felt.scale * part.seen) > 0.3
 
 
-def test_all_is_found() -> None:
+def test_all_is_found():
     felt = Felt.random(1)
     found = metric(means_of(felt), UNKNOWN)
     assert found.scale == pytest.approx(felt.scale, rel=2e-3)
@@ -65,7 +63,7 @@ def angle(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(sine, one @ other)))
 
 
-def test_an_accelerometer_that_shows_too_much_makes_nothing_larger() -> None:
+def test_an_accelerometer_that_shows_too_much_makes_nothing_larger():
     """2 %: gravity's known length says so."""
     felt = Felt.random(2)
     parts = [replace(part, forces=1.02 * part.forces) for part in means_of(felt)]
@@ -102,7 +100,7 @@ def noisy_means(felt: Felt, seed: int, noise: float = 3e-3) -> list[Means]:
 
 
 @pytest.mark.bench
-def test_deviations_are_honest() -> None:
+def test_deviations_are_honest():
     scales, tilts = [], []
     for seed in range(8):
         felt, found = noisy(seed)
@@ -120,7 +118,7 @@ def growing(parts: list[Means], more: float) -> list[Means]:
     return [replace(part, seen=s * part.seen) for part, s in zip(parts, sizes, strict=True)]
 
 
-def test_parts_of_other_sizes_widen_the_deviation() -> None:
+def test_parts_of_other_sizes_widen_the_deviation():
     """A map that is 4 % larger at its end; a rest of as long says nothing of sizes."""
     felt = Felt.random(30)
     parts = noisy_means(felt, 0)
@@ -133,13 +131,13 @@ def test_parts_of_other_sizes_widen_the_deviation() -> None:
     assert abs(found.scale / felt.scale - 1.0) < 3.0 * found.inflation * found.share < 0.06
 
 
-def test_noise_of_positions_makes_nothing_smaller() -> None:
+def test_noise_of_positions_makes_nothing_smaller():
     """As it would where accelerations of images are what is regressed on."""
     ratios = [found.scale / felt.scale for felt, found in (noisy(seed, 0.01) for seed in range(4))]
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_covariance_is_that_of_white_noise() -> None:
+def test_the_covariance_is_that_of_white_noise():
     """Of positions: means of a motion that is noise alone, by their own sums."""
     rng, spacing = np.random.default_rng(0), 0.1
     layout = Layout.over(np.array([[0.0, 80.0]]), 0.004)
@@ -155,7 +153,7 @@ def test_the_covariance_is_that_of_white_noise() -> None:
         assert pairs == pytest.approx(expected[lag], abs=0.12 * expected[0])
 
 
-def test_a_knock_does_not_count() -> None:
+def test_a_knock_does_not_count():
     """30 m/s^2 for 20 ms that the images do not show."""
     felt = Felt.random(9)
     stamps = felt.stamps(SECONDS)
@@ -169,7 +167,7 @@ def test_a_knock_does_not_count() -> None:
     assert metric(parts, UNKNOWN).scale == pytest.approx(felt.scale, rel=3e-3)
 
 
-def test_a_camera_at_rest_determines_nothing() -> None:
+def test_a_camera_at_rest_determines_nothing():
     """Nor does it divide by nothing."""
     felt = Felt.random(10, way=0.0, turn=0.0)
     stamps = felt.stamps(SECONDS)
@@ -181,7 +179,7 @@ def test_a_camera_at_rest_determines_nothing() -> None:
         metric(parts, UNKNOWN)
 
 
-def test_the_mount_is_found() -> None:
+def test_the_mount_is_found():
     felt = Felt.random(3)
     stamps = felt.stamps(SECONDS)
     rates = felt.rates(stamps)
@@ -195,7 +193,7 @@ def test_the_mount_is_found() -> None:
     assert found.turn_deviation < 5e-3
 
 
-def test_a_motor_s_tone_does_not_draw_the_offset() -> None:
+def test_a_motor_s_tone_does_not_draw_the_offset():
     """Of 0.5 deg, four times the hand's rates, in step with the turns that are compared."""
     felt = Felt.random(3)
     stamps = felt.stamps(SECONDS)
@@ -207,7 +205,7 @@ def test_a_motor_s_tone_does_not_draw_the_offset() -> None:
     assert abs(found.mount.delay - felt.delay) < 3.0 * found.delay_deviation
 
 
-def test_another_ones_turns_are_no_mount() -> None:
+def test_another_ones_turns_are_no_mount():
     felt, other = Felt.random(4), Felt.random(5)
     stamps = felt.stamps(SECONDS)
     with pytest.raises(NoMount, match="are not the camera's"):
@@ -216,7 +214,7 @@ def test_another_ones_turns_are_no_mount() -> None:
         imu_extrinsics(GyroSamples(np.zeros(0), np.zeros((0, 3))), felt.spline(SECONDS))
 
 
-def test_gaps_are_left_out() -> None:
+def test_gaps_are_left_out():
     felt = Felt.random(6)
     stamps = felt.stamps(SECONDS)
     kept = (stamps < 4.0) | (stamps > 4.3)

@@ -1,7 +1,5 @@
 """The readout time from neighbouring frames: value, deviation, alarms; on an own projector."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -51,12 +49,9 @@ def watch(
 
 @pytest.mark.parametrize(
     ("points", "believed"),
-    [
-        *(("room", factor * READOUT) for factor in (1.0, 0.8, 1.2, 0.0)),
-        ("board", 1.2 * READOUT),
-    ],
+    [*(("room", factor * READOUT) for factor in (1.0, 0.8, 1.2, 0.0)), ("board", 1.2 * READOUT)],
 )
-def test_the_readout_time_whatever_is_believed(points: str, believed: float) -> None:
+def test_the_readout_time_whatever_is_believed(points, believed):
     noise, turn = (1.0, 0.14) if points == "room" else (0.3, 0.06)
     _, said = watch(recording(points, turn=turn, noise=noise), believed)
     found = said[-1]
@@ -69,7 +64,7 @@ def test_the_readout_time_whatever_is_believed(points: str, believed: float) -> 
         assert len(alarms) > len(said) / 2  # from within the first half on
 
 
-def test_a_reversed_direction_is_a_negative_readout_time() -> None:
+def test_a_reversed_direction_is_a_negative_readout_time():
     camera = replace(CAMERA, scan_direction="bottom_to_top")
     _, said = watch(recording(), READOUT, camera)
     assert said[-1] is not None
@@ -78,12 +73,12 @@ def test_a_reversed_direction_is_a_negative_readout_time() -> None:
 
 
 @pytest.mark.parametrize(("turn", "believed"), [(0.0, READOUT), (0.0003, 0.0), (0.003, READOUT)])
-def test_no_alarm_at_rest_nor_at_slow_motion(turn: float, believed: float) -> None:
+def test_no_alarm_at_rest_nor_at_slow_motion(turn, believed):
     _, said = watch(recording(turn=turn), believed)
     assert not any(measured and measured.contradicts(READOUT) for measured in said)
 
 
-def test_the_window_forgets_and_time_that_goes_back_starts_afresh() -> None:
+def test_the_window_forgets_and_time_that_goes_back_starts_afresh():
     frames = recording(seconds=2.0)
     short, _ = watch(frames, 0.0, keep=0.8)
     found = short.measure()
@@ -95,7 +90,7 @@ def test_the_window_forgets_and_time_that_goes_back_starts_afresh() -> None:
     assert short.measure() is None
 
 
-def test_contradiction_needs_both_many_deviations_and_a_real_difference() -> None:
+def test_contradiction_needs_both_many_deviations_and_a_real_difference():
     assert not MeasuredReadout(0.030, 1e-3, 100, 100.0).contradicts(0.033)
     assert not MeasuredReadout(0.030, 1e-6, 100, 100.0).contradicts(0.031)
     assert MeasuredReadout(0.030, 5e-4, 100, 100.0).contradicts(0.033)

@@ -1,7 +1,5 @@
 """The compiled parts of the readout watch, against the same in plain NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import projector
 import pytest
@@ -50,7 +48,7 @@ def plain_score(of: Equations, value: float) -> tuple[Array, float, float]:
 
 
 @pytest.mark.parametrize("value", [0.0, 0.03, -0.2])
-def test_the_score_is_that_of_plain_matrices(value: float) -> None:
+def test_the_score_is_that_of_plain_matrices(value):
     of = equations(np.random.default_rng(0), 40)
     of.y[7] *= 100.0  # an outlier
     terms, slope, noise = plain_score(of, value)
@@ -59,13 +57,13 @@ def test_the_score_is_that_of_plain_matrices(value: float) -> None:
     assert (found.slope, found.noise) == pytest.approx((slope, noise), rel=1e-8)
 
 
-def test_a_covariance_that_is_none_is_seen() -> None:
+def test_a_covariance_that_is_none_is_seen():
     of = equations(np.random.default_rng(0), 5)
     of.yy[2] = -np.eye(SIDE)
     assert np.isnan(score(of, 0.0).slope)
 
 
-def test_the_equation_of_three_views_holds_for_a_steady_turn() -> None:
+def test_the_equation_of_three_views_holds_for_a_steady_turn():
     """A camera that turns and travels steadily in its own axes: y = T x with T = 1 / rate."""
     rng = np.random.default_rng(1)
     turn, travel, readout = rng.normal(0.0, 0.3, 3), rng.normal(0.0, 0.3, 3), 0.02
@@ -93,7 +91,7 @@ def test_the_equation_of_three_views_holds_for_a_steady_turn() -> None:
 
 
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_an_image_alone_finds_its_motion_and_says_how_well(direction: str) -> None:
+def test_an_image_alone_finds_its_motion_and_says_how_well(direction):
     """Many noisy images of one motion: the steps scatter as their covariance says."""
     rng = np.random.default_rng(2)
     camera = Camera(

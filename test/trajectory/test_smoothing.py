@@ -1,7 +1,5 @@
 """Smoothing: better than tracking, honest, and silent where the images say nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -60,7 +58,7 @@ def run(frames: Frames) -> Smoothed:
 
 
 @pytest.mark.parametrize("turn", [0.14, 0.35])
-def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn: float) -> None:
+def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn):
     rng = np.random.default_rng(11)
     motion = projector.Motion.random(rng, turn, 0.08)
     recorded = projector.record(rng, motion, projector.room(rng, 1500), readout=READOUT,
@@ -84,7 +82,7 @@ def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn: f
         assert 2.0 < squared.mean() < 8.0
 
 
-def test_hard_accelerations_are_not_smoothed_away() -> None:
+def test_hard_accelerations_are_not_smoothed_away():
     rng = np.random.default_rng(13)
     rate = np.full((6, 1), 2.0 * np.pi * 3.0)  # Hz
     amplitudes = np.array([[100.0], [0.0], [0.0], [20.0], [0.0], [0.0]]) / rate**2
@@ -104,7 +102,7 @@ def test_hard_accelerations_are_not_smoothed_away() -> None:
         assert np.sum(seen * true) / np.sum(true * true) == pytest.approx(1.0, abs=0.03)
 
 
-def test_frames_that_shake_faster_than_the_motion_are_said_to() -> None:
+def test_frames_that_shake_faster_than_the_motion_are_said_to():
     """60 Hz, which a gyroscope knows: a spline averages it away and would be sure of it."""
     rng = np.random.default_rng(14)
     calm = projector.Motion.random(rng)
@@ -139,7 +137,7 @@ def test_frames_that_shake_faster_than_the_motion_are_said_to() -> None:
             assert not np.any(found.sample(stamps + round(0.5e9 * READOUT)).determined)
 
 
-def test_gaps_are_bridged_only_where_the_neighbours_determine_them() -> None:
+def test_gaps_are_bridged_only_where_the_neighbours_determine_them():
     rng = np.random.default_rng(12)
     motion = projector.Motion.random(rng)
     recorded = projector.record(rng, motion, projector.room(rng), readout=READOUT, seconds=3.2)
@@ -154,8 +152,3 @@ def test_gaps_are_bridged_only_where_the_neighbours_determine_them() -> None:
     for k in (0, 1, 3):
         squared = offsets[k, :6] @ np.linalg.inv(covariances[k, :6, :6]) @ offsets[k, :6]
         assert squared < 25.0
-
-
-def test_smoothing_needs_a_readout_time() -> None:
-    with pytest.raises(ValueError, match="needs the readout time"):
-        smooth(Camera(width=640, height=480, K=projector.K), [], [])

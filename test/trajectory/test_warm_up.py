@@ -1,7 +1,5 @@
 """After warming up, calibrating and smoothing compile nothing any more."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -47,7 +45,7 @@ print(sorted(compiled() - before))
 """
 
 
-def test_calibrating_and_smoothing_compile_nothing_any_more() -> None:
+def test_calibrating_and_smoothing_compile_nothing_any_more():
     found = subprocess.run(
         [sys.executable, "-c", _SCRIPT],
         env={

@@ -5,8 +5,6 @@ verdicts that need the default number of trials (differences of a few per cent) 
 which are not the code's alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 
@@ -188,7 +186,7 @@ def result(name: str) -> Result:
 
 @pytest.mark.bench
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
-def test_verdicts(name: str) -> None:
+def test_verdicts(name):
     claims = {claim.name: claim for claim in result(name).claims}
     assert {claim.split(".")[0] for claim in claims} == {name}
     if name != "timings":
@@ -205,7 +203,7 @@ def test_verdicts(name: str) -> None:
 
 @pytest.mark.bench
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
-def test_everything_is_said_and_shown(name: str) -> None:
+def test_everything_is_said_and_shown(name):
     found = result(name)
     for claim in found.claims:
         assert claim.statement

@@ -1,16 +1,10 @@
 """The synthetic scene against the camera equations, point by point."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.experiments.trials import (
-    Setting,
-    Trials,
-    draw_trials,
-)
+from benchmarks.experiments.trials import Setting, Trials, draw_trials
 
 
 def bearings(trials: Trials, i: int, linear_in_camera: bool) -> np.ndarray:
@@ -32,7 +26,7 @@ def bearings(trials: Trials, i: int, linear_in_camera: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize("drifting", [False, True])
-def test_points_are_seen_at_their_own_row(drifting: bool) -> None:
+def test_points_are_seen_at_their_own_row(drifting):
     trials = draw_trials(5, 0, Setting(25.0, 0.2, 0.0, drifting))
     for i in range(5):
         np.testing.assert_allclose(trials.rays[i], bearings(trials, i, drifting), atol=1e-9)

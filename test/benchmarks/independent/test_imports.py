@@ -1,7 +1,5 @@
 """What judges the estimator must not be made of it."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from pathlib import Path
@@ -12,7 +10,7 @@ FOLDER = Path(benchmarks.independent.__file__).parent
 OWN = "benchmarks.independent"
 
 
-def test_nothing_of_the_package_is_imported() -> None:
+def test_nothing_of_the_package_is_imported():
     files = sorted(FOLDER.glob("*.py"))
     assert len(files) > 4
     for path in files:

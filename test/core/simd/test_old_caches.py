@@ -1,7 +1,5 @@
 """Old caches go; what may be in use, or is somebody else's, stays."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path
@@ -14,7 +12,7 @@ DAY = 86400.0
 
 
 @pytest.fixture
-def cache(tmp_path: Path) -> Path:
+def cache(tmp_path) -> Path:
     jit._mark.cache_clear()
     jit._remove_others.cache_clear()
     return tmp_path
@@ -29,7 +27,7 @@ def folder(cache: Path, name: str, days: float, inside: str = "rs_localizer.core
     return made
 
 
-def test_what_nobody_used_for_a_month_is_removed(cache: Path) -> None:
+def test_what_nobody_used_for_a_month_is_removed(cache):
     used = folder(cache, "0" * 16, 100)
     old = folder(cache, "0123456789abcdef", 31)
     staying = [
@@ -48,7 +46,7 @@ def test_what_nobody_used_for_a_month_is_removed(cache: Path) -> None:
     assert (cache / "3333333333333333").is_file()
 
 
-def test_use_keeps_a_folder(cache: Path) -> None:
+def test_use_keeps_a_folder(cache):
     used, old = folder(cache, "0" * 16, 0), folder(cache, "1" * 16, 31)
     jit._mark(old)
     jit._remove_others(used)

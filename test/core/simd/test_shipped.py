@@ -1,7 +1,5 @@
 """Machine code of the package: used where the CPU can run it, and only there."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess
@@ -56,7 +54,7 @@ def run(code: str, folder: Path, cache: Path, environment: dict[str, str]) -> st
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory) -> Path:
     """A folder with the kernel's source and, below compiled, its code for x86-64-v3."""
     folder = tmp_path_factory.mktemp("shipped")
     (folder / "tripling.py").write_text(KERNEL)
@@ -65,7 +63,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def load(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
+def load(made, tmp_path, monkeypatch) -> Load:
     """Makes the kernel as a new process would, with nothing in the user's cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(jit, "_said", set())
@@ -83,7 +81,7 @@ def hits(compiled: Any) -> int:
     return sum(compiled.stats.cache_hits.values())
 
 
-def test_nothing_is_compiled_where_the_package_has_it(load: Load, tmp_path: Path) -> None:
+def test_nothing_is_compiled_where_the_package_has_it(load, tmp_path):
     compiled = load()
     assert compiled(1.5) == 4.5
     assert hits(compiled) == 1
@@ -92,7 +90,7 @@ def test_nothing_is_compiled_where_the_package_has_it(load: Load, tmp_path: Path
     assert list((tmp_path / "cache").rglob("*.nbc"))
 
 
-def test_it_runs_in_a_process_that_has_compiled_nothing(made: Path, tmp_path: Path) -> None:
+def test_it_runs_in_a_process_that_has_compiled_nothing(made, tmp_path):
     use = (
         "from pathlib import Path; from rs_localizer.core.simd import shipped; "
         f"shipped.FOLDER = Path({str(made / 'compiled')!r}); "
@@ -103,9 +101,7 @@ def test_it_runs_in_a_process_that_has_compiled_nothing(made: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("lacking", ["avx2", "fma", "movbe", "xsave", "ssse3"])
-def test_a_cpu_that_lacks_an_instruction_compiles(
-    load: Load, monkeypatch: pytest.MonkeyPatch, lacking: str
-) -> None:
+def test_a_cpu_that_lacks_an_instruction_compiles(load, monkeypatch, lacking):
     found = shipped.keys
 
     def keys(key: Any) -> list[Any]:
@@ -120,9 +116,7 @@ def test_a_cpu_that_lacks_an_instruction_compiles(
     assert hits(compiled) == 0
 
 
-def test_all_users_of_a_machine_run_the_same_code(
-    load: Load, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_users_of_a_machine_run_the_same_code(load, monkeypatch):
     with monkeypatch.context() as without:
         without.setattr(shipped, "keys", lambda key: [])
         load()(1.5)  # now this user has code of their own
@@ -132,7 +126,7 @@ def test_all_users_of_a_machine_run_the_same_code(
     assert hits(compiled) == 1
 
 
-def test_damaged_code_of_the_package_is_not_run(load: Load, made: Path, tmp_path: Path) -> None:
+def test_damaged_code_of_the_package_is_not_run(load, made, tmp_path):
     (file,) = (made / "compiled").rglob("*.nbc")
     whole = file.read_bytes()
     file.write_bytes(whole[:-100] + bytes(100))
@@ -143,16 +137,7 @@ def test_damaged_code_of_the_package_is_not_run(load: Load, made: Path, tmp_path
     file.write_bytes(whole)
 
 
-def test_levels_are_what_a_cpu_can_do() -> None:
-    avx2 = ",".join(f"+{name}" for name in shipped.LEVELS["x86-64-v3"])
-    avx512 = ",".join(f"+{name}" for name in shipped.LEVELS["x86-64-v4"])
-    assert shipped.levels(avx2) == ("x86-64-v3",)
-    assert shipped.levels(avx512) == ("x86-64-v4", "x86-64-v3")
-    assert shipped.levels(avx512.replace("+avx512vl", "-avx512vl")) == ("x86-64-v3",)
-    assert shipped.levels("") == shipped.levels("+64bit,+sse2,+avx") == ()
-
-
-def test_caches_of_two_cpus_share_a_folder_and_not_their_code(made: Path, tmp_path: Path) -> None:
+def test_caches_of_two_cpus_share_a_folder_and_not_their_code(made, tmp_path):
     cache = tmp_path / "both"
     assert "cache_hits=Counter()" in compile_for("nehalem", made, cache)
     assert "cache_hits=Counter()" in compile_for("x86-64-v3", made, cache)

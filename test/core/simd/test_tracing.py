@@ -112,10 +112,7 @@ def test_cross_and_nearest_rotation():
 
 
 def test_sums_go_over_all_lanes_of_all_blocks():
-    bodies = (
-        (lambda v: [v[0] * v[1], v[2]], 2),
-        (lambda v: [v[0] + v[2]], 1),
-    )
+    bodies = ((lambda v: [v[0] * v[1], v[2]], 2), (lambda v: [v[0] + v[2]], 1))
     sums = traced_sums(3, *bodies)
 
     @kernel

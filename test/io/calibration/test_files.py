@@ -1,9 +1,5 @@
 """Calibration files of other programs, and what is none."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -97,7 +93,7 @@ FIVE = [0.1, -0.2, 1e-3, 2e-3, 0.3]
          "plumb_bob", [0.1, 0, 1, 0]),
     ],
 )  # fmt: skip
-def test_other_programs(tmp_path: Path, text: str, model: str, D: list[float]) -> None:
+def test_other_programs(tmp_path, text, model, D):
     (tmp_path / "camera").write_text(text)
     camera = read_calibration(tmp_path / "camera")
     assert (camera.width, camera.height, camera.distortion_model) == (640, 480, model)
@@ -106,7 +102,7 @@ def test_other_programs(tmp_path: Path, text: str, model: str, D: list[float]) -
 
 
 @pytest.mark.parametrize("ending", ["yaml", "xml", "json"])
-def test_what_opencv_writes(tmp_path: Path, ending: str) -> None:
+def test_what_opencv_writes(tmp_path, ending):
     path = tmp_path / f"camera.{ending}"
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     file.write("image_width", 640)
@@ -119,7 +115,7 @@ def test_what_opencv_writes(tmp_path: Path, ending: str) -> None:
     np.testing.assert_allclose(camera.D, FIVE)
 
 
-def test_one_of_several_cameras(tmp_path: Path) -> None:
+def test_one_of_several_cameras(tmp_path):
     other = KALIBR.replace("cam0", "cam1").replace("500.0", "600.0")
     (tmp_path / "chain.yaml").write_text(KALIBR + other)
     assert read_calibration(f"{tmp_path}/chain.yaml#cam1").K[0, 0] == 600.0
@@ -132,22 +128,6 @@ def test_one_of_several_cameras(tmp_path: Path) -> None:
     assert read_calibration(f"{tmp_path}/cameras.txt#9").K[0, 0] == 700.0
     with pytest.raises(CalibrationError, match="the cameras 7, 9: choose one with #7"):
         read_calibration(tmp_path / "cameras.txt")
-
-
-@pytest.mark.parametrize(
-    ("text", "model", "D"),
-    [
-        (ROS, "rational_polynomial", [1, 2, 3, 4, 5, 6, 7, 8]),
-        # OpenCV's order: two radial, two tangential, the third radial.
-        (BOOFCV, "plumb_bob", [0.05, -0.16, 0.001, 0.002, 0.0]),
-    ],
-)
-def test_both_kinds(tmp_path: Path, text: str, model: str, D: list[float]) -> None:
-    (tmp_path / "camera.yaml").write_text(text)
-    camera = read_calibration(tmp_path / "camera.yaml")
-    assert (camera.width, camera.height, camera.distortion_model) == (640, 480, model)
-    np.testing.assert_array_equal(camera.K, [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]])
-    np.testing.assert_array_equal(camera.D, D)
 
 
 @pytest.mark.parametrize(
@@ -178,12 +158,7 @@ def test_both_kinds(tmp_path: Path, text: str, model: str, D: list[float]) -> No
         ('<!DOCTYPE x [<!ENTITY a "b">]><x>&a;</x>', "the XML defines entities"),
     ],
 )
-def test_faults_are_named(tmp_path: Path, text: str, expected: str) -> None:
+def test_faults_are_named(tmp_path, text, expected):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(CalibrationError, match=expected):
         read_calibration(tmp_path / "camera.yaml")
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"absent.yaml cannot be read: No such file"):
-        read_calibration(tmp_path / "absent.yaml")

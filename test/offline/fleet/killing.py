@@ -1,7 +1,5 @@
 """Work that ends processes, or tells of them: a module of its own, which workers can import."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

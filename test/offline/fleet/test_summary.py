@@ -1,14 +1,12 @@
 """The summary of many recordings."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 
 from rs_localizer.offline.fleet.summary import CSV, DONE, FAILED, Row, write_summary
 
 
-def test_no_cell_is_a_formula(tmp_path: Path) -> None:
+def test_no_cell_is_a_formula(tmp_path):
     rows = [
         Row(Path("=cmd|' /C calc'!A0"), "@sum", DONE, {"offset": -0.5, "why": "+1+1"}),
         Row(Path("b"), "-c", FAILED, {}, "=1+1"),

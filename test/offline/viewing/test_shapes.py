@@ -1,7 +1,5 @@
 """What the viewer draws: shapes by their definitions, not by the code's own formulas."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,12 +8,7 @@ from scipy.stats import chi2
 import rs_localizer as rsl
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.offline.viewing.shapes import (
-    ellipsoid,
-    eye,
-    readout_path,
-    reproject,
-)
+from rs_localizer.offline.viewing.shapes import ellipsoid, eye, readout_path, reproject
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = rsl.Camera(width=640, height=480, K=K, readout_time=0.03)
@@ -42,7 +35,7 @@ def localized(points: Array, pixels: Array, residual: float = 0.3) -> Localized:
     return Localized(0, 0, "map", "camera", pose, None, rows, 0, estimate)
 
 
-def test_the_ellipsoid_holds_95_percent() -> None:
+def test_the_ellipsoid_holds_95_percent():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3))
     covariance = root @ root.T
@@ -56,13 +49,13 @@ def test_the_ellipsoid_holds_95_percent() -> None:
     )
 
 
-def test_a_flat_covariance_is_a_flat_ellipsoid() -> None:
+def test_a_flat_covariance_is_a_flat_ellipsoid():
     shape = ellipsoid(np.diag([4.0, 0.0, 1.0]) - 1e-18 * np.eye(3))
     assert shape.half_sizes[0] == 0.0
     assert np.linalg.norm(shape.quaternion) == pytest.approx(1.0)
 
 
-def test_reprojections_are_of_the_row_that_sees_the_point() -> None:
+def test_reprojections_are_of_the_row_that_sees_the_point():
     """At a depth of 2 m, where a metre is 250 px; at tau the camera has gone 0.2 tau to the right,
     so that the point appears as much to the left."""
     points = np.array([[0.0, y, 1.0] for y in (-0.8, 0.0, 0.8)])
@@ -76,13 +69,13 @@ def test_reprojections_are_of_the_row_that_sees_the_point() -> None:
     assert found.colours[0, 0] < found.colours[1, 0] < found.colours[2, 0]
 
 
-def test_the_way_within_the_readout_is_that_of_the_camera() -> None:
+def test_the_way_within_the_readout_is_that_of_the_camera():
     way = readout_path(localized(np.zeros((0, 3)), np.zeros((0, 2))))
     np.testing.assert_allclose(way[4], [0.0, 0.0, -1.0], atol=1e-12)
     assert np.linalg.norm(way[-1] - way[0]) == pytest.approx(0.2)
 
 
-def test_the_eye_sees_camera_and_points() -> None:
+def test_the_eye_sees_camera_and_points():
     points = np.array([[0.1, 0.0, 1.0], [-0.1, 0.0, 1.0], [0.0, 0.1, 1.0]])
     look = eye([localized(points, np.zeros((3, 2)))])
     ahead = look.target - look.position

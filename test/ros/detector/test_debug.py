@@ -24,7 +24,7 @@ def image(second: int) -> Detected:
     return Detected(Image(second * 10**9, "camera", pixels), seen, MAP, np.dtype([]))
 
 
-def test_without_a_localizer_an_image_is_shown_at_once() -> None:
+def test_without_a_localizer_an_image_is_shown_at_once():
     shown: list[int] = []
     debug = DebugPictures(lambda image, _: shown.append(image.stamp_ns // 10**9), lambda *_: None)
     config = DetectorConfig()

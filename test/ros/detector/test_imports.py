@@ -1,7 +1,5 @@
 """The detectors start without what only localizes."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -12,7 +10,7 @@ MOST = {"markers": 50, "features": 41}
 
 
 @pytest.mark.parametrize("kind", MOST)
-def test_the_detectors_do_not_import_the_estimator(kind: str) -> None:
+def test_the_detectors_do_not_import_the_estimator(kind):
     code = (
         f"import sys, rs_localizer.ros.detector.{kind}\n"
         "print(*(n for n, m in sys.modules.items() if n.startswith('rs_localizer.')"

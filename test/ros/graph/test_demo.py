@@ -1,14 +1,11 @@
 """The demo as a user starts it, with a few frames; and what Ctrl-C leaves of it."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import cv2
 import PIL.Image
@@ -29,7 +26,7 @@ def figures(text: str, label: str) -> list[list[float]]:
     return [[float(word) for word in line[44:].split() if word[0].isdigit()] for line in lines]
 
 
-def test_quick_demo(tmp_path: Path) -> None:
+def test_quick_demo(tmp_path):
     demo = subprocess.run(
         [*DEMO, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=280
     )
@@ -60,7 +57,7 @@ def children(pid: int) -> list[int]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_no_process_behind(tmp_path: Path, number: int) -> None:
+def test_a_signal_leaves_no_process_behind(tmp_path, number):
     with (tmp_path / "log").open("w") as log:
         demo = subprocess.Popen(
             [*DEMO, "--out", str(tmp_path / "out")], stdout=log, stderr=log, start_new_session=True

@@ -1,10 +1,6 @@
 """The first start on a machine: while kernels are compiled, the node answers and says so."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,9 +26,7 @@ def said(peer: Any) -> list[tuple[bytes, str]]:
 
 
 @pytest.mark.parametrize("autostart", [True, False])
-def test_services_answer_while_kernels_are_compiled(
-    start_node: Callable[..., Any], peer: Any, tmp_path: Path, autostart: bool
-) -> None:
+def test_services_answer_while_kernels_are_compiled(start_node, peer, tmp_path, autostart):
     states = said(peer)
     chosen = f"autostart:={str(autostart).lower()}"
     node = start_node("-p", chosen, XDG_CACHE_HOME=str(tmp_path / "cache"))
@@ -67,7 +61,7 @@ def test_services_answer_while_kernels_are_compiled(
     assert "Traceback" not in node.log
 
 
-def test_two_clients_configure_at_once(start_node: Callable[..., Any], peer: Any) -> None:
+def test_two_clients_configure_at_once(start_node, peer):
     """The transition is made once, and both get an answer."""
     node = start_node("-p", "autostart:=false")
     clients = [peer.node.create_client(ChangeState, "/rs_localizer/change_state") for _ in range(2)]

@@ -1,7 +1,5 @@
 """The latest camera_info is used, whatever the worker has got round to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +9,7 @@ from sensor_msgs.msg import CameraInfo
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.refusals import Refusals
 
 
@@ -52,7 +50,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_a_repeated_camera_info_is_no_work(bench: Bench) -> None:
+def test_a_repeated_camera_info_is_no_work(bench):
     bench.take(640)
     assert bench.work() == 1
     bench.take(640, stamp=7)
@@ -60,7 +58,7 @@ def test_a_repeated_camera_info_is_no_work(bench: Bench) -> None:
     assert bench.width == 640
 
 
-def test_back_to_the_old_one_before_the_new_one_was_used(bench: Bench) -> None:
+def test_back_to_the_old_one_before_the_new_one_was_used(bench):
     bench.take(640)
     bench.work()
     bench.take(1280)
@@ -69,7 +67,7 @@ def test_back_to_the_old_one_before_the_new_one_was_used(bench: Bench) -> None:
     assert bench.width == 640
 
 
-def test_a_bad_one_neither_replaces_a_good_one_nor_is_forgotten(bench: Bench) -> None:
+def test_a_bad_one_neither_replaces_a_good_one_nor_is_forgotten(bench):
     bench.take(640)
     bench.take(0)
     bench.work()

@@ -1,7 +1,5 @@
 """The diagnosis of a node: what a user reads first when there are no poses."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -75,7 +73,7 @@ def world() -> World:
     return World()
 
 
-def test_numbers_of_a_working_node(world: World) -> None:
+def test_numbers_of_a_working_node(world):
     world.pass_frames(100, rate=50.0, latency=0.004)
     health = world.diagnose()
     assert (health.level, health.state) == (Level.OK, "localized")
@@ -110,7 +108,7 @@ def test_numbers_of_a_working_node(world: World) -> None:
     assert values["Poses published"] == "100"
 
 
-def test_lost_after_some_frames_and_found_by_one(world: World) -> None:
+def test_lost_after_some_frames_and_found_by_one(world):
     world.pass_frames(10, rate=50.0)
     world.refuse(4)
     assert world.diagnose().level == Level.WARN
@@ -124,7 +122,7 @@ def test_lost_after_some_frames_and_found_by_one(world: World) -> None:
     assert world.diagnose().state == "localized"
 
 
-def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
+def test_lost_messages_are_seen_in_the_stamps(world):
     for index in range(150):
         if index % 10 < 6:
             world.pass_frames(1, rate=30.0)
@@ -138,14 +136,14 @@ def test_lost_messages_are_seen_in_the_stamps(world: World) -> None:
     assert int(health.values["Frames missing by their stamps, recently"]) in range(50, 61)
 
 
-def test_the_readout_time_that_the_motion_shows() -> None:
+def test_the_readout_time_that_the_motion_shows():
     summary, name = Statistics(Refusals(print), tell).summary(), "Readout time seen (ms)"
     assert name not in diagnose(GOOD, summary).values
     seen = replace(GOOD, readout=MeasuredReadout(-0.02004, 1.2e-4, 100, 100.0))
     assert diagnose(seen, summary).values[name] == "-20.04 +- 0.12"
 
 
-def test_what_is_odd_is_a_warning(world: World) -> None:
+def test_what_is_odd_is_a_warning(world):
     odd = replace(GOOD, oddities={"pixels_outside": "7 of 100 pixels"})
     world.pass_frames(10, rate=50.0)
     health = world.diagnose(odd)
@@ -156,17 +154,6 @@ def test_what_is_odd_is_a_warning(world: World) -> None:
     health = world.diagnose(odd)
     assert health.level == Level.ERROR
     assert health.message.endswith("for too_few_inliers; pixels_outside: 7 of 100 pixels")
-
-
-def test_what_was_odd_is_forgotten() -> None:
-    now = [0.0]
-    refusals = Refusals(lambda text: None, lambda: now[0])
-    refusals.notice("map_is_camera", "first")
-    refusals.notice("map_is_camera", "second")
-    refusals.notice("another", "text")
-    assert refusals.recent(("map_is_camera", "nothing"), 5.0) == {"map_is_camera": "second"}
-    now[0] = 5.1
-    assert refusals.recent(("map_is_camera",), 5.0) == {}
 
 
 def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) -> Silence:
@@ -227,25 +214,21 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
         ),
         # One of two frame topics is enough.
         (
-            {
-                "silence": {"correspondences": FRAMES, "keypoints": silent("/k", "no publisher")},
-            },
+            {"silence": {"correspondences": FRAMES, "keypoints": silent("/k", "no publisher")}},
             Level.OK,
             "localized",
             "localized with 3 of 4 points",
         ),
     ],
 )
-def test_what_is_missing_comes_first(
-    world: World, change: dict[str, Any], level: Level, state: str, message: str
-) -> None:
+def test_what_is_missing_comes_first(world, change, level, state, message):
     world.pass_frames(3, rate=50.0)
     health = world.diagnose(replace(GOOD, **change))
     assert (health.level, health.values["State"]) == (level, state)
     assert health.message.startswith(message)
 
 
-def test_what_is_missing_came_and_cannot_be_used(world: World) -> None:
+def test_what_is_missing_came_and_cannot_be_used(world):
     for _ in range(3):
         world.refusals.add("bad_camera_info", "the camera is not calibrated: K[0] is 0")
     health = world.diagnose(replace(GOOD, missing=("camera_info",)))
@@ -254,7 +237,7 @@ def test_what_is_missing_came_and_cannot_be_used(world: World) -> None:
     )
 
 
-def test_a_frame_that_takes_long(world: World) -> None:
+def test_a_frame_that_takes_long(world):
     world.statistics.started()
     world.now += 3.0
     health = world.diagnose()
@@ -264,7 +247,7 @@ def test_a_frame_that_takes_long(world: World) -> None:
     assert world.diagnose().values["State"] == "waiting for frames"
 
 
-def test_topics_that_nothing_waits_for_are_left_out() -> None:
+def test_topics_that_nothing_waits_for_are_left_out():
     nobody = replace(COMES, seconds=9.0, heard=False, cause="it has no publisher")
     deaf = replace(nobody, cause="the QoS of /x does not fit", mismatch=True)
     kinds = ("correspondences", "keypoints")

@@ -1,7 +1,5 @@
 """What is said of the IMU: numbers where they are known, and a warning where it is not used."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -20,7 +18,7 @@ LATE = Unused(ImuReason.LATE, "the last reading is 97.5 ms older than the last r
 UNUSED = ImuState(200, 0, 0.0, LATE, LATE, {"imu_late": 200}, math.nan, math.nan, None)
 
 
-def test_an_imu_in_use() -> None:
+def test_an_imu_in_use():
     assert imu_values(USED) == {
         "IMU": "used",
         "IMU used (share of the last frames)": "97%",
@@ -32,7 +30,7 @@ def test_an_imu_in_use() -> None:
     assert imu_oddity(USED) == {}
 
 
-def test_an_imu_that_is_not_used() -> None:
+def test_an_imu_that_is_not_used():
     assert imu_values(UNUSED) == {
         "IMU": f"not used: {LATE}",
         "IMU used (share of the last frames)": "0%",
@@ -44,14 +42,14 @@ def test_an_imu_that_is_not_used() -> None:
     assert "a larger imu.wait" in said  # what to do
 
 
-def test_the_most_frequent_reason_is_said_and_not_the_last_one() -> None:
+def test_the_most_frequent_reason_is_said_and_not_the_last_one():
     slow = Unused(ImuReason.TOO_SLOW, "a reading comes every 20.0 ms")
     state = replace(UNUSED, mostly=slow)
     assert imu_values(state)["IMU"] == f"not used: {slow}"
     assert "every 20.0 ms" in imu_oddity(state)["imu"]
 
 
-def test_gravity_that_contradicts_the_map_is_a_warning() -> None:
+def test_gravity_that_contradicts_the_map_is_a_warning():
     assert "imu.gravity" not in imu_oddity(USED)
     assert imu_oddity(replace(USED, gravity=math.radians(2.0))) == {}
     state = replace(USED, gravity=math.radians(88.0))

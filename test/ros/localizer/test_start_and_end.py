@@ -1,13 +1,10 @@
 """The node from its start to its end: signals, arguments that are wrong, what it says of itself."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,7 +29,7 @@ Start = Callable[..., Any]
         (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGTERM),
     ],
 )
-def test_signals_end_it_in_order(start_node: Start, signals: tuple[int, ...]) -> None:
+def test_signals_end_it_in_order(start_node, signals):
     node = start_node()
     node.wait_for_log("active with solver")
     assert node.stop(*signals) == 0
@@ -46,9 +43,7 @@ SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("slow", ["numba", "rclpy", "cv2"])
-def test_signals_while_it_imports(
-    start_node: Start, tmp_path: Path, number: int, slow: str
-) -> None:
+def test_signals_while_it_imports(start_node, tmp_path, number, slow):
     (tmp_path / f"{slow}.py").write_text(SLOW)
     node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     while not (tmp_path / f"{slow}.seen").exists():
@@ -58,7 +53,7 @@ def test_signals_while_it_imports(
     assert node.log == ""
 
 
-def test_missing_ros_is_said_in_one_line(start_node: Start, tmp_path: Path) -> None:
+def test_missing_ros_is_said_in_one_line(start_node, tmp_path):
     text = "No module named 'rclpy'"
     (tmp_path / "rclpy.py").write_text(f"raise ModuleNotFoundError({text!r}, name='rclpy')")
     node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
@@ -68,7 +63,7 @@ def test_missing_ros_is_said_in_one_line(start_node: Start, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_while_it_compiles(start_node: Start, tmp_path: Path, number: int) -> None:
+def test_signals_while_it_compiles(start_node, tmp_path, number):
     cache = tmp_path / "cache"
     node = start_node(XDG_CACHE_HOME=str(cache))
     deadline = time.monotonic() + 60.0
@@ -92,9 +87,7 @@ def test_signals_while_it_compiles(start_node: Start, tmp_path: Path, number: in
         (("--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
     ],
 )
-def test_started_with_bad_parameters(
-    start_node: Start, arguments: tuple[str, ...], text: str
-) -> None:
+def test_started_with_bad_parameters(start_node, arguments, text):
     node = start_node(*arguments)
     assert node.process.wait(60.0) == 1
     fatal = [line for line in node.log.splitlines() if line.startswith("[FATAL]")]
@@ -111,7 +104,7 @@ def test_started_with_bad_parameters(
         ("/rs_localizer/pose.publisher.depth:=ten", "not configured:"),
     ],
 )
-def test_qos_overrides_that_make_no_qos(start_node: Start, override: str, text: str) -> None:
+def test_qos_overrides_that_make_no_qos(start_node, override, text):
     node = start_node("-p", f"qos_overrides.{override}")
     assert node.process.wait(60.0) == 1
     errors = [line for line in node.log.splitlines() if line.startswith("[ERROR]")]
@@ -119,7 +112,7 @@ def test_qos_overrides_that_make_no_qos(start_node: Start, override: str, text: 
     assert re.search(text, errors[0], re.IGNORECASE)
 
 
-def test_publishers_are_active_before_a_frame_can_come(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_publishers_are_active_before_a_frame_can_come(monkeypatch):
     active: list[bool] = []
 
     class Early(Inputs):
@@ -141,7 +134,7 @@ def test_publishers_are_active_before_a_frame_can_come(monkeypatch: pytest.Monke
     assert active == [True] * len(TYPES)
 
 
-def test_what_it_says_at_start(start_node: Start, tmp_path: Path) -> None:
+def test_what_it_says_at_start(start_node, tmp_path):
     file = tmp_path / "params.yaml"
     file.write_text("/**:\n  ros__parameters: {min_inlier: 9, use_sim_time: false}\n")
     node = start_node("--params-file", str(file), "-p", "readout_tim:=0.1")

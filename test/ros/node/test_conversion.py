@@ -1,7 +1,5 @@
 """Messages of recordings become messages of rclpy and stay the same to the last byte."""
 
-from __future__ import annotations
-
 import array
 from typing import Any
 
@@ -47,7 +45,7 @@ def info(make: Any) -> CameraInfo:
 
 
 @pytest.mark.parametrize("build", [cloud, info])
-def test_the_same_bytes_made_or_copied(build: Any) -> None:
+def test_the_same_bytes_made_or_copied(build):
     recorded = build(bags.make_message)
     kind = recorded.__msgtype__
     expected = bytes(bags.typestore().serialize_cdr(recorded, kind))
@@ -56,5 +54,5 @@ def test_the_same_bytes_made_or_copied(build: Any) -> None:
         assert bytes(bags.typestore().serialize_cdr(again, kind)) == expected
 
 
-def test_bytes_are_handed_over_as_rclpy_wants_them() -> None:
+def test_bytes_are_handed_over_as_rclpy_wants_them():
     assert isinstance(cloud(make_message).data, array.array)

@@ -1,7 +1,5 @@
 """What the gaps between stamps tell of messages that have not come."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ def stamps(rate: float, count: int, jitter: float, rng: np.random.Generator) -> 
 @pytest.mark.parametrize(
     ("rate", "share"), [(10.0, 0.6), (10.0, 0.9), (30.0, 0.3), (30.0, 0.9), (60.0, 0.2)]
 )
-def test_what_was_dropped_is_counted(rate: float, share: float) -> None:
+def test_what_was_dropped_is_counted(rate, share):
     rng = np.random.default_rng(0)
     sent = stamps(rate, round(5 * rate), 0.02, rng)
     keep = rng.random(len(sent)) < share
@@ -29,19 +27,19 @@ def test_what_was_dropped_is_counted(rate: float, share: float) -> None:
 
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("jitter", [0.0, 0.02, 0.05])
-def test_a_steady_camera_misses_nothing(rate: float, jitter: float) -> None:
+def test_a_steady_camera_misses_nothing(rate, jitter):
     for seed in range(20):
         assert missing(stamps(rate, 150, jitter, np.random.default_rng(seed))) == 0
 
 
-def test_no_rate_no_verdict() -> None:
+def test_no_rate_no_verdict():
     rng = np.random.default_rng(0)
     triggered = np.cumsum(rng.exponential(1e8, 200)).astype(np.int64)  # whenever something moves
     assert missing(triggered) == 0
     assert missing([]) == missing([5]) == missing([0, 10, 30, 40]) == 0
 
 
-def test_a_recording_that_starts_over_misses_nothing() -> None:
+def test_a_recording_that_starts_over_misses_nothing():
     once = np.arange(50) * 100_000_000
     assert missing(np.concatenate([once, once])) == 0
     assert missing(np.repeat(once, 2)) == 0  # each frame twice

@@ -1,7 +1,5 @@
 """A topic is heard as well as its publishers send it, whoever comes first."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any
@@ -29,7 +27,7 @@ WHOLE = QoSProfile(depth=1, reliability=RELIABLE, durability=LATCHED)
         ((BEST_EFFORT, VOLATILE), [(RELIABLE, LATCHED)], (BEST_EFFORT, VOLATILE)),
     ],
 )
-def test_the_best_that_all_offer(wished: Any, offers: list[Any], expected: Any) -> None:
+def test_the_best_that_all_offer(wished, offers, expected):
     assert best(wished, offers) == expected
 
 
@@ -41,7 +39,7 @@ def heard_with(peer: Any, topic: str) -> Callable[[], set[ReliabilityPolicy]]:
     }
 
 
-def test_the_node_follows_its_publishers(start_node: Callable[..., Any], peer: Any) -> None:
+def test_the_node_follows_its_publishers(start_node, peer):
     node = start_node()
     present = heard_with(peer, "/correspondences")
     assert peer.spin_until(lambda: present() == {BEST_EFFORT})
@@ -59,7 +57,7 @@ def test_the_node_follows_its_publishers(start_node: Callable[..., Any], peer: A
     assert node.stop() == 0
 
 
-def test_a_latched_camera_info_is_heard(start_node: Callable[..., Any], peer: Any) -> None:
+def test_a_latched_camera_info_is_heard(start_node, peer):
     info = CameraInfo(width=640, height=480, distortion_model="plumb_bob", d=[0.0] * 5)
     info.k = [500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0]
     info.header.frame_id = "camera"

@@ -1,7 +1,5 @@
 """Refusals are counted one by one and logged now and then."""
 
-from __future__ import annotations
-
 import pytest
 
 from rs_localizer.ros.node.refusals import Refusals
@@ -22,7 +20,7 @@ def log() -> Log:
     return Log()
 
 
-def test_one_line_for_each_reason_and_period(log: Log) -> None:
+def test_one_line_for_each_reason_and_period(log):
     log.add("dark", "no light")
     log.add("dark", "no light")
     log.add("late", "too late")
@@ -39,7 +37,7 @@ def test_one_line_for_each_reason_and_period(log: Log) -> None:
     assert log.refusals.counts == {"dark": 5, "late": 1}
 
 
-def test_different_details_have_their_own_lines(log: Log) -> None:
+def test_different_details_have_their_own_lines(log):
     for _ in range(3):
         log.add("bad_cloud", "there is no field u")
         log.add("bad_cloud", "the data are truncated")
@@ -47,7 +45,7 @@ def test_different_details_have_their_own_lines(log: Log) -> None:
     assert log.refusals.counts == {"bad_cloud": 6}
 
 
-def test_details_that_differ_in_numbers_are_one(log: Log) -> None:
+def test_details_that_differ_in_numbers_are_one(log):
     for inliers in range(8, 12):
         log.add("too_few_inliers", f"{inliers} of 100 points within 2.0 px")
     log.now += 6.0
@@ -58,7 +56,7 @@ def test_details_that_differ_in_numbers_are_one(log: Log) -> None:
     ]
 
 
-def test_ever_new_details_fill_neither_log_nor_memory(log: Log) -> None:
+def test_ever_new_details_fill_neither_log_nor_memory(log):
     letters = "abcdefghijklmnopqrstuvwxyz"
     for second in range(60):
         for first in letters:

@@ -1,7 +1,5 @@
 """The worker: nothing waits for a slow frame, the newest wins, and every frame is accounted for."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator
@@ -92,7 +90,7 @@ def fake() -> Iterator[Fake]:
     assert wait_for_workers(PATIENCE)
 
 
-def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake: Fake) -> None:
+def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake):
     fake.send("one")
     fake.wait(fake.started)
     for frame in ("two", "three", "four"):
@@ -105,7 +103,7 @@ def test_the_newest_frame_wins_and_what_it_replaced_is_counted(fake: Fake) -> No
     assert (summary.received, summary.replaced) == ({"frames": 4}, 2)
 
 
-def test_topics_do_not_replace_each_other(fake: Fake) -> None:
+def test_topics_do_not_replace_each_other(fake):
     fake.send("one")
     fake.wait(fake.started)
     fake.send("two")
@@ -117,7 +115,7 @@ def test_topics_do_not_replace_each_other(fake: Fake) -> None:
     assert fake.published == ["one old", "three old", "other old"]
 
 
-def test_updates_come_before_the_next_frame_and_never_within_one(fake: Fake) -> None:
+def test_updates_come_before_the_next_frame_and_never_within_one(fake):
     order: list[str] = []
 
     def settings(text: str) -> Any:
@@ -140,13 +138,13 @@ def test_updates_come_before_the_next_frame_and_never_within_one(fake: Fake) -> 
     assert order == ["camera", "newest"]
 
 
-def test_updates_do_not_wait_for_a_frame(fake: Fake) -> None:
+def test_updates_do_not_wait_for_a_frame(fake):
     done = threading.Event()
     fake.worker.update("camera", lambda frames: done.set())
     assert done.wait(PATIENCE)
 
 
-def test_errors_and_refusals_are_told_and_it_goes_on(fake: Fake) -> None:
+def test_errors_and_refusals_are_told_and_it_goes_on(fake):
     def fail(frames: Any) -> None:
         raise ValueError("no such setting")
 
@@ -163,7 +161,7 @@ def test_errors_and_refusals_are_told_and_it_goes_on(fake: Fake) -> None:
     assert fake.errors[0].startswith("ValueError('no such setting') in fail, ")
 
 
-def test_nothing_is_published_after_a_pause(fake: Fake) -> None:
+def test_nothing_is_published_after_a_pause(fake):
     fake.send("one")
     fake.wait(fake.started)
     fake.send("two")
@@ -175,7 +173,7 @@ def test_nothing_is_published_after_a_pause(fake: Fake) -> None:
     assert fake.statistics.summary().dropped == 2  # none is lost unseen
 
 
-def test_a_late_mounting_keeps_no_other_frame_waiting(fake: Fake) -> None:
+def test_a_late_mounting_keeps_no_other_frame_waiting(fake):
     fake.go_on.release(4)
     for frame in ("late 1", "late 2", "next"):
         fake.send(frame)
@@ -192,7 +190,7 @@ def test_a_late_mounting_keeps_no_other_frame_waiting(fake: Fake) -> None:
     assert fake.statistics.summary().refused == 0
 
 
-def test_a_mounting_that_does_not_come_is_a_refusal(fake: Fake) -> None:
+def test_a_mounting_that_does_not_come_is_a_refusal(fake):
     fake.patience = 0.05
     fake.go_on.release(1)
     fake.send("late")
@@ -204,7 +202,7 @@ def test_a_mounting_that_does_not_come_is_a_refusal(fake: Fake) -> None:
     assert fake.published == []
 
 
-def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake: Fake) -> None:
+def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake):
     fake.go_on.release(1)
     fake.send("late")
     fake.wait(fake.started)
@@ -217,7 +215,7 @@ def test_a_frame_that_waits_for_its_mounting_is_dropped_by_a_pause(fake: Fake) -
     assert fake.published == []
 
 
-def test_the_end_waits_for_the_last_frame_but_not_for_ever(fake: Fake) -> None:
+def test_the_end_waits_for_the_last_frame_but_not_for_ever(fake):
     fake.send("one")
     fake.wait(fake.started)
     fake.worker.close()

@@ -5,8 +5,6 @@ PyPI either: /tf and /tf_static carry single geometry_msgs/TransformStamped here
 parent from the newest sample on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any

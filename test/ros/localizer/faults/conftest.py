@@ -1,7 +1,5 @@
 """Makes the parts of the fault matrix importable."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

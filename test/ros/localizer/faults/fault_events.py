@@ -1,7 +1,5 @@
 """What happens to a node while it works: floods, transitions, settings, silence, strangers."""
 
-from __future__ import annotations
-
 import re
 import threading
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Keypoints and maps with something wrong in them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +10,7 @@ from live_world import DESCRIPTORS, PATIENCE, SECOND, World
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.ros.node.conversion import make_message
-from rs_localizer.simulation.landmarks import map_rows
+from rs_localizer.simulation.scene import map_rows
 
 
 def landmarks(world: World, frame: str = "map") -> Map:

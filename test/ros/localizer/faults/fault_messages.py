@@ -1,7 +1,5 @@
 """Clouds and camera_infos with something wrong in them."""
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Callable
 from typing import Any

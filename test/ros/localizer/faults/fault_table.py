@@ -1,7 +1,5 @@
 """All faults: what is done to the node, and what it has to say."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """TF that is missing, contradicts or changes."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util

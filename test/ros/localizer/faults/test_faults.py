@@ -5,8 +5,6 @@ A fault is a row of :data:`FAULTS`. The table is written to a file with
     RS_LOCALIZER_FAULTS=out/faults.md .venv/bin/python -m pytest test/ros/localizer/faults
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator
@@ -14,12 +12,12 @@ from pathlib import Path
 
 import pytest
 from fault_events import bug
-from fault_table import FAULTS, Fault
+from fault_table import FAULTS
 from live_world import PATIENCE, World, record
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+def world(tmp_path_factory) -> Iterator[World]:
     world = World(record(tmp_path_factory.mktemp("bags") / "flight"))
     yield world
     world.close()
@@ -37,7 +35,7 @@ def matrix() -> Iterator[list[tuple[str, str, str]]]:
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_fault(world: World, matrix: list[tuple[str, str, str]], fault: Fault) -> None:
+def test_fault(world, matrix, fault):
     seen, poses = len(world.said), len(world.peer.poses)
     result = fault.do(world)
     answers = [result] if isinstance(result, str) else []
@@ -66,5 +64,5 @@ def test_fault(world: World, matrix: list[tuple[str, str, str]], fault: Fault) -
     matrix.append((fault.name, row.removesuffix("; "), "yes"))
 
 
-def test_the_matrix_is_large_enough() -> None:
+def test_the_matrix_is_large_enough():
     assert len({fault.name for fault in FAULTS}) == len(FAULTS) >= 30

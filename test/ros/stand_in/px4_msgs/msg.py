@@ -1,7 +1,5 @@
 """Messages that take what rclpy's would take."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
