@@ -2,6 +2,7 @@
 # make test   lint, types and tests
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
 # make coverage  the tests once more, and which lines they run (compiled kernels are not seen)
+# make docs   the pages as a site, in out/docs; a link that leads nowhere is an error
 # make clean  removes everything that make has made
 #
 # Both prepare a virtual environment first (once). PYTHON chooses the interpreter, VENV the place.
@@ -30,7 +31,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
 python := $(VENV)/bin/python
 
-.PHONY: demo test bench coverage collect warm lint clean
+.PHONY: demo test bench coverage docs collect warm lint clean
 .DELETE_ON_ERROR:
 
 demo: $(ready)
@@ -49,6 +50,11 @@ bench: $(ready) warm
 coverage: $(ready) warm
 	@$(python) -m pip install -qq --disable-pip-version-check --no-input pytest-cov
 	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile --cov rs_localizer --cov-report term:skip-covered
+
+docs: $(ready)
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --editable '.[docs]'
+	@$(python) -m sphinx -q -W --keep-going -c docs . $(OUT)/docs
+	@echo $(OUT)/docs/README.html
 
 # Leaves the tests with their assertions rewritten, which each of the processes would do.
 collect: $(ready)

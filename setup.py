@@ -72,6 +72,7 @@ setup(
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
         "completion": ["argcomplete"],
+        "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         "evo": ["evo"],
         "fleet": ["dask", "distributed"],
         "hloc": ["h5py"],

@@ -89,7 +89,9 @@ def compare(points, count, frames=90, outliers=0.0):
     return np.array(alone), np.array(together), np.array(tracked)
 
 
-@pytest.mark.parametrize(("points", "count"), [(MAP, 20), (WALL, 60)], ids=["20 points", "wall"])
+@pytest.mark.parametrize(
+    ("points", "count"), [(MAP, 20), pytest.param(WALL, 60, marks=pytest.mark.bench)]
+)
 def test_tracking_improves_weak_frames(points, count):
     alone, together, tracked = compare(points, count)
     ratio = np.median(together[1:], axis=0) / np.nanmedian(alone[1:], axis=0)
@@ -99,6 +101,7 @@ def test_tracking_improves_weak_frames(points, count):
     assert tracked[1:].mean() > 0.95
 
 
+@pytest.mark.bench
 def test_tracking_never_harms_rich_frames():
     alone, together, tracked = compare(MAP, 150, outliers=0.3)
     for quantile in (0.25, 0.5, 0.75):
@@ -108,6 +111,7 @@ def test_tracking_never_harms_rich_frames():
     assert tracked[1:].mean() > 0.95
 
 
+@pytest.mark.bench
 def test_the_prediction_is_covered_by_its_covariance():
     hand = Hand()
     tracker = Tracker(rsl.Localizer(CAMERA))

@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
-from rs_localizer.core.shake import CYCLES, FUNCTIONS, shake_basis
+from rs_localizer.core.shake import CYCLES
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest, step_between
 from rs_localizer.estimation.assumptions import Assumed
@@ -25,21 +25,17 @@ from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.frame_fit import (
     SMOOTH_TERMS,
     FrameFit,
-    extent,
     fit_frame,
     log_determinant_of_inverse,
-    smooth_terms,
+    score_products,
 )
 from rs_localizer.estimation.medians import median_depth
 from rs_localizer.estimation.mirror import farthest, mirrored
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.packing import weighted
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
 from rs_localizer.estimation.refine import apply_step, inverted, refine
-from rs_localizer.estimation.residual_tests import neighbours_agree
-from rs_localizer.estimation.residuals import linearized, squared_errors
 
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
 # hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
@@ -518,61 +514,16 @@ def _look(
         (15,) of the 14 frequencies and the smooth error; and how much neighbouring rows agree.
     """
     statistic = np.zeros(SCALES)
-    lines = linearized(data, count, state, gradient, np.zeros((count, 6)))
-    front = squared_errors(data, count, state, gradient)
-    variance = noise * noise
-    information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    add_prior(
-        prior.informations, prior.references, prior.gravity, state, variance, information, slope
+    variance, frequencies = noise * noise, len(CYCLES)
+    products, agreement = score_products(
+        data, count, state, gradient, inliers, prior, variance, turns
     )
-    frequencies = len(CYCLES)
-    crossed = np.zeros((frequencies, 6, PARAMETERS))
-    own, along = np.zeros((frequencies, 6, 6)), np.zeros((frequencies, 6))
-    across = np.zeros((2 * SMOOTH_TERMS, PARAMETERS))
-    within, beside = np.zeros((2 * SMOOTH_TERMS, 2 * SMOOTH_TERMS)), np.zeros(2 * SMOOTH_TERMS)
-    values, rates = np.empty(FUNCTIONS), np.empty(FUNCTIONS)
-    terms, column = np.empty(SMOOTH_TERMS), np.empty(6)
-    low, high = extent(lines, inliers)
-    for i in range(count):
-        if not inliers[i] or not np.isfinite(front[i]):
-            continue
-        shake_basis(lines.tau[i], values, rates)
-        smooth_terms(lines.image[i], low, high, terms)
-        for side in range(2):
-            row, turn = lines.by_motion[i, side], lines.by_turn[i, side]
-            error, first = lines.errors[i, side], SMOOTH_TERMS * side
-            for a in range(PARAMETERS):
-                for b in range(PARAMETERS):
-                    information[a, b] += row[a] * row[b]
-            for f in range(frequencies if turns else 0):
-                for axis in range(3):
-                    column[axis] = values[2 * f] * turn[axis]
-                    column[3 + axis] = values[2 * f + 1] * turn[axis]
-                _accumulate(column, row, error, own[f], crossed[f], along[f])
-            last = first + SMOOTH_TERMS
-            _accumulate(
-                terms, row, error, within[first:last, first:last], across[first:last],
-                beside[first:last],
-            )  # fmt: skip
-    inverse = inverted(information)
+    own, crossed, along, within, across, beside, inverse = products
     if turns:
         for f in range(frequencies):
             statistic[f] = _explained(own[f], crossed[f], inverse, along[f]) / variance
     statistic[frequencies] = _explained(within, across, inverse, beside) / variance
-    return statistic, neighbours_agree(lines.errors, lines.tau, lines.image, inliers)
-
-
-@kernel
-def _accumulate(
-    column: Array, row: Array, error: float, own: Array, crossed: Array, along: Array
-) -> None:
-    """Add the products of columns with themselves (below the diagonal), motion and error."""
-    for a in range(len(column)):
-        along[a] -= column[a] * error
-        for b in range(PARAMETERS):
-            crossed[a, b] += column[a] * row[b]
-        for b in range(a + 1):
-            own[a, b] += column[a] * column[b]
+    return statistic, agreement
 
 
 @kernel

@@ -33,6 +33,7 @@ def settled(seed, speed, noise=0.5, **more):
     return frame_posterior(observations, truth, PRIOR, 2.0, ASSUMED), truth
 
 
+@pytest.mark.bench
 @pytest.mark.parametrize(("speed", "acceleration"), [(0.05, 0.0), (0.05, 0.005)])
 def test_the_covariance_covers_a_moving_camera(speed, acceleration):
     squared = np.array([
@@ -44,8 +45,15 @@ def test_the_covariance_covers_a_moving_camera(speed, acceleration):
     assert np.mean(squared < chi2.ppf(0.95, 12)) > 0.88
 
 
-@pytest.mark.parametrize("noise", [0.1, 1.0])
-@pytest.mark.parametrize("speed", [0.01, 0.1])
+@pytest.mark.parametrize(
+    ("speed", "noise"),
+    [
+        (0.1, 0.1),
+        (0.01, 1.0),
+        pytest.param(0.01, 0.1, marks=pytest.mark.bench),
+        pytest.param(0.1, 1.0, marks=pytest.mark.bench),
+    ],
+)
 def test_thousands_of_points_of_a_right_map_show_no_error_of_map_or_lens(speed, noise):
     """What a field has of the points' noise, and their errors, too, grows with their number."""
     for seed in range(3):
@@ -92,6 +100,7 @@ def test_at_rest_the_truth_is_covered(resting):
     assert np.mean(twists < chi2.ppf(0.95, 6)) > 0.9
 
 
+@pytest.mark.bench
 def test_slow_motions_are_averaged_without_a_jump_and_covered():
     """Between rest and motion the mixture still covers the truth."""
     for speed in (0.002, 0.005, 0.01):
@@ -256,6 +265,7 @@ def test_two_waves_are_followed():
     assert np.sqrt(np.mean(off**2)) < np.radians(0.06)
 
 
+@pytest.mark.bench
 def test_noise_is_hardly_ever_a_vibration():
     """Frequencies are looked for in a third of the frames, by chance, and nothing is made of it."""
     followed, off = 0, [[], []]
@@ -274,7 +284,14 @@ def test_noise_is_hardly_ever_a_vibration():
     assert np.sqrt(np.mean(np.square(off[0]) / np.mean(np.square(off[1])))) < 1.15
 
 
-@pytest.mark.parametrize(("count", "wrong", "published"), [(16, 0, 0), (20, 4, 0), (40, 8, 6)])
+@pytest.mark.parametrize(
+    ("count", "wrong", "published"),
+    [
+        (20, 4, 0),
+        pytest.param(16, 0, 0, marks=pytest.mark.bench),
+        pytest.param(40, 8, 6, marks=pytest.mark.bench),
+    ],
+)
 def test_few_points_of_a_vibrating_camera_are_refused_or_covered(count, wrong, published):
     """Six pixels of swing, where points within four may count as inliers of a motion alone.
 
@@ -314,6 +331,7 @@ def test_points_just_beyond_the_gate_that_nothing_explains_are_counted():
             assert least <= found.near_outliers <= most
 
 
+@pytest.mark.bench
 def test_scores_are_chi_squared_where_there_is_nothing():
     """Mean 6 of each frequency, and 14 of a smooth error: the motion mimics six of its twenty."""
     statistics = []
@@ -379,10 +397,16 @@ def published(make, frames=60, noise=0.5, points=80):
 
 @pytest.mark.parametrize(
     "make",
-    [hand, partial(vibration, degrees=0.5, hertz=60.0),
-     partial(any_vibration, degrees=(0.1, 0.3), hertz=(20.0, 150.0), tones=5)],
-    ids=["hand", "sine", "band"],
-)  # fmt: skip
+    [
+        partial(vibration, degrees=0.5, hertz=60.0),
+        pytest.param(hand, marks=pytest.mark.bench),
+        pytest.param(
+            partial(any_vibration, degrees=(0.1, 0.3), hertz=(20.0, 150.0), tones=5),
+            marks=pytest.mark.bench,
+        ),
+    ],
+    ids=["sine", "hand", "band"],
+)
 def test_regions_hold_for_an_independent_simulator(make):
     for scores in published(make):
         assert len(scores) >= 50  # published

@@ -36,7 +36,13 @@ def followed(tracker, recorded, frames):
 
 
 @pytest.mark.parametrize(
-    ("offset", "hertz"), [(0.005, 60.0), (0.005, 61.3), (0.005, 120.0), (-0.011, 120.0)]
+    ("offset", "hertz"),
+    [
+        (0.005, 61.3),
+        (-0.011, 120.0),
+        pytest.param(0.005, 60.0, marks=pytest.mark.bench),
+        pytest.param(0.005, 120.0, marks=pytest.mark.bench),
+    ],
 )
 def test_no_period_of_a_vibration_is_mistaken_for_another(hertz, offset):
     motion = partial(shaken_hand, shaking=((0.2, hertz),))
@@ -80,7 +86,7 @@ def test_few_inliers_say_nothing():
     assert row_offset_likelihood(camera, points, pixels, few, 0) is None
 
 
-@pytest.mark.parametrize("shaking", [(), ((0.2, 60.0),)])
+@pytest.mark.parametrize("shaking", [((0.2, 60.0),), pytest.param((), marks=pytest.mark.bench)])
 def test_a_step_of_the_stamps_is_found(shaking):
     """Another clock from one sample on, by 20 ms: more than a period of the vibration."""
     motion = partial(shaken_hand, shaking=shaking) if shaking else hand

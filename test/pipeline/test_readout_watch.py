@@ -66,8 +66,7 @@ def watched(count: int = FRAMES, **settings: Any) -> tuple[FrameLocalizer, list[
     return frames, notices
 
 
-@pytest.mark.parametrize("tracking", [True, False])
-@pytest.mark.parametrize("factor", [0.8, 1.2])
+@pytest.mark.parametrize(("factor", "tracking"), [(0.8, True), (1.2, False)])
 def test_a_wrong_readout_time_is_said_once(factor, tracking):
     frames, notices = watched(readout_time=factor * READOUT, tracking=tracking)
     assert len(notices) == 1
@@ -109,7 +108,7 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
     assert "readout_time" not in notices
 
 
-@pytest.mark.parametrize("tracking", [True, False])
+@pytest.mark.parametrize("tracking", [True, pytest.param(False, marks=pytest.mark.bench)])
 def test_a_reversed_scan_is_said_and_covariances_hold(tracking):
     given = {"readout_time": READOUT, "tracking": tracking}
     frames, (text,) = watched(FRAMES - 1, scan_direction="bottom_to_top", **given)
@@ -180,7 +179,9 @@ def test_nothing_is_measured_that_nobody_uses(settings):
     assert notices == []
 
 
-@pytest.mark.parametrize("direction", ["top_to_bottom", "bottom_to_top"])
+@pytest.mark.parametrize(
+    "direction", ["bottom_to_top", pytest.param("top_to_bottom", marks=pytest.mark.bench)]
+)
 def test_the_readout_time_from_nothing(direction):
     given = {"estimate_readout_time": True, "scan_direction": direction}
     frames, notices = watched(FRAMES - 1, **given)
