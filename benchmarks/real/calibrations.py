@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from rs_localizer.trajectory.calibration import calibrate
 from rs_localizer.trajectory.first_lens import first_lens, reprojection_error
 from rs_localizer.trajectory.observe import Observed
 
-Result = dict[str, object]
+Result = dict[str, Any]
 PARTS = ("whole", "1/2", "2/2", "1/3", "2/3", "3/3")
 
 
