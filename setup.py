@@ -77,6 +77,7 @@ setup(
         "fleet": ["dask", "distributed"],
         "hloc": ["h5py"],
         "mapping": ["pycolmap"],
+        "table": ["fsspec", "pyarrow"],
         "view": ["rerun-sdk"],
         "test": [
             "build",

@@ -103,7 +103,7 @@ def test_a_real_camera_whose_stamps_are_not_its_own_raises_no_alarm():
     notices: list[str] = []
     frames = FrameLocalizer(NodeConfig(readout_time=0.0129), lambda name, _: notices.append(name))
     with open_bag(data.path(data.WEBCAM)) as bag:
-        assert sum(bool(result) for _, result in replay(bag, find_topics(bag), frames)) > 100
+        assert sum(bool(answer.result) for answer in replay(bag, find_topics(bag), frames)) > 100
     assert frames.readout_watch.measured is not None
     assert "readout_time" not in notices
 
@@ -137,7 +137,7 @@ def within(error: np.ndarray, covariance: np.ndarray) -> bool:
 def test_a_global_shutter_has_no_twist():
     frames = FrameLocalizer(NodeConfig(readout_time=READOUT))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
-        for (_, found), _ in zip(replay(bag, find_topics(bag), frames), range(40), strict=False):
+        for (*_, found), _ in zip(replay(bag, find_topics(bag), frames), range(40), strict=False):
             assert found
     assert found.twist is None
     assert "(a global shutter)" in frames.readout_watch.fault
@@ -147,7 +147,7 @@ def test_a_global_shutter_has_no_twist():
 def test_a_global_shutter_is_known_within_a_second_and_stays_one(tracking):
     frames = FrameLocalizer(NodeConfig(readout_time=READOUT, tracking=tracking))
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
-        for (_, found), _ in zip(replay(bag, find_topics(bag), frames), range(30), strict=False):
+        for (*_, found), _ in zip(replay(bag, find_topics(bag), frames), range(30), strict=False):
             assert found
     assert frames.readout_watch.far_off
     assert frames.readout_watch.global_shutter
