@@ -204,17 +204,6 @@ def test_a_prediction_that_is_rounding_errors_is_none():
     assert tracker.localize(soon, *shown)
 
 
-def test_a_global_shutter_has_nothing_to_track_with():
-    with pytest.raises(ValueError, match="tracking needs velocities, which solver p3p"):
-        Tracker(rsl.Localizer(CAMERA, solver="p3p"))
-
-
-def test_without_a_readout_time_there_is_nothing_to_track_with():
-    blind = rsl.Camera(640, 480, K)
-    with pytest.raises(ValueError, match="tracking needs the readout time"):
-        Tracker(rsl.Localizer(blind))
-
-
 @pytest.mark.parametrize("kind", ["gyroscope", "gravity"])
 def test_a_measured_rate_or_direction_helps_on_a_wall(kind):
     hand, localizer = Hand(), rsl.Localizer(CAMERA)

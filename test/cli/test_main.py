@@ -115,13 +115,6 @@ def test_faults_are_one_line_and_an_exit_code(error, code, text, monkeypatch, ca
     assert capsys.readouterr().err.endswith(text)
 
 
-def test_results_as_json(capsys):
-    assert main(["readout", "--json", "imx219"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["command"] == "readout"
-    assert all(0.0 < entry["median"] < 0.2 for entry in found["result"])
-
-
 def test_what_a_command_prints_as_json(monkeypatch, capsys):
     results: list[object] = [{"residual (px)": math.nan, "poses": 3}, None]
 

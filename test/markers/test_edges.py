@@ -72,11 +72,6 @@ def test_a_smeared_edge_is_where_it_was_amid_the_exposure(smear, side):
         assert error(image, left, top, side, cells=6) < 0.1
 
 
-def test_light_that_falls_off_across_a_smeared_marker_moves_it_little():
-    light = np.linspace(1.0, 0.6, 80)  # a fifth less from side to side
-    assert error(ring(20.3, 19.8, 42.0, (1.0, 0.3)) * light, 20.3, 19.8, 42.0, cells=6) < 0.15
-
-
 def test_the_sides_of_a_slanted_marker_keep_clear_of_each_other():
     """A rhomb of 25 degrees: its rows are a sixth of its height apart, not of its sides."""
     angle, side = np.deg2rad(25.0), 40.0

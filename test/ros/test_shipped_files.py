@@ -17,6 +17,9 @@ from rclpy.context import Context
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Chessboard
 from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
 
@@ -193,6 +196,22 @@ def test_the_detector_knows_the_localizers_shutter(describe, tmp_path):
         "min_side": 12.0, "use_sim_time": True,
     }  # fmt: skip
     assert parameters(description, "localizer") == {"stamp_offset": 0.005, "use_sim_time": True}
+
+
+def test_the_localizer_knows_how_well_a_board_is_known(describe, tmp_path):
+    file = tmp_path / "board.yaml"
+    board = Chessboard(6, 4, 0.03, deviation=2.5e-4)
+    write_marker_map(file, MarkerMap(boards=(board,)))
+    chosen = {"marker_map": str(file), "params_file": str(ROOT / "config" / "rs_localizer.yaml")}
+    of_map = {"map_deviation": 2.5e-4}
+    found = parameters(describe("markers.launch.py", **chosen), "localizer")
+    assert found == pytest.approx(of_map)
+    given = describe("markers.launch.py", **chosen, map_deviation="0.0")
+    assert parameters(given, "localizer") == {"map_deviation": 0.0}
+    own = tmp_path / "own.yaml"
+    own.write_text("/**:\n  ros__parameters: {map_deviation: 0.001}\n")
+    chosen["params_file"] = str(own)
+    assert parameters(describe("markers.launch.py", **chosen), "localizer") == {}
 
 
 def test_markers_need_a_map(describe, tmp_path):

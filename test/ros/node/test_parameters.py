@@ -10,7 +10,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rs_localizer.config import NodeConfig, VelocityPrior
+from rs_localizer.config import NodeConfig
 from rs_localizer.ros.node import parameters
 from rs_localizer.settings import settings
 
@@ -77,16 +77,6 @@ def test_descriptions_ranges_and_choices(recorder):
     assert not describe("solver").read_only
 
 
-def test_several_at_once_are_one_change(recorder):
-    change = {"solver": "p3p", "seed": 4, "velocity_prior__linear": 0.5}
-    assert recorder.set_all(**change) == (True, "")
-    expected = NodeConfig(
-        solver="p3p", seed=4, velocity_prior=VelocityPrior(VelocityPrior().angular, 0.5)
-    )
-    assert recorder.applied == [expected]
-    assert parameters.read(recorder.node, NodeConfig) == expected
-
-
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -124,12 +114,3 @@ def test_what_is_refused_stays_as_it_was(recorder, change, reason):
 def test_bad_values_at_start(context, assignment, text):
     with pytest.raises(ValueError, match=text):
         Recorder(context, "-p", assignment)
-
-
-def test_numbers_in_a_row(context):
-    recorder = Recorder(context, "-p", "gravity_in_map:=[0.0, 1.0, 0.0]")
-    assert recorder.config.gravity_in_map == (0.0, 1.0, 0.0)
-    assert recorder.set_all(gravity_in_map=[0.0, -9.81, 0.0]) == (True, "")
-    assert recorder.applied[-1].gravity_in_map == (0.0, -9.81, 0.0)
-    assert recorder.set_all(gravity_in_map=[0.0, 1.0])[1].startswith("gravity_in_map must be 3")
-    recorder.node.destroy_node()
