@@ -414,6 +414,10 @@ class FrameLocalizer:
             return Refusal(Reason.EMPTY_CLOUD, str(error))
         except MessageError as error:
             return Refusal(Reason.BAD_CLOUD, str(error))
+        return self.localize_cloud(cloud)
+
+    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
+        """Localize correspondences, however they came."""
         self._follow(cloud.stamp_ns, cloud.frame)
         result = self._localize(cloud)
         if result:
