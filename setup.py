@@ -72,10 +72,12 @@ setup(
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
         "completion": ["argcomplete"],
+        "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         "evo": ["evo"],
         "fleet": ["dask", "distributed"],
         "hloc": ["h5py"],
         "mapping": ["pycolmap"],
+        "table": ["fsspec", "pyarrow"],
         "view": ["rerun-sdk"],
         "test": [
             "build",

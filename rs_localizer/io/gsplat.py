@@ -27,6 +27,11 @@ def exposed_rows(camera: Camera) -> tuple[float, float]:
     return float(times.min()), float(times.max())
 
 
+def shutter_type(camera: Camera) -> str:
+    """As gsplat and NCore call it: ``ROLLING_TOP_TO_BOTTOM`` and so on, ``GLOBAL``."""
+    return f"ROLLING_{camera.scan_direction}".upper() if camera.readout_time > 0.0 else "GLOBAL"
+
+
 def write_gsplat(
     folder: Path, camera: Camera, names: list[str], poses: Array, points: Array
 ) -> None:
@@ -45,8 +50,6 @@ def write_gsplat(
     np.save(folder / "viewmats.npy", views[:, 0])
     np.save(folder / "viewmats_rs.npy", views[:, 2])
     np.save(folder / "Ks.npy", np.broadcast_to(K, (len(names), 3, 3)))
-    rolling = camera.readout_time > 0.0
-    shutter = f"ROLLING_{camera.scan_direction}".upper() if rolling else "GLOBAL"
     width, height = camera.size
     lens = colmap_parameters(camera)
     images = []
@@ -55,7 +58,7 @@ def write_gsplat(
         images.append(f"{number} {_line([w, x, y, z, *view[:3, 3]])} 1 {name}\n\n")
     for file, text in (
         ("names.txt", "".join(f"{name}\n" for name in names)),
-        ("shutter.txt", f"{shutter}\n"),
+        ("shutter.txt", f"{shutter_type(camera)}\n"),
         ("cameras.txt", f"1 {lens['model']} {width} {height} {_line(lens['params'])}\n"),
         ("images.txt", "".join(images)),
         (

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from rs_localizer.config import NodeConfig, PublishTf
+from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
@@ -15,7 +15,7 @@ from rs_localizer.io.topics import CAMERA_INFO, IMU, MAP_POINTS, TF, TF_STATIC
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import IMU_TYPE, INPUTS, Input, Role, with_role
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 
 Item = tuple[str, int, Any]
 """Topic, time of recording in ns, message."""
@@ -236,10 +236,43 @@ def _connected(tree: TransformTree, target: str, source: str) -> bool:
     return True
 
 
-def replay(
-    bag: BagReader, topics: Topics, localizer: FrameLocalizer
-) -> Iterator[tuple[int, Localized | Refusal]]:
-    """Time of recording (ns) and result of every frame, as the node would have answered.
+def prepare(
+    bag: BagReader,
+    config: NodeConfig,
+    given: Mapping[str, str | None] | None = None,
+    notice: Notify = unheard,
+) -> tuple[Topics, FrameLocalizer]:
+    """What :func:`replay` needs: where the inputs are, and a localizer with its map.
+
+    Args:
+        bag: the recording.
+        config: the settings.
+        given: topics, as for :func:`find_topics`.
+        notice: told of what is odd.
+
+    Raises:
+        ValueError: for topics, transforms or a map that are missing or cannot be used.
+    """
+    topics = find_topics(bag, given)
+    if config.imu.use == ImuUse.NONE:
+        topics = topics.without(IMU)
+    if topics.lacks_map and not config.map_file:
+        raise BagError(f"{bag.path} has {topics.frames} and no map; give one with --map")
+    localizer = FrameLocalizer(config, notice, find_transforms(bag, topics, config))
+    localizer.load_map()
+    return topics, localizer
+
+
+class Answer(NamedTuple):
+    """What became of a frame."""
+
+    recorded_ns: int
+    stamp_ns: int  # of its message
+    result: Localized | Refusal
+
+
+def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterator[Answer]:
+    """The result of every frame, as the node would have answered.
 
     A message that is no frame and cannot be used gives a Refusal of its own, for a reason of
     :data:`NO_FRAMES`.
@@ -254,7 +287,7 @@ def replay(
     for topic, recorded_ns, message in messages:
         result = inputs[topic].take(localizer, message)
         if result is not None:
-            yield recorded_ns, result
+            yield Answer(recorded_ns, stamp_ns(message), result)
 
 
 def _list(topics: list[str]) -> str:

@@ -12,6 +12,7 @@ from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
+from rs_localizer.offline.table import COLUMNS
 from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.health import State
 from rs_localizer.settings import Kind, settings
@@ -61,6 +62,16 @@ def test_the_table_of_solvers():
     said = {pages.names_in(row[0])[0]: (int(row[1]), int(row[2])) for row in table.rows}
     solvers = {name: find_solver(name) for name in SOLVERS}
     assert said == {name: (it.sample_size, it.solutions) for name, it in solvers.items()}
+
+
+def test_the_columns_of_the_table_of_frames() -> None:
+    (table,) = pages.all_tables("column", "type")
+    said = {
+        name: kind
+        for names, kind in zip(table.column("column"), table.column("type"), strict=True)
+        for name in pages.names_in(names)
+    }
+    assert list(said.items()) == list(COLUMNS.items())
 
 
 def test_figures_are_of_solvers_that_exist():
