@@ -291,7 +291,7 @@ class FrameLocalizer:
     ) -> None:
         self._notice = notice
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
-        self.imu = ImuInput(notice)
+        self.imu: ImuInput = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
         self._resets = StreamResets()
