@@ -291,7 +291,7 @@ class FrameLocalizer:
     ) -> None:
         self._notice = notice
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
-        self.imu = ImuInput(notice)
+        self.imu: ImuInput = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
         self._resets = StreamResets()
@@ -414,6 +414,10 @@ class FrameLocalizer:
             return Refusal(Reason.EMPTY_CLOUD, str(error))
         except MessageError as error:
             return Refusal(Reason.BAD_CLOUD, str(error))
+        return self.localize_cloud(cloud)
+
+    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
+        """Localize correspondences, however they came."""
         self._follow(cloud.stamp_ns, cloud.frame)
         result = self._localize(cloud)
         if result:
