@@ -13,6 +13,7 @@ from rs_localizer.ros.launching import argument, common_arguments, localizer, st
 TOPICS = {
     "correspondences": "points of the map and their pixels (sensor_msgs/PointCloud2)",
     "keypoints": "pixels with ids or descriptors, to be matched (sensor_msgs/PointCloud2)",
+    "detections": "tags of a detector (apriltag_msgs/AprilTagDetectionArray)",
     "map_points": "the map for keypoints, latched (sensor_msgs/PointCloud2)",
     "camera_info": "the camera's calibration (sensor_msgs/CameraInfo)",
     "imu": "the IMU beside the camera (sensor_msgs/Imu)",

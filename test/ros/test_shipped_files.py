@@ -17,6 +17,7 @@ from rclpy.context import Context
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
 
@@ -158,7 +159,7 @@ def test_arguments_and_files_exist(describe, file):
 
 def test_every_input_can_be_remapped(describe):
     unused: Any = None
-    inputs = set(Feed(unused, unused, unused, unused).topics())
+    inputs = set(Feed(unused, unused, unused, unused).topics()) | set(INPUTS)
     launched = node(describe("localizer.launch.py"), "localizer")
     assert {name for name, _ in launched.options["remappings"]} == inputs
     assert launched.options["name"] == NODE_NAME
@@ -178,6 +179,7 @@ def test_every_setting_can_be_given(describe, file):
     assert found == {
         "readout_time": 0.02, "seed": 3, "tracking": False, "map_frame": "1",
         "use_sim_time": True, "scan_direction": "bottom_to_top",
+        **MAP.get(file, {}),  # it may hear of the same markers on detections
     }  # fmt: skip
 
 
