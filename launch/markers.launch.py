@@ -51,4 +51,5 @@ def _nodes(context: LaunchContext) -> list:
 def _shutter(params_file: str) -> dict[str, Any]:
     """What the localizer's params file says of the shutter, for the detector's debug image."""
     values = read_params(params_file, NodeConfig)
-    return {name: values[name] for name in settings(DetectorConfig) if name in values}
+    shared = set(settings(DetectorConfig)) - {"marker_map"}  # the localizer's is of other detectors
+    return {name: values[name] for name in values if name in shared}

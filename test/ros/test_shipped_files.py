@@ -194,7 +194,9 @@ def test_the_detector_knows_the_localizers_shutter(describe, tmp_path):
         "marker_map": WALL, "readout_time": 0.021, "stamp_offset": 0.005,
         "min_side": 12.0, "use_sim_time": True,
     }  # fmt: skip
-    assert parameters(description, "localizer") == {"stamp_offset": 0.005, "use_sim_time": True}
+    assert parameters(description, "localizer") == {
+        "marker_map": WALL, "stamp_offset": 0.005, "use_sim_time": True
+    }  # fmt: skip
 
 
 def test_markers_need_a_map(describe, tmp_path):
