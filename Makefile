@@ -1,7 +1,8 @@
 # make demo   the whole thing on the bundled recording: a table on the screen, pictures in out/
 # make test   lint, types and tests
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
-# make coverage  the tests once more, and which lines they run (compiled kernels are not seen)
+# make coverage  the tests once more, and which lines they run: without what Numba compiles, and
+#                without what runs in processes of its own (nodes, some commands)
 # make docs   the pages as a site, in out/docs; a link that leads nowhere is an error
 # make clean  removes everything that make has made
 #
@@ -48,8 +49,9 @@ bench: $(ready) warm
 	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile -m bench --timeout 1800
 
 coverage: $(ready) warm
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input pytest-cov
-	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile --cov rs_localizer --cov-report term:skip-covered
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --upgrade --no-deps --target $(VENV)/coverage coverage pytest-cov
+	@PYTHONPATH="$$(cd $(VENV) && pwd)/coverage" OPENBLAS_NUM_THREADS=1 \
+	    $(python) -m pytest -q -n 2 --dist loadfile --timeout 900 --cov --cov-report term:skip-covered
 
 docs: $(ready)
 	@$(python) -m pip install -qq --disable-pip-version-check --no-input --editable '.[docs]'

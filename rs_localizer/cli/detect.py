@@ -99,7 +99,7 @@ def detect_one(args: argparse.Namespace) -> Recorded:
         atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
     ):
         recorded = _record(args, source, detector, out)
-        write_shutter(args, out)
+        write_shutter(args, out, marker_map.settings)
     _tell(args, recorded, notices)
     for fault in (*recorded.faults, *time_faults(args, source.clock, recorded.period)):
         print(f"warning: {fault}")

@@ -150,14 +150,20 @@ def need_package(name: str, why: str) -> None:
         ) from None
 
 
-def localizer(configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]]) -> Node:
-    """The node rs_localizer with its params file and the settings that were given."""
+def localizer(
+    configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]],
+    of_map: Mapping[str, Any] | None = None,
+) -> Node:  # fmt: skip
+    """The node rs_localizer with its params file, what its map says, and the given settings."""
     return Node(
         package=PACKAGE,
         executable="localizer",
         name="rs_localizer",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file"), given(configurations)],
+        parameters=[
+            LaunchConfiguration("params_file"),
+            {**(of_map or {}), **given(configurations)},
+        ],
         remappings=list(remappings),
         arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
         output="screen",

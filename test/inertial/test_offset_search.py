@@ -12,7 +12,6 @@ from benchmarks.independent.gyroscopes import Imu
 from benchmarks.independent.motions import hand, rest, shaken_hand
 from benchmarks.independent.scenes import Rich
 from benchmarks.inertial.recordings import record
-from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.settings import InertialSettings
 from rs_localizer.localizer import Localizer
 from rs_localizer.pipeline.pose_at_time import twist_at
@@ -74,16 +73,6 @@ def test_a_reset_begins_anew():
     assert not followed(tracker, recorded, 20)[0][-1]
     tracker.reset()
     assert tracker._aid.searches
-
-
-def test_few_inliers_say_nothing():
-    recorded = record(Camera(), rest, Rich(), (1, 1), 5)
-    points, pixels = recorded.frames.seen(0, 0.3)
-    camera = believed(recorded.frames.camera)
-    found = Localizer(camera).localize(points, pixels)
-    assert row_offset_likelihood(camera, points, pixels, found, 0) is not None
-    few = replace(found, inliers=found.inliers & (np.arange(len(points)) < 8))
-    assert row_offset_likelihood(camera, points, pixels, few, 0) is None
 
 
 @pytest.mark.parametrize("shaking", [((0.2, 60.0),), pytest.param((), marks=pytest.mark.bench)])

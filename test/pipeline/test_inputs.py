@@ -45,7 +45,8 @@ def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name, tmp_p
     broken = SimpleNamespace(header=nameless, fields=[], data=b"", **sizes)
     wall = tmp_path / "wall.yaml"
     wall.write_text(
-        "markers: [{family: 4x4_50, id: 0, size: 0.1, position: [0, 0, 0], quaternion: [0, 0, 0, 1]}]"
+        "{map_frame: map, markers: [{family: 4x4_50, id: 0, size: 0.1, position: [0, 0, 0], "
+        "quaternion: [0, 0, 0, 1]}]}"
     )
     localizer = FrameLocalizer(NodeConfig(marker_map=str(wall)))
     localizer.load_map()

@@ -237,16 +237,6 @@ def test_what_is_missing_came_and_cannot_be_used(world):
     )
 
 
-def test_a_frame_that_takes_long(world):
-    world.statistics.started()
-    world.now += 3.0
-    health = world.diagnose()
-    assert (health.level, health.state) == (Level.WARN, "busy")
-    assert health.message == "a frame has been worked on for 3.0 s"
-    world.statistics.ended()
-    assert world.diagnose().values["State"] == "waiting for frames"
-
-
 def test_topics_that_nothing_waits_for_are_left_out():
     nobody = replace(COMES, seconds=9.0, heard=False, cause="it has no publisher")
     deaf = replace(nobody, cause="the QoS of /x does not fit", mismatch=True)
