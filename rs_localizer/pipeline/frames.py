@@ -292,7 +292,7 @@ class FrameLocalizer:
     ) -> None:
         self._notice = notice
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
-        self.imu = ImuInput(notice)
+        self.imu: ImuInput = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
         self._tags: Tags | None = None
@@ -418,6 +418,10 @@ class FrameLocalizer:
             return Refusal(Reason.EMPTY_CLOUD, str(error))
         except MessageError as error:
             return Refusal(Reason.BAD_CLOUD, str(error))
+        return self.localize_cloud(cloud)
+
+    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
+        """Localize correspondences, however they came."""
         self._follow(cloud.stamp_ns, cloud.frame)
         result = self._localize(cloud)
         if result:
@@ -454,10 +458,7 @@ class FrameLocalizer:
         if self._tags is None:
             return Refusal(Reason.NO_MAP, "detections need the setting marker_map")
         cloud = self._tags.match(message)
-        if isinstance(cloud, Refusal):
-            return cloud
-        self._follow(cloud.stamp_ns, cloud.frame)
-        return self._localize(cloud)
+        return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
 
     def _localize_by_map(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
         cloud = self._landmarks.match(keypoints, self._config.matching, self._camera, prior)
