@@ -226,11 +226,11 @@ def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Fig
     )
 
 
-def _figures(found: Recorded) -> Figures:
+def _figures(recorded: Recorded) -> Figures:
     return {
-        "images": found.images,
-        "with corners": found.with_corners,
-        "corners": found.corners,
-        "residual of a still pose (px)": found.residual,
-        "warnings": "; ".join(found.faults),
+        "images": recorded.images,
+        "with corners": recorded.with_corners,
+        "corners": recorded.corners,
+        "residual of a still pose (px)": recorded.residual,
+        "warnings": "; ".join(recorded.faults),
     }

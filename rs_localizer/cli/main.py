@@ -233,8 +233,8 @@ def _output(name: str, common: Collection[str]) -> Iterator[None]:
 
 def _print_json(name: str, result: Any, printed: str) -> None:
     """The figures of a command, or the lines that it has printed."""
-    found = {"text": printed.splitlines()} if result is None else {"result": result}
-    print(json.dumps({"command": name, **_as_json(found)}, indent=1))
+    content = {"text": printed.splitlines()} if result is None else {"result": result}
+    print(json.dumps({"command": name, **_as_json(content)}, indent=1))
 
 
 def _as_json(value: Any) -> Any:

@@ -97,9 +97,9 @@ def _make(args: argparse.Namespace) -> None:
         raise
     except ValueError as error:  # the arguments are all that can be wrong with it
         raise UsageError(str(error)) from error
-    found = problems(marker_map)
-    if found:
-        raise UsageError(found[0])
+    faults = problems(marker_map)
+    if faults:
+        raise UsageError(faults[0])
     # An ending would be lost with a dot in the name.
     target = Path(f"{args.out}.{args.format}")
     map_file = Path(f"{args.out}.yaml")
@@ -166,11 +166,11 @@ def _counts(text: str, option: str) -> tuple[int, int]:
 
 def _check(path: Path) -> None:
     marker_map = read_marker_map(path)
-    found = problems(marker_map)
-    for text in found:
+    faults = problems(marker_map)
+    for text in faults:
         print(text)
-    if found:
-        count = "a problem" if len(found) == 1 else f"{len(found)} problems"
+    if faults:
+        count = "a problem" if len(faults) == 1 else f"{len(faults)} problems"
         raise ValueError(f"{path} has {count}")
     kinds = sorted({marker.family.name for marker, _ in marker_map.all_markers()})
     of = f" of {', '.join(kinds)}" if kinds else ""
