@@ -379,8 +379,8 @@ class Imu:
     )
     wait: float = setting(
         0.02,
-        "How long a frame waits for the messages of its exposure before the camera goes on alone, "
-        "in s",
+        "How long a frame waits for the messages of its exposure before it is localized without "
+        "them, in s",
         minimum=0.0,
         maximum=1.0,
     )

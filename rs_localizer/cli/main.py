@@ -39,7 +39,7 @@ _STEERING = {
 _COMMON = (
     ("--json", "print the result as JSON"),
     ("--quiet", "print nothing but faults"),
-    ("--verbose", "of a fault, say where in the program it was found"),
+    ("--verbose", "print the traceback of a fault"),
 )
 
 
@@ -90,7 +90,7 @@ COMMANDS = {
     ),
     "readout": Command(
         "rs_localizer.cli.readout",
-        "what others say of a camera's readout time: median, spread, sources",
+        "published readout times of a camera: median, spread, sources",
         "rs_localizer readout imx219 1920x1080",
     ),
     "evaluate": Command(
@@ -100,7 +100,7 @@ COMMANDS = {
     ),
     "map": Command(
         "rs_localizer.cli.map",
-        "make a map of a room or of markers, refine, align and convert it, say what it holds",
+        "make a map of a room or of markers; refine, align, convert and describe it",
         "rs_localizer map build walk.mp4 --calibration lens.yaml --params shutter.yaml --out room",
     ),
     "watch": Command(

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--grid",
         metavar="2x3",
         help=f"markers, columns x rows (default: {_GRID}); what does not fit on a page together "
-        "is to be cut out and mounted as the map says",
+        "is to be cut out and mounted as in the map",
     )
     kind.add_argument("--chessboard", metavar="6x4", help="inner corners, along a row x rows")
     kind.add_argument("--charuco", metavar="5x7", help="squares, along a row x rows")
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     make.add_argument("--overwrite", action="store_true", help="replace earlier files")
     check = commands.add_parser(
         "check",
-        help="say what is wrong with a map file",
+        help="check a map file",
         description="Read a map and look for overlaps, mirrored markers and sizes in other units.",
     )
     check.add_argument("map", type=Path, metavar="MAP")

@@ -27,5 +27,5 @@ def run(args: argparse.Namespace) -> list[dict[str, object]]:
             f"{entry.name:{width}}  {entry.mode:{modes}}  {1e3 * entry.median:9.2f}  {spread:14} "
             f"{entry.number:6}  {entry.source}{note if entry.upper_bound else ''}"
         )
-    print("What others say, of modes that may not be yours: rs_localizer calibrate measures it.")
+    print("Published values, perhaps of other modes: rs_localizer calibrate measures yours.")
     return [asdict(entry) for entry in entries]

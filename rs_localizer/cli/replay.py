@@ -454,7 +454,7 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
     if images:
         print(f"{bag.count(images)} images published in {played.seconds:.1f} s")
     for topic, count in played.poses.items():
-        print(f"{count} poses heard on {topic}")
+        print(f"{count} poses received on {topic}")
     if not played.poses:
         print(f"no node {NODE_NAME} was there to publish poses")
 

@@ -234,9 +234,7 @@ def _size(tree: dict[str, Any]) -> tuple[int, int]:
     if width is None and height is None:
         both = _first(tree, _SIZE)
         if both is None:
-            raise ValueError(
-                "it does not say for which size of images: add image_width and image_height"
-            )
+            raise ValueError("it has no image size: add image_width and image_height")
         width, height = _values(both).tolist()
     if width is None or height is None:
         raise KeyError((_WIDTH if width is None else _HEIGHT)[0])

@@ -189,7 +189,7 @@ def jpeg_of(width: int, height: int, before: bytes = b"") -> bytes:
 
 def test_a_jpeg_that_hides_its_size_is_not_decoded():
     hidden = JPEG[:2] + b"junk" + JPEG[2:]
-    with pytest.raises(MessageError, match="cannot be decoded: no header tells its size"):
+    with pytest.raises(MessageError, match="cannot be decoded: no header has its size"):
         read_compressed_image(compressed(hidden))
 
 

@@ -71,7 +71,7 @@ def alignment(any_map: Map | MarkerMap, wishes: Wishes) -> Similarity:
         one, other, wanted = wishes.distance
         apart = float(np.linalg.norm(place(one) - place(other)))
         if not apart > 0.0:
-            raise ValueError(f"{one} and {other} are at one place: no size can be told by them")
+            raise ValueError(f"{one} and {other} are at one place: they give no scale")
         scale = wanted / apart
     origin = np.zeros(3)
     if wishes.origin is not None:
@@ -105,7 +105,7 @@ def _normal(floor: Array, points: Array) -> Array:
     middle = floor.mean(axis=0)
     _, extents, axes = np.linalg.svd(floor - middle)
     if not extents[1] > _LINE * extents[0]:
-        raise ValueError("the ids of the floor lie on a line: they do not say what is level")
+        raise ValueError("the ids of the floor lie on a line, which determines no level")
     normal = axes[2]
     return np.asarray(normal if (points.mean(axis=0) - middle) @ normal >= 0.0 else -normal)
 

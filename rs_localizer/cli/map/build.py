@@ -111,7 +111,7 @@ def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
                 continue
             seen_by = None if shot.camera_info is None else cameras.of(shot, image)
             if size not in (None, image.pixels.shape) or (views and seen_by is not camera):
-                raise ValueError("the camera changes on the way; cut the recording there")
+                raise ValueError("the camera changes within the recording; cut it there")
             camera, size = seen_by, image.pixels.shape
             stamps.append(image.stamp_ns)
             asked = [s for s in wanted if s not in named and _time(image, stamps) >= s - 1e-3]
@@ -294,7 +294,7 @@ def _check_points(args: argparse.Namespace) -> None:
     """Before minutes of work: that each point of a distance is given in two images."""
     names = [name for name, *_ in args.point]
     if names and not args.distance:
-        raise UsageError("--point says nothing without a --distance")
+        raise UsageError("--point needs --distance")
     for name in (end for distance in args.distance for end in (distance.one, distance.other)):
         if names.count(name) < 2:
             raise UsageError(
@@ -339,8 +339,8 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
         print(f"  {name:30} {text}")
     if not built.placement.scaled:
         print(
-            "warning: nothing tells the scale: poses and velocities are in units of the map; give "
-            "--markers, --point and --distance, or --imu"
+            "warning: nothing determines the scale: poses and velocities are in units of the map; "
+            "give --markers, --point and --distance, or --imu"
         )
     check = built.refined.readout_check
     if check is not None and check.differs:

@@ -42,7 +42,7 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         help="COLMAP's, for the descriptors (default: database.db, or the only database of any "
         "name, in the folder or one of the two above)",
     )
-    foreign = parser.add_argument_group("markers: what files of other programs do not say")
+    foreign = parser.add_argument_group("markers: what files of other programs omit")
     foreign.add_argument("--family", help=f"(default: that of the file, or {USUAL_FAMILY.name})")
     foreign.add_argument("--size", type=number(0.0, above=True), metavar="M", help="of all markers")
     foreign.add_argument("--map-frame", metavar="NAME", help="(default: map)")

@@ -33,7 +33,7 @@ _HOLD = 0.001
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Bundle adjustment in continuous time: landmarks are free, the motion is a spline, each "
-        "keypoint is seen when its own row was exposed."
+        "keypoint is observed when its own row was exposed."
     )
     parser.add_argument(
         "recording", type=Path, metavar="RECORDING", help="a bag of correspondences or keypoints"
@@ -175,6 +175,6 @@ def _write(args: argparse.Namespace, landmarks: Map, result: RefinedMap) -> None
     unchanged = np.count_nonzero(~result.refined)
     if unchanged:
         print(
-            f"{unchanged} landmarks stayed as they were: seen by fewer than two images, or from "
+            f"{unchanged} landmarks are unchanged: in fewer than two images, or from "
             "too few sides to be known better"
         )

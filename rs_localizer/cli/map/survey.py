@@ -160,7 +160,7 @@ def _spotted(
                 continue
             read = read_camera_info(shot.camera_info)
             if calibration is not None and read != calibration:
-                raise ValueError("camera_info changes on the way; cut the recording there")
+                raise ValueError("camera_info changes within the recording; cut it there")
             calibration = read
             camera = calibration.camera(config.readout_time, config.scan_direction)
             height, width = shot.image.pixels.shape
@@ -207,8 +207,8 @@ def _tell(surveyed_map: Survey, every: Array, images: int) -> None:
         )
     if surveyed_map.rare:
         print(
-            f"left out: {_listed(surveyed_map.rare)}: too few images, or their orientation is "
-            "ambiguous"
+            f"left out: {_listed(surveyed_map.rare)}: too few images show them, or not enough to "
+            "determine their orientation"
         )
 
 

@@ -27,7 +27,7 @@ class MarkerSight:
     @property
     def text(self) -> str:
         if self.corners == 0:
-            return "the last image shows nothing of the map"
+            return "the last image shows no part of the map"
         boards = f" and {self.boards} boards" if self.boards else ""
         return f"{self.corners} corners of {self.markers} markers{boards}"
 

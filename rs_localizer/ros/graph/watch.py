@@ -241,7 +241,7 @@ def _why_silent(node: Any, name: str) -> str:
         if other.endswith(end) and kind in kinds and node.count_publishers(other)
     ]
     hint = f"; there is {', '.join(others)}" if others else ""
-    return f"nobody publishes {topic} (ROS_DOMAIN_ID {os.environ.get('ROS_DOMAIN_ID', '0')}){hint}"
+    return f"no publisher on {topic} (ROS_DOMAIN_ID {os.environ.get('ROS_DOMAIN_ID', '0')}){hint}"
 
 
 @dataclass(slots=True)

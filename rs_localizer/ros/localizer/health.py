@@ -173,7 +173,7 @@ def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
         for reason in (INPUTS[name].refused for name in condition.missing):
             if count := summary.refusals.get(reason):
-                causes.append(f"{count} came and cannot be used: {reason} in the log says why")
+                causes.append(f"{count} cannot be used: see {reason} in the log")
         if any(item.mismatch for item in condition.silence.values()):
             level = Level.ERROR
         message = "; ".join([f"{State.WAITING} {what}", *causes])
@@ -266,5 +266,5 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
 def _heard(item: Silence) -> str:
     if not item.cause:
         quality = "reliable" if item.reliable else "best effort"
-        return f"messages come, {quality}" if item.heard else "no message yet"
+        return f"messages arrive, {quality}" if item.heard else "no message yet"
     return f"silent for {item.seconds:.0f} s: {item.cause}"
