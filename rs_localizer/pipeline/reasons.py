@@ -92,9 +92,17 @@ REASONS: dict[str, Meaning] = {
     Reason.BAD_IMU: Meaning(
         "a message on imu cannot be used", "its units: rad/s and m/s^2; what its driver fills in"
     ),
-    Reason.NO_MAP: Meaning("keypoints came before a map", "give map_file, or publish map_points"),
+    Reason.BAD_DETECTIONS: Meaning(
+        "a message on detections cannot be used, or its corners come in another order",
+        "lower left, lower right, upper right, upper left, as apriltag has them",
+    ),
+    Reason.NO_MAP: Meaning(
+        "keypoints came before a map, or detections without marker_map",
+        "give map_file, or publish map_points; marker_map for detections",
+    ),
     Reason.NO_MATCHES: Meaning(
-        "no keypoint matches a landmark", "are descriptors, or ids, of map and camera of one kind?"
+        "no keypoint matches a landmark, or no detected tag is in marker_map",
+        "are descriptors, or ids, of map and camera of one kind?",
     ),
     Reason.BAD_IMAGE: Meaning(
         "an image cannot be read", "its encoding: mono, color, Bayer, YUV, JPEG, PNG"
