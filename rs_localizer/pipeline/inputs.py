@@ -16,6 +16,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.io import topics
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import EmptyCloudError
+from rs_localizer.io.detections import APRILTAG_TYPE, ISAAC_TYPE
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.messages import MessageError
@@ -67,6 +68,12 @@ class Input:
     # Of what comes with every image, and only its stamp is new: what the localizer has of it.
     held: Callable[[FrameLocalizer], Any] | None = None
     help: str | None = None  # of its option in commands
+    also: tuple[str, ...] = ()  # other types with the same names of fields; none may be installed
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """All types of its messages."""
+        return self.type, *self.also
 
     @property
     def option(self) -> str:
@@ -139,6 +146,16 @@ _ROWS = (
         refused=Reason.BAD_KEYPOINTS,
         needs=topics.MAP_POINTS,
         help="instead of correspondences",
+    ),
+    Input(
+        topics.DETECTIONS,
+        APRILTAG_TYPE,
+        "tags of another detector, with marker_map",
+        Role.FRAMES,
+        use=lambda localizer, message: localizer.localize_detections(message),
+        refused=Reason.BAD_DETECTIONS,
+        help="tags of apriltag_ros or isaac_ros_apriltag, with -p marker_map:=FILE",
+        also=(ISAAC_TYPE,),
     ),
 )
 

@@ -40,12 +40,19 @@ def test_launch_files_read_the_list_without_the_kernels():
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name):
+def test_a_message_that_cannot_be_read_is_refused_for_a_known_reason(name, tmp_path):
     item = INPUTS[name]
     nameless = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
     sizes = dict.fromkeys(("height", "width", "point_step", "row_step", "is_bigendian"), 1)
     broken = SimpleNamespace(header=nameless, fields=[], data=b"", **sizes)
-    refusal = item.take(FrameLocalizer(NodeConfig()), broken)
+    wall = tmp_path / "wall.yaml"
+    wall.write_text(
+        "{map_frame: map, markers: [{family: 4x4_50, id: 0, size: 0.1, position: [0, 0, 0], "
+        "quaternion: [0, 0, 0, 1]}]}"
+    )
+    localizer = FrameLocalizer(NodeConfig(marker_map=str(wall)))
+    localizer.load_map()
+    refusal = item.take(localizer, broken)
     assert isinstance(refusal, Refusal)
     assert refusal.reason == item.refused
     assert refusal.reason in REASONS

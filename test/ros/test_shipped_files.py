@@ -20,6 +20,7 @@ from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.prints import Chessboard
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
 
@@ -161,7 +162,7 @@ def test_arguments_and_files_exist(describe, file):
 
 def test_every_input_can_be_remapped(describe):
     unused: Any = None
-    inputs = set(Feed(unused, unused, unused, unused).topics())
+    inputs = set(Feed(unused, unused, unused, unused).topics()) | set(INPUTS)
     launched = node(describe("localizer.launch.py"), "localizer")
     assert {name for name, _ in launched.options["remappings"]} == inputs
     assert launched.options["name"] == NODE_NAME
