@@ -12,17 +12,26 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.stats import norm
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.shake import CYCLES
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest, step_between
+from rs_localizer.core.state import (
+    LINEAR,
+    PARAMETERS,
+    VELOCITIES,
+    at_rest,
+    step_between,
+)
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.averaging import averaged
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.frame_fit import (
+    DEGREE_SIZES,
+    SMOOTH_DEGREE,
     SMOOTH_TERMS,
     FrameFit,
     fit_frame,
@@ -123,6 +132,7 @@ class _Frame(NamedTuple):
     hyper: Hyperprior
     smooth: bool  # beside a smooth error
     planar: bool
+    bend: Array  # (n,b) of a smooth error of the map (see frame_fit); (n,0): of the image
 
 
 class Mode(NamedTuple):
@@ -152,7 +162,12 @@ def frame_posterior(
         part = _of_points(observations.thinned(_MOST_POINTS), start, terms, threshold, assumed)
         gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
         errors = observations.squared_errors(part.state)
-        return replace(part, squared_errors=errors, inliers=errors <= gate**2)
+        inliers = errors <= gate**2
+        bend = part.bend
+        if bend.shape[1]:
+            depth = max(median_depth(part.state, observations.points, inliers), _NEAREST)
+            bend = _bend(observations.points, inliers, depth / assumed.focal_length)
+        return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed)
 
 
@@ -188,13 +203,22 @@ def _of_points(
     hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
-    smooth = declared > 0.1 * best.noise or (
+    smooth = declared > 0.0 or (
         assumed.turn is None
         and bool(excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
     )
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
-    frame = _Frame(observations, best, terms, threshold, assumed, hyper, smooth, other is not None)
+    frame = _Frame(
+        observations, best, terms, threshold, assumed, hyper, smooth, other is not None,
+        np.zeros((len(observations), 0)),
+    )  # fmt: skip
+    if smooth:
+        bend = _bend(observations.points, best.inliers, depth / assumed.focal_length)
+        of_map = frame._replace(bend=bend)
+        # A bent map leaves more open: it is left out only where it is far less probable.
+        if declared > 0.0 or _evidence_of(of_map) > _evidence_of(frame) - _FAR_LESS_PROBABLE:
+            frame = of_map
     shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
     weighed = frame.smooth or frame.planar
     if weighed or (assumed.may_rest and not _clearly_moving(best, terms, assumed)):
@@ -203,7 +227,7 @@ def _of_points(
         covariance = along_arcs(best.inflation * best.covariance, best.state[9:12])
         posterior, evidence = replace(best, covariance=covariance), -math.inf
         if shaken is not None:
-            evidence = _mode(frame, best.state, terms, len(SPEEDS) - 1, 0.0).evidence
+            evidence = _evidence_of(frame)
     if shaken is not None:
         fitted, evidence_of_shaking = shaken
         # Scales at their most probable values say less than those that are integrated.
@@ -244,6 +268,30 @@ def _standard(explained: Array, freedom: float) -> Array:
     return np.where(enough, np.clip(standard, -_CLIPPED, _CLIPPED), -_CLIPPED)
 
 
+def _bend(points: Array, inliers: BoolArray, size: float) -> Array:
+    """Polynomials (n,b) of the places of points, of each degree as much as of the image.
+
+    ``size``: m, their root mean square over the inliers, all together.
+    """
+    chosen = points[inliers]
+    low, high = chosen.min(axis=0), chosen.max(axis=0)
+    places = (points - 0.5 * (low + high)) / max(0.5 * float(np.max(high - low)), _NEAREST)
+    x, y, z = (legvander(places[:, k], SMOOTH_DEGREE) for k in range(3))
+    bend = np.column_stack([
+        DEGREE_SIZES[i + j + k] * math.sqrt((2 * i + 1) * (2 * j + 1) * (2 * k + 1))
+        * x[:, i] * y[:, j] * z[:, k]
+        for i in range(SMOOTH_DEGREE + 1)
+        for j in range(SMOOTH_DEGREE + 1 - i)
+        for k in range(SMOOTH_DEGREE + 1 - i - j)
+    ])  # fmt: skip
+    return bend * (size / math.sqrt(np.mean(np.sum(bend[inliers] ** 2, axis=1))))
+
+
+def _evidence_of(frame: _Frame) -> float:
+    """Of the fastest motion."""
+    return _mode(frame, frame.best.state, frame.terms, len(SPEEDS) - 1, 0.0).evidence
+
+
 def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
     """What is known of the scales of a frame; ``declared``: px, of the map."""
     mean = np.append(_TURN_SCALES, _SMOOTH_SCALE)
@@ -261,7 +309,7 @@ def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
 
 def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior, float] | None:
     """The posterior of a camera that turns within the frame, and its evidence; None: no such."""
-    observations, best, terms, threshold, assumed, hyper, _, _ = frame
+    observations, best, terms, threshold, assumed, hyper, _, _, bend = frame
     mean, precision, first = hyper
     gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
     if asked.wide:
@@ -272,7 +320,7 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         fit = fit_frame(
             observations.packed, len(observations), state, observations.row_time_gradient, terms,
             threshold, gate, noise, first, mean, precision,
-            True, asked.smooth, _STEPS,
+            True, asked.smooth, bend, _STEPS,
         )  # fmt: skip
         if fit.finite:
             fits.append(fit)
@@ -300,6 +348,7 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         squared_errors=fit.squared_errors,
         shake=fit.turns,
         model_error=fit.smooth,
+        bend=bend,
         agreement=fit.agreement,
         scales=scales,
         near_outliers=0,
@@ -353,6 +402,7 @@ def _merged(frame: _Frame) -> tuple[Posterior, float]:
         squared_errors=frame.observations.squared_errors(state),
         # Beside a motion that is free: at rest, what moves looks like an error of the map.
         model_error=modes[-1].smooth,
+        bend=frame.bend,
         speeds=np.eye(len(SPEEDS))[[mode.speed for mode in modes]].T @ weights,
         scales=Scales.nothing()._replace(speeds=by_speed),
         mirror=farthest(costs, evidence, steps, covariance) if frame.planar else None,
@@ -445,7 +495,7 @@ def _mode(frame: _Frame, start: Array, terms: PriorTerms, speed: int, odds: floa
         fit = fit_frame(
             observations.packed, len(observations), state, gradient, terms, frame.threshold,
             WIDEST_GATE * frame.threshold, best.noise, frame.hyper.first, frame.hyper.mean,
-            frame.hyper.precision, False, True, _STEPS,
+            frame.hyper.precision, False, True, frame.bend, _STEPS,
         )  # fmt: skip
         if fit.finite:
             state, covariance, smooth = fit.state, fit.covariance, fit.smooth
