@@ -9,16 +9,16 @@ keypoints do not tell; and their squares are the sum of as many numbers only as 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_model import FADING
@@ -79,6 +79,10 @@ _NARROW_SPACING = 0.025
 # way that knots cannot follow: by so many times the noise, and beyond the chance (so many standard
 # deviations) of its points. Where so much of the frames is, the motion between them is none.
 _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
+# So is one whose own in-frame turn moves its points by more than this part of its residual: one of
+# six numbers that fits the noise of n points moves them by sqrt(6 / 2n) of it, a third for n = 30.
+_IN_FRAME = 0.5
+_ROWS = np.linspace(-0.5, 0.5, 17)
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
 
@@ -105,8 +109,9 @@ class FastTurn:
     ``turn' = turn [w]x - [s]x turn``.
     """
 
-    turns: CubicSpline  # rotation vector (3,)
-    rates: CubicSpline  # (6,) rad/s: all, and the slow ones
+    # Cubic splines, of the times (m,) and the order of a derivative.
+    turns: Callable[..., Array]  # (m,3) rotation vectors
+    rates: Callable[..., Array]  # (m,6) rad/s: all, and the slow ones
     covered: BoolArray  # (f,) frames whose rates it has
     vibrates: bool  # most of these frames turn in a way that no smooth motion follows
     times: Array  # (f,) s, of the frames' middle rows
@@ -139,6 +144,10 @@ def fast_turn(times: Array, estimates: list[Estimate], readout_time: float) -> F
     """The fast part of the turns that gyroscopes know of frames at times (f,), s, of their middle
     rows; None: too few of the frames have one, or frames lie too far apart.
     """
+    # These take a third of a second, which programs that smooth nothing do not wait for.
+    from scipy.interpolate import CubicSpline
+    from scipy.ndimage import gaussian_filter1d
+
     grid = np.arange(times[0] - readout_time, times[-1] + readout_time, _STEP)
     nearest = np.clip(np.searchsorted(0.5 * (times[1:] + times[:-1]), grid), 0, len(times) - 1)
     tau = (grid - times[nearest]) / readout_time
@@ -334,7 +343,7 @@ def smooth(
     finer = _lively(camera, seen, fit(camera, seen, halved, found.freedom, found.deviation))
     more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
     best = finer if cheaper(finer, found, float(more)) else found
-    shaken = _shaken(best, seen, estimates)
+    shaken = _shaken(best, seen, estimates) | _turns_in_frame(camera, estimates)
     counted = shaken if fast is None else shaken[fast.covered]
     if counted.mean() > _MOST_SHAKEN:
         shaken[:] = True
@@ -363,6 +372,15 @@ def _shaken(found: Fit, seen: Observations, estimates: list[Estimate]) -> BoolAr
     left = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
     return np.asarray((count > 0) & (off > limit * own / left), np.bool_)
+
+
+def _turns_in_frame(camera: Camera, estimates: list[Estimate]) -> BoolArray:
+    """Which images (f,) turn within their exposure in a way that knots follow only in part."""
+    turns = [
+        shake_at(_ROWS, one.shake)[:, :3] if len(one.shake) else np.zeros(3) for one in estimates
+    ]
+    moved = camera.focal_length * np.array([np.sqrt(np.mean(3.0 * turn**2)) for turn in turns])
+    return np.asarray(moved > _IN_FRAME * np.array([one.residual_rms for one in estimates]))
 
 
 def _lively(camera: Camera, seen: Observations, found: Fit) -> Fit:

@@ -137,8 +137,9 @@ def test_a_vibrating_camera_is_smoothed_beside_what_its_gyroscope_knows(
         twists = {stamp_ns(m): m.twist for _, _, m in bag.messages(["/truth/twist"])}
     (part,) = smooth_frames(localizer, frames, stamps, None)
     if not imu:
-        assert part.frames == frames
+        # Their own in-frame turns say so; the noise, 1 px, hides most of what the knots leave.
         assert part.shaken == len(frames)
+        assert all(one is other for one, other in zip(part.frames, frames, strict=True))
         return
     assert part.shaken < 15  # those before the offset of the stamps is known
     assert len(part.frames) == len(frames) == 90
