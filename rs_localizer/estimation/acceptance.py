@@ -9,8 +9,7 @@ import numpy as np
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.medians import median_depth, median_of
-from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.observations import Observations, median_depth, median_of
 from rs_localizer.estimation.posterior import Mirror, Posterior
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.

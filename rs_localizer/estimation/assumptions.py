@@ -12,8 +12,8 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.state import ANGULAR
-from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.prior_terms import (
+from rs_localizer.estimation.prior import (
+    Prior,
     PriorTerms,
     held_terms,
     motion_terms,

@@ -23,12 +23,10 @@ from rs_localizer.core.shake import FUNCTIONS, RATES, shake_at, shake_basis
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, noise_deviation
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import apply_step, half_inverse, inverted, squared
 from rs_localizer.estimation.residual_tests import neighbours_agree
-from rs_localizer.estimation.residuals import Lines, linearized, squared_errors
-from rs_localizer.estimation.view import POINT_SIZE
+from rs_localizer.estimation.residuals import POINT_SIZE, Lines, linearized, squared_errors
 
 SMOOTH_DEGREE = 3
 SMOOTH_TERMS = (SMOOTH_DEGREE + 1) * (SMOOTH_DEGREE + 2) // 2

@@ -20,8 +20,6 @@ from rs_localizer.core.shake import CYCLES
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest, step_between
 from rs_localizer.estimation.assumptions import Assumed
-from rs_localizer.estimation.averaging import averaged
-from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.frame_fit import (
     SMOOTH_TERMS,
     FrameFit,
@@ -29,12 +27,11 @@ from rs_localizer.estimation.frame_fit import (
     log_determinant_of_inverse,
     score_products,
 )
-from rs_localizer.estimation.medians import median_depth
+from rs_localizer.estimation.gaussians import along_arcs, averaged
 from rs_localizer.estimation.mirror import farthest, mirrored
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.packing import weighted
+from rs_localizer.estimation.observations import Observations, median_depth, weighted
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
+from rs_localizer.estimation.prior import PriorTerms, terms_at
 from rs_localizer.estimation.refine import apply_step, inverted, refine
 
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that

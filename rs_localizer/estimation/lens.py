@@ -27,13 +27,10 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.mirror import is_plane
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.observing import Observed, Sighted
+from rs_localizer.estimation.observations import Observations, Observed, Sighted, relinearized
 from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import apply_step, inverted
-from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.estimation.residuals import linearized
 
 # Standard deviations of the coefficients beforehand: radial ones of 20 px at the corners of an

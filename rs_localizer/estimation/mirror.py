@@ -12,7 +12,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import inlined, kernel
-from rs_localizer.estimation.averaging import longest_axis
+from rs_localizer.estimation.gaussians import longest_axis
 from rs_localizer.estimation.posterior import Mirror
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.

@@ -9,13 +9,20 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import at_rest, rotation_of
 from rs_localizer.estimation.mirror import facing
-from rs_localizer.estimation.observing import Observed
+from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
-from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
-from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses, search
+from rs_localizer.estimation.prior import PriorTerms, held_terms
+from rs_localizer.estimation.ransac import (
+    NOTHING,
+    Candidate,
+    Draws,
+    Hypotheses,
+    Pool,
+    descend,
+    optimize,
+    search,
+)
 from rs_localizer.estimation.refine import EXPECTED_NOISE
-from rs_localizer.estimation.sampling import Pool
-from rs_localizer.estimation.scoring import descend, optimize
 from rs_localizer.solvers.table import Solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part

@@ -5,13 +5,14 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.shutter import Motion
-from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import (
+from rs_localizer.estimation.prior import (
+    Prior,
+    add_prior,
     held_beside,
     held_terms,
     motion_terms,
     slower_terms,
+    state_in,
     with_measurements,
     with_motion,
 )

@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior_terms import motion_terms
-from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses, search
-from rs_localizer.estimation.sampling import Pool, generator
+from rs_localizer.estimation.prior import motion_terms
+from rs_localizer.estimation.ransac import (
+    NOTHING,
+    Candidate,
+    Draws,
+    Hypotheses,
+    Pool,
+    generator,
+    search,
+)
 
 IDENTITY = np.eye(3)
 

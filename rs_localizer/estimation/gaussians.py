@@ -1,4 +1,4 @@
-"""How far a motion leaves its ellipsoid where the camera may have turned about what it sees.
+"""Gaussians of motions: those of a camera that turned about what it sees, and means of many.
 
 The points say precisely in which direction they are and roughly how far away. A camera whose
 orientation they hardly tell is somewhere on an arc about them, and arcs leave their tangents: by
@@ -9,20 +9,22 @@ terms of a step (turn ``phi``, move ``rho``; see :mod:`rs_localizer.estimation.r
     rho = p - exp([phi]x) (p + d)
         = -d - phi x p - (phi x (phi x p) / 2 + phi x d) - ...
 
-of which the ellipsoid has the first two.
-
-Arcs also turn the axes: a step from one point of an arc, told from another one, moves along
-other axes.
+of which the ellipsoid has the first two. Arcs also turn the axes: a step from one point of an arc,
+told from another one, moves along other axes.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.blocks import write
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
-from rs_localizer.core.state import MOVE
+from rs_localizer.core.state import MOVE, PARAMETERS, TURN, step_between
+from rs_localizer.estimation.refine import apply_step
 
 
 @kernel
@@ -107,3 +109,46 @@ def told_from(covariance: Array, turn: Array) -> Array:
                     rows[i, j] += block[k] * told[first + k, j]
         told = rows.T.copy()
     return told
+
+
+# Probabilities that have no part in the covariance.
+_NO_PART = 1e-5
+
+
+@kernel
+def averaged(
+    states: Array, covariances: Array, best: int, counting: Array, possible: Array
+) -> tuple[Array, Array, Array]:
+    """Mean (24,) of Gaussians by the ones probabilities (k,), covariance (18,18) by the others.
+
+    And the steps (k,18) from the best one to all.
+    """
+    count = len(states)
+    steps, mean = np.empty((count, PARAMETERS)), np.empty(PARAMETERS)
+    for k in range(count):
+        write(steps[k], step_between(states[best], states[k]))
+    for i in range(PARAMETERS):
+        total = 0.0
+        for k in range(count):
+            total += counting[k] * steps[k, i]
+        mean[i] = total
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    for k in range(count):
+        offset = steps[k] - mean
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
+                covariance[i, j] += possible[k] * offset[i] * offset[j]
+        if possible[k] > _NO_PART:
+            covariance += possible[k] * told_from(covariances[k], offset[TURN])
+    return apply_step(states[best], mean), covariance, steps
+
+
+@kernel
+def longest_axis(covariance: Array) -> float:
+    """Standard deviation (rad) of the turn about the axis that is known worst."""
+    return math.sqrt(np.linalg.eigvalsh(covariance[:3, :3].copy())[-1])
+
+
+def warm_up() -> None:
+    """Compile what planes come to that show two poses."""
+    longest_axis(np.eye(PARAMETERS))
