@@ -18,7 +18,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE, step_between
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation import frame_fit, gaussians, motion_model, observations, ransac
+from rs_localizer.estimation import frame_fit, mirror, motion_model, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.assumptions import (
     assumptions,
@@ -100,7 +100,7 @@ class Localizer:
         """Compile every kernel that :meth:`localize`, or tracking, may need, or load it from the
         cache.
         """
-        for part in (frame_fit, gaussians, motion_model, observations, ransac):
+        for part in (frame_fit, mirror, motion_model, observations, ransac):
             part.warm_up()
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
         count = max(160, self.config.min_inliers)

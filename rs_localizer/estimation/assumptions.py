@@ -17,7 +17,7 @@ from rs_localizer.estimation.prior import (
     PriorTerms,
     held_terms,
     motion_terms,
-    slower_terms,
+    terms_at,
     with_measurements,
     with_turn,
 )
@@ -94,7 +94,7 @@ def told_speed(terms: PriorTerms, prior: Prior | None) -> tuple[PriorTerms, Prio
     if part == 1.0:
         return terms, prior
     scales = prior.scales._replace(speeds=np.zeros(len(SPEEDS)))
-    return slower_terms(terms, max(part, _SLOWEST)), replace(prior, scales=scales)
+    return terms_at(terms, max(part, _SLOWEST), False), replace(prior, scales=scales)
 
 
 def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None) -> Assumed:

@@ -24,7 +24,6 @@ from rs_localizer.core.so3 import log
 from rs_localizer.core.state import (
     ACCELERATIONS,
     ANGULAR,
-    ANGULAR_ACCELERATION,
     LINEAR,
     MOTION_PARAMETERS,
     PARAMETERS,
@@ -226,8 +225,6 @@ _HOLDING = 1e18
 _JOLTS = 10.0
 WALKING = 0.1
 """Least part of the configured linear velocity that goes with a slower turn."""
-# What a gyroscope knows: turn rate and its change.
-_TURNING = np.ix_(np.r_[ANGULAR, ANGULAR_ACCELERATION], np.r_[ANGULAR, ANGULAR_ACCELERATION])
 
 
 class PriorTerms(NamedTuple):
@@ -259,36 +256,30 @@ def held_terms() -> PriorTerms:
     return _single(np.diag(np.concatenate([np.zeros(6), np.full(12, _HOLDING)])), _STILL)
 
 
-def slower_terms(terms: PriorTerms, part: float, turn_known: bool = False) -> PriorTerms:
-    """The prior of a motion whose typical turn rate is this part of the configured one.
-
-    Neither travel nor accelerations slow down as much: who hardly turns may walk, and jolts come
-    at any speed. What a gyroscope leaves of a turn does not depend on it.
-    """
-    informations = terms.informations.copy()
-    informations[0, ANGULAR] /= part**2
-    informations[0, LINEAR] /= max(part, WALKING) ** 2
-    informations[0, ACCELERATIONS] /= min(_JOLTS * part, 1.0) ** 2
-    if turn_known:
-        informations[0][_TURNING] = terms.informations[0][_TURNING]
-    return terms._replace(informations=informations)
-
-
-def held_beside(terms: PriorTerms, turn_known: bool = False) -> PriorTerms:
-    """A camera at rest, of which gravity, and what a gyroscope leaves, are as in other terms."""
-    held = held_terms()._replace(gravity=terms.gravity)
-    if not turn_known:
-        return held
-    informations = held.informations.copy()
-    informations[0][_TURNING] = terms.informations[0][_TURNING]
-    return held._replace(informations=informations)
-
-
+@kernel
 def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
-    """The terms of a typical speed, as a part of the configured one; 0: a camera at rest."""
+    """The prior of a typical speed, a part of the configured one; 0: of a camera at rest.
+
+    Neither travel nor accelerations slow down as much as turns: who hardly turns may walk, and
+    jolts come at any speed. At rest, only gravity is as in the terms. What a gyroscope leaves of a
+    turn does not depend on the speed.
+    """
+    informations, references = terms.informations.copy(), terms.references
     if speed == 0.0:
-        return held_beside(terms, turn_known)
-    return terms if speed == 1.0 else slower_terms(terms, speed, turn_known)
+        informations = np.zeros((1, PARAMETERS, PARAMETERS))
+        references = references[:1].copy()
+        for i in range(6, PARAMETERS):
+            informations[0, i, i] = _HOLDING
+    else:
+        informations[0, ANGULAR] /= speed**2
+        informations[0, LINEAR] /= max(speed, WALKING) ** 2
+        informations[0, ACCELERATIONS] /= min(_JOLTS * speed, 1.0) ** 2
+    if turn_known:
+        for i in range(6):
+            for j in range(6):
+                row, column = _turning(i), _turning(j)
+                informations[0, row, column] = terms.informations[0, row, column]
+    return PriorTerms(informations, references, terms.gravity)
 
 
 def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
