@@ -194,9 +194,12 @@ class Localizer:
     def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
         """What there is to find by a lens that other frames tell of, or by the calibration's."""
         points, pixels, scores, prior, expected_share, turn = given
-        terms, prior = (
-            told_speed(self._terms, prior) if self._assumed.may_rest else (self._terms, prior)
-        )
+        terms, assumed = self._terms, self._assumed
+        if prior is not None or turn is not None:
+            if assumed.may_rest:
+                terms, prior = told_speed(terms, prior)
+            assumed = with_experience(assumed, prior, turn_seen(self._terms, turn))
+            terms = known_terms(terms, prior, turn)
         camera = self.camera if lens is None else lens.mended(self.camera)
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
         usable = find_usable(camera, points, pixels, turn)
@@ -209,9 +212,9 @@ class Localizer:
             len(points),
             usable.centre,
             None if scores is None else np.argsort(-scores[usable.indices], kind="stable"),
-            known_terms(terms, prior, turn),
+            terms,
             generator(self.config.seed),
-            with_experience(self._assumed, prior, turn_seen(self._terms, turn)),
+            assumed,
             Sighted(camera, points, pixels, usable, turn),
             lens,
             prior is not None and prior.asks_lens,

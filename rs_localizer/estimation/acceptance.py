@@ -59,14 +59,14 @@ def refusal(
     found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
     if found < needed:
         behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
-        if 2 * behind > len(observations):
+        if 2 * behind > observations.count:
             return Failure(
                 Reason.BEHIND_CAMERA,
-                f"{behind} of {len(observations)} points lie behind the camera",
+                f"{behind} of {observations.count} points lie behind the camera",
             )
         return Failure(
             Reason.TOO_FEW_INLIERS,
-            f"{found} inliers of {len(observations)} points after {samples} samples, "
+            f"{found} inliers of {observations.count} points after {samples} samples, "
             f"{needed} are needed",
         )
     if not posterior.determined:

@@ -124,7 +124,7 @@ def frame_posterior(
         threshold: px, of inliers.
         assumed: of the camera.
     """
-    if len(observations) > _MOST_POINTS:
+    if observations.count > _MOST_POINTS:
         part = _of_points(observations.thinned(_MOST_POINTS), start, terms, threshold, assumed)
         gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
         errors = observations.squared_errors(part.state)
@@ -148,7 +148,7 @@ def _of_points(
         ):
             best, other = again, mirrored(observations.points, again.inliers, again.state)
     explained, agreement = _look(
-        observations.packed, len(observations), best.state, observations.row_time_gradient,
+        observations.packed, observations.count, best.state, observations.row_time_gradient,
         best.inliers, terms, best.noise, assumed.rolling,
     )  # fmt: skip
     excess, remembered = _standard(explained, best.freedom), assumed.scales
@@ -241,7 +241,7 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
     fits: list[FrameFit] = []
     for state in (best.state,) if other is None else (best.state, other):
         fit = fit_frame(
-            observations.packed, len(observations), state, observations.row_time_gradient, terms,
+            observations.packed, observations.count, state, observations.row_time_gradient, terms,
             threshold, gate, noise, first, mean, precision,
             True, asked.smooth, STEPS,
         )  # fmt: skip

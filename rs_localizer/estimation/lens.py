@@ -96,7 +96,7 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
         observations = sighted.by(mended)
         if observations is None:
             return None
-        if len(observations) > _MOST_POINTS:
+        if observations.count > _MOST_POINTS:
             observations = observations.thinned(_MOST_POINTS)
         best = maximum_a_posteriori(observations, state, terms, gate * threshold)
         if not (best.determined and np.all(np.isfinite(best.state))):
@@ -270,7 +270,7 @@ def _told(
     Args:
         sighted: by the camera with these coefficients (k,).
     """
-    count, chosen = len(observations), best.inliers
+    count, chosen = observations.count, best.inliers
     # The noise in derivatives looks like a lens, the same in all frames, and these are joined.
     observations = relinearized(sighted.camera, observations, best.state, sighted.turn, fewest=0)
     lines = linearized(

@@ -213,6 +213,7 @@ class Observations:
     row_range: float  # of tau
     row_time_gradient: Array  # (2,) per pixel
     packed: Array
+    count: int
 
     @classmethod
     def of(
@@ -220,7 +221,9 @@ class Observations:
     ) -> Observations:
         """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2)."""
         packed = pack(points, rays, tau, by_ray)
-        return cls(points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed)
+        return cls(
+            points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed, len(points)
+        )  # fmt: skip
 
     def thinned(self, count: int) -> Observations:
         """So many of the points, evenly taken."""
@@ -228,20 +231,20 @@ class Observations:
         packed = thin(self.packed, chosen)
         return Observations(
             self.points[chosen], self.rays[chosen], self.tau[chosen], self.row_range,
-            self.row_time_gradient, packed,
+            self.row_time_gradient, packed, count,
         )  # fmt: skip
 
     def __len__(self) -> int:
-        return len(self.points)
+        return self.count
 
     def squared_errors(self, state: Array) -> Array:
         """Squared reprojection errors (n,) in raw pixels."""
-        errors: Array = squared_errors(self.packed, len(self), state, self.row_time_gradient)
+        errors: Array = squared_errors(self.packed, self.count, state, self.row_time_gradient)
         return errors
 
     def row_paces(self, state: Array) -> Array:
         """How much faster than the image points the rows move (n,): 1 at rest, 0 in step."""
-        paces: Array = row_paces(self.packed, len(self), state, self.row_time_gradient)
+        paces: Array = row_paces(self.packed, self.count, state, self.row_time_gradient)
         return paces
 
 
@@ -270,7 +273,7 @@ def relinearized(
         turn: what the observations are compensated by.
         fewest: points that are not few.
     """
-    count = len(observations)
+    count = observations.count
     if count < fewest or (len(camera.D) == 0 and turn is None):
         return observations
     gradient = observations.row_time_gradient
@@ -381,7 +384,9 @@ def packed(camera: Camera, points: Array, usable: Usable) -> Observations:
     indices, _, centre, rays, by_ray, tau = usable
     found = _packed(points, rays, tau, by_ray, indices, centre)
     near, bearing, times, row_range, lanes = found
-    return Observations(near, bearing, times, row_range, camera.row_time_gradient, lanes)
+    return Observations(
+        near, bearing, times, row_range, camera.row_time_gradient, lanes, len(near)
+    )  # fmt: skip
 
 
 @kernel

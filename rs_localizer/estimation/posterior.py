@@ -217,7 +217,7 @@ def maximum_a_posteriori(
     return Posterior(
         *_rounds(
             observations.packed,
-            len(observations),
+            observations.count,
             start,
             observations.row_time_gradient,
             prior,

@@ -224,18 +224,18 @@ _KEEP = 2
 class Hypotheses:
     """How samples become models, and how models are judged.
 
-    ``solve(points, rays, tau, samples, rotations, models)`` fills models (k,18,h), see
+    ``solve(points, rays, tau, samples, rotations, iterations, models)`` fills models (k,18,h), see
     :mod:`rs_localizer.solvers.batch`.
     """
 
-    solve: Callable[[Array, Array, Array, IntArray, Array, Array], None]
+    solve: Callable[[Array, Array, Array, IntArray, Array, int, Array], None]
     sample_size: int
     solutions: int
     block: int  # samples per block
     score_scale: float  # px, truncation of the error of minimal models
     final_scale: float  # px, truncation after local optimisation: the inlier threshold
-    prior: PriorTerms
     noise: float  # px, expected standard deviation
+    iterations: int = 0  # of an iterative solver
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,8 +266,9 @@ class Draws:
 
 
 def search(
-    observations: Observations, hypotheses: Hypotheses, draws: Draws, start: Candidate
-) -> Candidate:
+    observations: Observations, hypotheses: Hypotheses, prior: PriorTerms, draws: Draws,
+    start: Candidate,
+) -> Candidate:  # fmt: skip
     """The best optimised hypothesis of up to ``draws.most`` minimal samples.
 
     Blocks take the initial rotations in turn and draw equally from all pools. The search stops
@@ -277,20 +278,22 @@ def search(
     are optimised (LO-RANSAC: Chum, Matas, Kittler, DAGM 2003). The samples of ``start`` count: a
     search goes on from where another stopped.
     """
-    usable = [pool for pool in draws.pools if len(pool.points) >= hypotheses.sample_size]
-    best = start
-    inliers = _inliers(observations, best, hypotheses.final_scale)
+    size, count, gate = hypotheses.sample_size, observations.count, hypotheses.final_scale**2
+    usable = [pool for pool in draws.pools if len(pool.points) >= size]
+    best, inliers = start, np.zeros(count, dtype=np.bool_)
+    if start.found:
+        inliers = observations.squared_errors(start.state) < gate
     drawn, blocks = [start.samples // max(len(usable), 1)] * len(usable), 0
-    no_fit, best_gain = len(observations) * hypotheses.score_scale**2, 0.0
+    no_fit, best_gain = count * hypotheses.score_scale**2, 0.0
     while usable and (left := draws.most - sum(drawn)) > 0:
-        samples = np.empty((min(hypotheses.block, left), hypotheses.sample_size), dtype=np.int64)
+        samples = np.empty((min(hypotheses.block, left), size), dtype=np.int64)
         _draw(observations, usable, drawn, draws.random, samples)
         models = np.empty((hypotheses.solutions, MODEL_SIZE, len(samples)))
         blocks += 1
         rotation = draws.rotations[blocks % len(draws.rotations)]
         hypotheses.solve(
             observations.points, observations.rays, observations.tau, samples,
-            rotation[None], models,
+            rotation[None], hypotheses.iterations, models,
         )  # fmt: skip
         states, costs = best_models(
             models, observations.packed, observations.row_time_gradient,
@@ -299,13 +302,12 @@ def search(
         best_gain = max(best_gain, no_fit - float(costs[0]))
         state, cost = optimize(
             states, costs, observations.packed, observations.row_time_gradient,
-            2.0 * hypotheses.score_scale, hypotheses.final_scale, hypotheses.prior,
-            hypotheses.noise,
+            2.0 * hypotheses.score_scale, hypotheses.final_scale, prior, hypotheses.noise,
         )  # fmt: skip
         if cost < best.cost:
             best = Candidate(state, cost)
-            inliers = _inliers(observations, best, hypotheses.final_scale)
-        if _missed(inliers, usable, drawn, hypotheses.sample_size) < 1.0 - draws.confidence:
+            inliers = observations.squared_errors(state) < gate
+        if _missed(inliers, usable, drawn, size) < 1.0 - draws.confidence:
             break
     return Candidate(best.state, best.cost, sum(drawn))
 
@@ -322,17 +324,13 @@ def _draw(
     first = 0
     for index, pool in enumerate(pools):
         part = samples[first : (index + 1) * count // len(pools)]
-        prefixes = pool.prefix_sizes(drawn[index], len(part), size)
+        if pool.ranked:
+            prefixes = pool.prefix_sizes(drawn[index], len(part), size)
+        else:
+            prefixes = np.full(len(part), len(pool.points), dtype=np.int64)
         draw(pool.points, prefixes, observations.tau, observations.row_range, random, part)
         drawn[index] += len(part)
         first += len(part)
-
-
-def _inliers(observations: Observations, candidate: Candidate, scale: float) -> BoolArray:
-    if not candidate.found:
-        return np.zeros(len(observations), dtype=np.bool_)
-    inliers: BoolArray = observations.squared_errors(candidate.state) < scale * scale
-    return inliers
 
 
 def _missed(inliers: BoolArray, pools: Sequence[Pool], drawn: Sequence[int], size: int) -> float:

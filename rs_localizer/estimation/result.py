@@ -84,7 +84,7 @@ def _costs(
     observations: Observations, posterior: Posterior, turn: KnownTurn, delays: Array
 ) -> Array:
     """What delays (k,) leave, in noise variances."""
-    count = len(observations)
+    count = observations.count
     errors, by_motion, by_turn, tau, _ = linearized(
         observations.packed,
         count,

@@ -1,6 +1,6 @@
 from benchmarks import size
 
-SOURCE = '''
+SOURCE = """
 from rs_localizer.core import so3
 import rs_localizer.core.arrays
 _A, B = 1, 2
@@ -8,7 +8,7 @@ _TERMS: tuple = ()
 name = 3
 def late():
     from rs_localizer.core.so3 import exp
-'''
+"""
 
 
 def test_constants_are_names_in_capitals_that_a_module_assigns():
