@@ -13,11 +13,13 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.io.atomic_files import write_errors
+from rs_localizer.io.remote import Location, is_url
 from rs_localizer.offline.fleet.cluster import Where, perform_all
 from rs_localizer.offline.fleet.identity import folder_names, identity, program, read_marker
 from rs_localizer.offline.fleet.summary import (
@@ -76,9 +78,11 @@ class Plan:
 
     kind: Kind
     # What a result depends on beside the recording and the settings.
-    inputs: Callable[[Path], Sequence[Path]]
+    inputs: Callable[[Any], Sequence[Location]]
     # Whether results of other settings are replaced; None: the command has no such option.
     overwrite: bool | None = None
+    # What is made of all complete results, in the order of the recordings.
+    gather: Callable[[Sequence[Path]], object] | None = None
 
 
 def run_batch(args: Namespace, plan: Plan) -> None:
@@ -106,6 +110,8 @@ def run_batch(args: Namespace, plan: Plan) -> None:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
             _find_finished(tasks, rows)
             write_summary(out, plan.kind.command, list(rows.values()))
+        if plan.gather is not None:
+            plan.gather([task.folder for task in tasks if rows[task.name].state == DONE])
     print(f"written to {args.out}: {CSV}, {MARKDOWN}, {PICTURE}")
     if failed := sum(row.state == FAILED for row in rows.values()):
         raise ValueError(f"{failed} of {len(rows)} recordings failed; {args.out / CSV} says why")
@@ -140,9 +146,9 @@ def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
     ]
 
 
-def _absolute(path: Path) -> Path:
-    """Without "..", and with links as they are called."""
-    return Path(os.path.abspath(path))
+def _absolute(place: Location) -> Location:
+    """Without "..", and with links as they are called; URLs as they are."""
+    return place if is_url(place) else Path(os.path.abspath(place))
 
 
 def _check(tasks: list[Task], plan: Plan) -> None:
@@ -178,11 +184,11 @@ def only_one(out: Path) -> Iterator[None]:
 
 def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
     started, busy = time.perf_counter(), 0.0
-    left = _find_finished(tasks, rows)
-    if before := len(tasks) - len(left):
+    open_tasks = _find_finished(tasks, rows)
+    if before := len(tasks) - len(open_tasks):
         print(f"{before} of {len(tasks)} recordings have been done before")
     bar = tqdm(total=len(tasks), initial=before, unit="recording", disable=None)
-    with bar, contextlib.closing(perform_all(left, where)) as outcomes:
+    with bar, contextlib.closing(perform_all(open_tasks, where)) as outcomes:
         for outcome in outcomes:
             rows[outcome.name] = row = _row(rows[outcome.name].recording, outcome)
             busy += outcome.seconds
@@ -190,24 +196,24 @@ def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
             bar.write(f"{row.folder}: {_said(row)}")
     wall = time.perf_counter() - started
     print(f"{counted(list(rows.values()))}")
-    if left:
+    if open_tasks:
         print(f"{wall:.1f} s for {busy:.1f} s of work")
 
 
 def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
     """Enter what is complete on disk; the tasks of which nothing is known."""
-    left = []
+    open_tasks = []
     for task in tasks:
         if rows[task.name].state != OPEN:
             continue
         if (figures := finished(task)) is None:
-            left.append(task)
+            open_tasks.append(task)
         else:
             rows[task.name] = Row(task.recording, task.name, DONE, figures)
-    return left
+    return open_tasks
 
 
-def _row(recording: Path, outcome: Outcome) -> Row:
+def _row(recording: Location, outcome: Outcome) -> Row:
     state = FAILED if outcome.figures is None else DONE
     return Row(recording, outcome.name, state, outcome.figures or {}, outcome.reason)
 
@@ -236,5 +242,5 @@ def folder_name(option: str, folder: Path | None) -> str | None:
     return folder.name
 
 
-def inputs(*files: Path | str | None) -> list[Path]:
-    return [Path(file) for file in files if file]
+def inputs(*files: Location | None) -> list[Location]:
+    return [file if is_url(file) else Path(file) for file in files if file]

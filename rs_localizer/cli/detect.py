@@ -99,7 +99,7 @@ def detect_one(args: argparse.Namespace) -> Recorded:
         atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
     ):
         recorded = _record(args, source, detector, out)
-        write_shutter(args, out)
+        write_shutter(args, out, marker_map.settings)
     _tell(args, recorded, notices)
     for fault in (*recorded.faults, *time_faults(args, source.clock, recorded.period)):
         print(f"warning: {fault}")
@@ -139,7 +139,7 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
         f"{recorded.corners:.0f} corners each (median){fit}"
     )
     if recorded.with_corners < recorded.images:
-        print(f"{recorded.images - recorded.with_corners} images show nothing of the map")
+        print(f"{recorded.images - recorded.with_corners} images show no part of the map")
     tell_left_out(recorded.refused, recorded.carried)
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
@@ -206,7 +206,7 @@ def _tell_features(args: argparse.Namespace, extraction: Extraction) -> None:
 def _detect_batch(args: argparse.Namespace) -> None:
     """``detect`` in many recordings."""
     if args.timing:
-        raise UsageError("--timing is of one recording: beside others it would tell little")
+        raise UsageError("--timing is for one recording: beside others it means little")
     files = inputs(args.map, args.calibration, args.params)
     kind = Kind("detect", _detect_of_many, "detect", _detect_warm)
     run_batch(args, Plan(kind, lambda _: files, args.overwrite))
@@ -226,11 +226,11 @@ def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Fig
     )
 
 
-def _figures(found: Recorded) -> Figures:
+def _figures(recorded: Recorded) -> Figures:
     return {
-        "images": found.images,
-        "with corners": found.with_corners,
-        "corners": found.corners,
-        "residual of a still pose (px)": found.residual,
-        "warnings": "; ".join(found.faults),
+        "images": recorded.images,
+        "with corners": recorded.with_corners,
+        "corners": recorded.corners,
+        "residual of a still pose (px)": recorded.residual,
+        "warnings": "; ".join(recorded.faults),
     }

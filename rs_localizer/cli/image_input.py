@@ -94,9 +94,11 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
     return given_values(args, also)
 
 
-def write_shutter(args: argparse.Namespace, out: Path) -> None:
-    """What is known of the shutter, into the directory of a recording."""
-    if values := shutter_values(args):
+def write_shutter(
+    args: argparse.Namespace, out: Path, of_map: Mapping[str, float] | None = None
+) -> None:
+    """What is known of the shutter and of the map, into the directory of a recording."""
+    if values := {**(of_map or {}), **shutter_values(args)}:
         write_parameters(out / PARAMETERS, values)
 
 
@@ -117,7 +119,7 @@ def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: floa
     """
     faults = []
     if clock is not None:
-        print(clock.told())
+        print(clock.description())
         faults.append(clock.fault())
     faults.append(readout_fault(build(shutter_values(args)).readout_time, period))
     return [fault for fault in faults if fault]
@@ -126,10 +128,11 @@ def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: floa
 def tell_next(args: argparse.Namespace, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
     out = shlex.quote(str(args.out))
-    with_parameters = (args.out / PARAMETERS).exists()
-    shutter = f"--params {out}/{PARAMETERS}" if with_parameters else "-p readout_time:=SECONDS"
+    settings = f" --params {out}/{PARAMETERS}" if (args.out / PARAMETERS).exists() else ""
+    if "readout_time" not in shutter_values(args):
+        settings += " -p readout_time:=SECONDS"
     poses = shlex.quote(f"{args.out}_poses")
-    print(f"next: rs_localizer replay {out} {shutter}{more} --out {poses}")
+    print(f"next: rs_localizer replay {out}{settings}{more} --out {poses}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,8 +172,8 @@ def opened(
         if value is not None:
             raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
     with open_bag(path) as bag:
-        given = None if args.calibration is None else read_calibration(args.calibration)
-        yield of_bag(bag, given, args, calibrated)
+        camera = None if args.calibration is None else read_calibration(args.calibration)
+        yield of_bag(bag, camera, args, calibrated)
 
 
 def of_bag(
@@ -210,6 +213,6 @@ def tell_times(clock: ImageClock | None) -> None:
     """Say where the times of images are from that have been read, and what speaks against them."""
     if clock is None:
         return
-    print(clock.told())
+    print(clock.description())
     if fault := clock.fault():
         print(f"warning: {fault}")

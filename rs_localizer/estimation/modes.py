@@ -43,7 +43,7 @@ STEPS = 25
 # for (benchmarks.honesty tags).
 _REST_ODDS = math.log(100.0)
 # Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
-_FAR_LESS_PROBABLE = 9.0
+FAR_LESS_PROBABLE = 9.0
 # The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
 # this power, about the same mean: it holds for a camera that moves so little that rest is more
 # probable (1 would hold on average over all cameras, and not for that one). The odds against an
@@ -228,6 +228,7 @@ class SmoothError(NamedTuple):
     first: Array
     mean: Array
     precision: Array
+    bend: Array  # (n,b), or (n,0)
 
 
 @kernel
@@ -320,7 +321,7 @@ def _modes(
                 count, scale = _keep(modes, count, speed, second), second.smooth
                 twin, here = second.state, max(here, second.evidence)
         best = max(best, here)
-        if here < best - _FAR_LESS_PROBABLE / TEMPER:
+        if here < best - FAR_LESS_PROBABLE / TEMPER:
             break
     return _Modes(
         modes.states[:count], modes.covariances[:count], modes.evidences[:count],
@@ -378,7 +379,7 @@ def _mode(
         fit = fit_frame(
             inliers.data, len(inliers.chosen), state, inliers.gradient, terms, inliers.threshold,
             WIDEST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
-            False, True, STEPS,
+            False, True, smooth.bend, STEPS,
         )  # fmt: skip
         if fit.finite:
             state, covariance, scale = fit.state, fit.covariance, fit.smooth

@@ -74,6 +74,11 @@ class Posterior:
     speeds: Array = field(default_factory=lambda: np.zeros(0))
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
+    # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
+    undetected: Array = field(default_factory=lambda: np.zeros((12, 12)))
+    # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
+    # that the covariance does not have it, either
+    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def determined(self) -> bool:

@@ -154,25 +154,25 @@ def decode(packed: bytes, format_: str) -> Gray:
     """
     data = np.frombuffer(packed, np.uint8)
     start = data[:8].tobytes()
-    found = [item for item in _FORMATS if start.startswith(item[1])]
-    if not found:
+    formats = [item for item in _FORMATS if start.startswith(item[1])]
+    if not formats:
         raise MessageError(
             f"the compressed image is neither JPEG nor PNG: its format is {format_!r} "
             f"and its {len(data)} bytes start with {start.hex(' ') or 'nothing'}"
         )
-    name, _, end = found[0]
+    name, _, end = formats[0]
     # OpenCV fills what is missing with gray and says nothing.
     if not _ends_with(data, end):
         raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")
     size = _claimed_size(packed, name)
     if size is None:
         raise MessageError(
-            f"the {name} image of {len(data)} bytes cannot be decoded: no header tells its size"
+            f"the {name} image of {len(data)} bytes cannot be decoded: no header has its size"
         )
     if math.prod(size) > min(_DENSEST * len(data), _MOST_PIXELS):
         raise MessageError(
-            f"the {name} image says that it is {size[0]} x {size[1]}, of which {len(data)} bytes "
-            f"cannot tell, or which is more than {_MOST_PIXELS // 1_000_000} megapixels"
+            f"the {name} image says that it is {size[0]} x {size[1]}, too much for {len(data)} "
+            f"bytes, or more than {_MOST_PIXELS // 1_000_000} megapixels"
         )
     if name == "PNG":
         data = np.frombuffer(_still_png(packed), np.uint8)

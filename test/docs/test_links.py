@@ -69,3 +69,18 @@ def test_pictures_are_what_their_script_draws():
     drawn = runpy.run_path(str(pages.ROOT / "docs" / "pictures.py"))["PICTURES"]
     for name, draw in drawn.items():
         assert (pages.ROOT / "docs" / name).read_text(encoding="utf-8") == draw(), name
+
+
+_NODE = r"[\w/]+(?:\[[^]]+\]|\(\[[^]]+\]\))?"
+_STATEMENT = (
+    rf"{_NODE}(?: & {_NODE})*(?: (?:--|-- [\w ]+ --|-- \"[^\"]+\" --)> {_NODE}(?: & {_NODE})*)*"
+)
+
+
+@pytest.mark.parametrize("page", pages.NAMES)
+def test_diagrams_are_flowcharts(page):
+    """GitHub and the site draw them in the browser, where nobody would see an error."""
+    for diagram in pages.fenced(page, "mermaid"):
+        head, *lines = diagram.splitlines()
+        assert re.fullmatch("flowchart (LR|BT)", head)
+        assert [line for line in lines if not re.fullmatch(_STATEMENT, line.strip())] == []
