@@ -4,7 +4,6 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,8 +14,6 @@ from rs_localizer.io.outputs import TYPES
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node import managed
 from rs_localizer.ros.node.inputs import Inputs
-
-Start = Callable[..., Any]
 
 
 def test_signals_end_it_in_order(start_node):
