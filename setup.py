@@ -84,6 +84,7 @@ setup(
             "catkin_pkg",
             "codespell==2.4.*",
             "hypothesis",
+            "pupil-apriltags",  # the detector of AprilRobotics, for what it publishes
             "mypy==2.4.*",  # pinned, as is Ruff: what passes today passes with the next release
             "pytest",
             "pytest-timeout",

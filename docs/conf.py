@@ -18,7 +18,7 @@ by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its 
 PAGES = {
     "Start": "concepts install camera",
     "Use": "node reasons detector features imu recordings calibration mapping map_build maps "
-    "simulation viewing integrations security",
+    "simulation viewing integrations library security",
     "Understand": "solvers estimator honesty benchmarks architecture api",
 }
 OTHERS = ("CONTRIBUTING", "benchmarks/README", "QUALITY_DECLARATION", "CHANGELOG")

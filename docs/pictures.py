@@ -1,10 +1,11 @@
-"""Draws the pictures of concepts.md: ``python docs/pictures.py`` writes the SVG files beside it.
+"""Draws the pictures of the pages: ``python docs/pictures.py`` writes the SVG files beside it.
 
 Plain text, so that a change shows in a diff and a test can compare every byte.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -185,15 +186,87 @@ def frames() -> str:
     return sheet.svg()
 
 
+def vibration() -> str:
+    """How far a camera turns within one image: steady, shaken, and a gyroscope's samples of it."""
+    sheet = Drawing(820, 270)
+    left, right, middle, high = 70.0, 600.0, 140.0, 90.0
+    sheet.text(left, 30, "turn of the camera within one image (rotation about one axis)", size=15)
+    sheet.arrow(left - 10, middle + 95, right + 30, middle + 95)
+    sheet.text(right + 36, middle + 99, "row time")
+    for tau in (-0.5, 0.0, 0.5):
+        x = left + (tau + 0.5) * (right - left)
+        sheet.line(x, middle + 90, x, middle + 100)
+        sheet.text(x, middle + 116, f"{tau:g}", at="middle")
+
+    def turn(tau: float, shaken: bool) -> float:
+        # The basis of estimator.md: no value and no slope at the middle row.
+        fast, slow = 10.0 * math.pi * tau, 6.0 * math.pi * tau
+        swing = 0.35 * (math.cos(slow) - 1.0) + 0.05 * (math.sin(fast) - fast)
+        return 0.9 * tau + (swing if shaken else 0.0)
+
+    def place(tau: float, shaken: bool) -> tuple[float, float]:
+        return left + (tau + 0.5) * (right - left), middle - high * turn(tau, shaken)
+
+    taus = [k / 120 - 0.5 for k in range(121)]
+    sheet.line(*(x for tau in taus for x in place(tau, False)), colour=GREY, dash="6 4")
+    sheet.line(*(round(x, 1) for tau in taus for x in place(tau, True)), colour="#0d47a1", width=2)
+    for k in range(13):
+        x, y = place(k / 12 - 0.5, True)
+        sheet.dot(round(x, 1), round(y, 1), RED)
+    for k, (colour, words) in enumerate(
+        (
+            (GREY, "pose and twist (x)"),
+            ("#0d47a1", "with vibration (d)"),
+            (RED, "gyroscope samples"),
+        )
+    ):
+        sheet.line(right + 20, 70 + 24 * k, right + 44, 70 + 24 * k, colour=colour, width=3)
+        sheet.text(right + 52, 75 + 24 * k, words, size=12)
+    return sheet.svg()
+
+
+def coverage() -> str:
+    """How many truths lie inside their 95 % regions, by benchmarks.md."""
+    page = Path(__file__).with_name("benchmarks.md").read_text(encoding="utf-8")
+    lines = page.splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith("| bench |"))
+    head = [cell.strip() for cell in lines[start].strip("| ").split("|")]
+    shown = {"pose at mid-frame": "#0d47a1", "twist at mid-frame": "#f9a825"}
+    rows = []
+    for line in lines[start + 2 :]:
+        if not line.startswith("|"):
+            break
+        cells = dict(zip(head, (cell.strip() for cell in line.strip("| ").split("|")), strict=True))
+        rows.append((cells["bench"].strip("`"), [cells[name].strip(" %") for name in shown]))
+    sheet = Drawing(820, 80 + 26 * len(rows))
+    left, wide, bottom = 110.0, 6.4, 50 + 26 * len(rows)
+    sheet.text(left, 24, "truths inside their 95 % regions (%)", size=15)
+    for k, (name, colour) in enumerate(shown.items()):
+        sheet.box(430 + 170 * k, 13, 14, 12, colour)
+        sheet.text(450 + 170 * k, 24, name)
+    for share in (0, 25, 50, 75, 95):
+        x = left + wide * share
+        sheet.line(x, 38, x, bottom, colour=RED if share == 95 else "#cccccc", width=1)
+        sheet.text(x, bottom + 18, str(share), at="middle", colour=RED if share == 95 else INK)
+    for k, (name, shares) in enumerate(rows):
+        sheet.text(left - 8, 58 + 26 * k, name, at="end")
+        for i, (share, colour) in enumerate(zip(shares, shown.values(), strict=True)):
+            if share != "-":
+                sheet.box(left, 43 + 26 * k + 10 * i, wide * float(share), 9, colour)
+    return sheet.svg()
+
+
 PICTURES: dict[str, Callable[[], str]] = {
     "row_time.svg": row_time,
     "scan_directions.svg": scan_directions,
     "frames.svg": frames,
+    "vibration.svg": vibration,
 }
+OF_FIGURES = {"coverage.svg": coverage}  # of a table that changes with each measurement
 
 
 def main() -> None:
-    for name, draw in PICTURES.items():
+    for name, draw in (PICTURES | OF_FIGURES).items():
         Path(__file__).with_name(name).write_text(draw(), encoding="utf-8")
 
 

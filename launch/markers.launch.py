@@ -49,7 +49,7 @@ def _nodes(context: LaunchContext) -> list:
             shutter | given(chosen, DetectorConfig),
         ),
         localizer(
-            chosen,
+            {name: text for name, text in chosen.items() if name != "marker_map"},
             [("camera_info", LaunchConfiguration("camera_info"))],
             _map_settings(file, chosen["params_file"]),
         ),
@@ -68,4 +68,5 @@ def _map_settings(file: str, params_file: str) -> dict[str, Any]:
 def _shutter(params_file: str) -> dict[str, Any]:
     """What the localizer's params file says of the shutter, for the detector's debug image."""
     values = read_params(params_file, NodeConfig)
-    return {name: values[name] for name in settings(DetectorConfig) if name in values}
+    shared = set(settings(DetectorConfig)) - {"marker_map"}  # the localizer's is of other detectors
+    return {name: values[name] for name in values if name in shared}

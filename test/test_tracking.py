@@ -297,18 +297,3 @@ def test_times_in_other_units_are_refused(unit):
         assert tracker.localize(first + frame * step, points, pixels)
     with pytest.raises(ValueError, match=r"frames are \d+ ns apart: time_ns is in nanoseconds"):
         tracker.localize(first + 3 * step, points, pixels)
-
-
-def test_what_was_passed_instead_is_said():
-    localizer = rsl.Localizer(CAMERA)
-    failure = localizer.localize(np.zeros((3, 3)), np.zeros((3, 2)))
-    estimate = localizer.localize(*Hand().frame(0.0, 80))
-    for call, text in (
-        (lambda: Tracker(CAMERA), "localizer must be an rs_localizer.Localizer, got Camera"),
-        (lambda: rsl.camera_state(failure, CAMERA), r"got Failure \(too_few_points: "),
-        (lambda: rsl.camera_state(estimate, localizer), "rs_localizer.Camera, got Localizer"),
-        (lambda: rsl.rectify(CAMERA, failure, [[0.0, 0.0]]), r"Motion, got Failure \(too_few"),
-        (lambda: rsl.Localizer(CAMERA, {"seed": 1}), "rs_localizer.LocalizerConfig, got dict"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            call()

@@ -8,9 +8,10 @@ import importlib.util
 import json
 import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 from tqdm import tqdm
 
@@ -270,6 +271,29 @@ def _hint(recording: Location, params: Path | None) -> None:
         print(f"the recording has settings of its own: --params {shlex.quote(str(file))}")
 
 
+def _localized(
+    bag: BagReader,
+    topics: Topics,
+    localizer: FrameLocalizer,
+    tally: Tally,
+    refused: list[Answer],
+    bar: tqdm[NoReturn],
+) -> Iterator[tuple[int, Localized]]:
+    """The frames with a pose, and when they were recorded; the others are counted and kept."""
+    for answer in replay(bag, topics, localizer):
+        result = answer.result
+        if result:
+            tally.add(result)
+            yield answer.recorded_ns, result
+        else:
+            tally.refuse(result)
+            if result.reason in NO_FRAMES:
+                continue
+            if tally.table is not None:
+                refused.append(answer)
+        bar.update()
+
+
 def _replay(
     bag: BagReader,
     topics: Topics,
@@ -282,46 +306,36 @@ def _replay(
     exports = Exports(args, localizer, out)
     whole: list[Localized] = []
     refused: list[Answer] = []
-    keep = args.smooth or args.rerun is not None or args.view
+    smoothed: set[int] = set()  # stamps of images
+    keep = args.rerun is not None or args.view
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
         BagWriter(out / RESULT, args.storage) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
-
-        def write(frame: Localized, recorded_ns: int) -> None:
+        frames = _localized(bag, topics, localizer, tally, refused, bar)
+        if args.smooth:
+            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
+            parts = smooth_frames(localizer, (frame for _, frame in frames), stamps, args.rate)
+            frames = (
+                (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
+            )
+        for recorded_ns, frame in frames:
             tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
             tally.track.add(frame)
             exports.add(frame)
             if tally.table is not None:
                 tally.table.add(frame.input_stamp_ns, frame)
-
-        for answer in replay(bag, topics, localizer):
-            result = answer.result
-            if result:
-                tally.add(result)
-                if keep:
-                    whole.append(result)
-                if not args.smooth:
-                    write(result, answer.recorded_ns)
-            else:
-                tally.refuse(result)
-                if result.reason in NO_FRAMES:
-                    continue
-                refused.append(answer)
-            bar.update()
-        if args.smooth and whole:
-            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            tally.smoothed = smooth_frames(localizer, whole, stamps, args.rate)
-            whole = tally.smoothed.frames
-            for frame in whole:
-                write(frame, frame.input_stamp_ns)
-            write_bridged(out, tally.smoothed.bridged)
+                if args.smooth:
+                    smoothed.add(frame.input_stamp_ns)
+            if keep:
+                whole.append(frame)
+    if tally.smoothed is not None:
+        write_bridged(out, tally.smoothed.bridged)
     if tally.table is not None:
-        bridged = {frame.input_stamp_ns for frame in whole} if args.smooth else set()
         for answer in refused:
-            if answer.stamp_ns not in bridged:
+            if answer.stamp_ns not in smoothed:
                 tally.table.add(answer.stamp_ns, answer.result)
     tally.seconds = time.perf_counter() - start
     tally.imu = localizer.imu.state
@@ -440,7 +454,7 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
     if images:
         print(f"{bag.count(images)} images published in {played.seconds:.1f} s")
     for topic, count in played.poses.items():
-        print(f"{count} poses heard on {topic}")
+        print(f"{count} poses received on {topic}")
     if not played.poses:
         print(f"no node {NODE_NAME} was there to publish poses")
 

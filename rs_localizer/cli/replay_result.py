@@ -12,7 +12,7 @@ import shutil
 import textwrap
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -367,9 +367,9 @@ def _write_transform(
     return True
 
 
-def write_bridged(out: Path, stamps_ns: IntArray) -> None:
+def write_bridged(out: Path, stamps_ns: Iterable[int]) -> None:
     """Write the stamps (b,) of poses without an image of their own, in s, one a line."""
-    text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps_ns.tolist())
+    text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps_ns)
     (out / BRIDGED).write_text(text, encoding="utf-8")
 
 
@@ -378,6 +378,16 @@ _COLUMNS = (
     *("residual", "model_error", "inliers", "global_shutter_inliers", "points", "tracked"),
     *("dropped", "twist"),
 )
+
+
+@dataclass(slots=True)
+class Smoothed:
+    """What became of the moments of a recording that was smoothed."""
+
+    samples: int = 0
+    bridged: array[int] = field(default_factory=lambda: array("q"))  # stamps, ns
+    undetermined: int = 0
+    shaken: int = 0
 
 
 @dataclass(slots=True)
@@ -394,7 +404,7 @@ class Tally:
     repeated: int = 0
     seconds: float = 0.0
     moving: bool = False  # whether there are twists
-    smoothed: SmoothedFrames | None = None
+    smoothed: Smoothed | None = None
     imu: ImuState | None = None
     readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
@@ -409,6 +419,15 @@ class Tally:
             estimate.global_shutter_inliers, len(estimate.inliers), estimate.tracked,
             frame.dropped, frame.twist is not None,
         ))  # fmt: skip
+
+    def smooth(self, part: SmoothedFrames) -> list[Localized]:
+        """Count the frames of a window that was smoothed, and give them."""
+        self.smoothed = self.smoothed or Smoothed()
+        self.smoothed.samples += len(part.frames)
+        self.smoothed.bridged.extend(part.bridged.tolist())
+        self.smoothed.undetermined += part.undetermined
+        self.smoothed.shaken += part.shaken
+        return part.frames
 
     def refuse(self, refusal: Refusal) -> None:
         """Count a message without one."""
@@ -503,9 +522,9 @@ def _inertial(imu: ImuState | None) -> list[tuple[str, str]]:
     return rows
 
 
-def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:
+def _smoothing(smoothed: Smoothed) -> list[tuple[str, str]]:
     return [
-        ("samples of the smoothed motion", str(len(smoothed.frames))),
+        ("samples of the smoothed motion", str(smoothed.samples)),
         (f"  bridged, listed in {BRIDGED}", str(len(smoothed.bridged))),
         ("  left out, not determined", str(smoothed.undetermined)),
         ("  shaken faster than it follows, left as they were", str(smoothed.shaken)),

@@ -129,8 +129,8 @@ class Estimate(Motion):
         shaken: Array = body_rate + so3.right_jacobian(turn) @ rate
         if self.turn is None:
             return shaken
-        rotation, known = self.turn.at(tau)
-        turned: Array = rotation @ shaken + known
+        rotation, gyro_rate = self.turn.at(tau)
+        turned: Array = rotation @ shaken + gyro_rate
         return turned
 
     def linear_velocity_at(self, tau: float) -> Array:

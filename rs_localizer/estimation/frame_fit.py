@@ -35,14 +35,14 @@ SMOOTH_TERMS = (SMOOTH_DEGREE + 1) * (SMOOTH_DEGREE + 2) // 2
 TURNS = 3 * FUNCTIONS
 # Expected size of each degree: printers stretch paper, lenses bend at the rim; the mean square
 # over the image of a field of scale 1 is 1.
-_DEGREE_SIZES = (1.0, 1.0, 0.5, 0.25)
+DEGREE_SIZES = (1.0, 1.0, 0.5, 0.25)
 _TERM_SIZES = np.array(
     [
-        _DEGREE_SIZES[degree] * math.sqrt((2 * i + 1) * (2 * (degree - i) + 1))
+        DEGREE_SIZES[degree] * math.sqrt((2 * i + 1) * (2 * (degree - i) + 1))
         for degree in range(SMOOTH_DEGREE + 1)
         for i in range(degree + 1)
     ]
-) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(_DEGREE_SIZES)))
+) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(DEGREE_SIZES)))
 # A column whose scale moves no point by this part of the noise is left out: it changes nothing.
 _NEGLIGIBLE = 0.03
 # Neighbouring frequencies have scales alike to a factor of e (precision of the difference of their
@@ -85,14 +85,15 @@ class FrameFit(NamedTuple):
 
     state: Array  # (24,)
     turns: Array  # (28,3) rad, coefficients of the in-frame turn; zeros without one
-    covariance: Array  # (18 + 84,18 + 84), or (18,18) without an in-frame turn
+    # (18 + 84,18 + 84), or (18,18) without an in-frame turn: by the noise and what the prior allows
+    covariance: Array
     noise: float  # px
     freedom: float
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2, beside the in-frame turn and the smooth error
     log_scales: Array  # (15,)
     decided: Array  # (15,) how many coefficients of each scale the points decide
-    smooth: float  # px, scale of the smooth error: its expected root mean square
+    smooth: float  # scale of the smooth error: its expected root mean square
     agreement: float  # of neighbouring rows (see residual_tests)
     evidence: float  # logarithm, but for a constant of the inliers
     left: float  # squared errors beside all, in variances of the noise
@@ -103,11 +104,14 @@ class FrameFit(NamedTuple):
 
 @kernel
 def products_of(
-    lines: Lines, inliers: BoolArray, errors: Array, turns: bool, smooth: bool
+    lines: Lines, inliers: BoolArray, errors: Array, turns: bool, smooth: bool, bend: Array
 ) -> Products:
-    """Multiply the columns of the inliers with each other and with their errors (n,2)."""
+    """Multiply the columns of the inliers with each other and with their errors (n,2).
+
+    ``bend`` (n,b): see :func:`fit_frame`.
+    """
     first = PARAMETERS + (TURNS if turns else 0)
-    size = first + (2 * SMOOTH_TERMS if smooth else 0)
+    size = first + (smooth_size(bend) if smooth else 0)
     matrix, right, square = np.zeros((size, size)), np.zeros(size), 0.0
     low, high = extent(lines, inliers)
     values, rates, terms = np.empty(FUNCTIONS), np.empty(FUNCTIONS), np.zeros(SMOOTH_TERMS)
@@ -117,12 +121,14 @@ def products_of(
             continue
         if turns:
             shake_basis(lines.tau[i], values, rates)
-        if smooth:
+        if smooth and bend.shape[1] == 0:
             smooth_terms(lines.image[i], low, high, terms)
         for side in range(2):
             _fill(rows[side], lines.by_motion[i, side], lines.by_turn[i, side], values, turns)
-            if smooth:
+            if smooth and bend.shape[1] == 0:
                 rows[side, first + SMOOTH_TERMS * side : first + SMOOTH_TERMS * (side + 1)] = terms
+            elif smooth:
+                _fill_bend(rows[side, first:], lines.by_motion[i, side], bend[i])
         square += errors[i, 0] ** 2 + errors[i, 1] ** 2
         one, other = rows[0], rows[1]
         for k in range(size):
@@ -145,6 +151,20 @@ def _fill(row: Array, by_motion: Array, by_turn: Array, values: Array, turns: bo
         for k in range(FUNCTIONS):
             for axis in range(3):
                 row[PARAMETERS + 3 * k + axis] = values[k] * by_turn[axis]
+
+
+@inlined
+def _fill_bend(row: Array, by_motion: Array, bend: Array) -> None:
+    """A point of the map that moves along an axis of the camera is a camera that moves back."""
+    for k in range(len(bend)):
+        for axis in range(3):
+            row[3 * k + axis] = -by_motion[3 + axis] * bend[k]
+
+
+@inlined
+def smooth_size(bend: Array) -> int:
+    """Number of coefficients of the smooth error."""
+    return 3 * bend.shape[1] if bend.shape[1] > 0 else 2 * SMOOTH_TERMS
 
 
 @kernel
@@ -176,16 +196,23 @@ def smooth_terms(image: Array, low: Array, high: Array, terms: Array) -> None:
 
 
 @kernel
-def smooth_at(lines: Lines, inliers: BoolArray, coefficients: Array) -> Array:
-    """The smooth error (n,2) px at all points, of coefficients (20,)."""
+def smooth_at(lines: Lines, inliers: BoolArray, coefficients: Array, bend: Array) -> Array:
+    """The smooth error (n,2) px at all points, of coefficients (20,), or (3 b,) of a bent map."""
+    row = np.empty(len(coefficients))
     low, high = extent(lines, inliers)
     terms, shown = np.zeros(SMOOTH_TERMS), np.zeros((len(inliers), 2))
     for i in range(len(inliers)):
-        smooth_terms(lines.image[i], low, high, terms)
+        if bend.shape[1] == 0:
+            smooth_terms(lines.image[i], low, high, terms)
         for side in range(2):
             total = 0.0
-            for k in range(SMOOTH_TERMS):
-                total += terms[k] * coefficients[SMOOTH_TERMS * side + k]
+            if bend.shape[1] > 0:
+                _fill_bend(row, lines.by_motion[i, side], bend[i])
+                for k in range(len(row)):
+                    total += row[k] * coefficients[k]
+            else:
+                for k in range(SMOOTH_TERMS):
+                    total += terms[k] * coefficients[SMOOTH_TERMS * side + k]
             shown[i, side] = total
     return shown
 
@@ -543,7 +570,7 @@ def _row_times(data: Array, count: int) -> Array:
 def fit_frame(
     data: Array, count: int, start: Array, gradient: Array, prior: PriorTerms, threshold: float,
     first_gate: float, first_noise: float, log_scales: Array, hyper_mean: Array,
-    hyper_precision: Array, with_turns: bool, with_smooth: bool, most: int,
+    hyper_precision: Array, with_turns: bool, with_smooth: bool, bend: Array, most: int,
 ) -> FrameFit:  # fmt: skip
     """Fit motion, in-frame turn, smooth error, their scales, the noise and the inliers.
 
@@ -557,9 +584,11 @@ def fit_frame(
         log_scales, hyper_mean, hyper_precision: (15,) where the logarithms of the scales start, and
             what is known of them.
         with_turns, with_smooth: whether there is an in-frame turn, a smooth error.
+        bend: (n,b) functions of the points' places in the map, of which the smooth error is a
+            combination for each axis of the camera (m); (n,0): it is one of the image (px).
         most: steps.
     """
-    q = (TURNS if with_turns else 0) + (2 * SMOOTH_TERMS if with_smooth else 0)
+    q = (TURNS if with_turns else 0) + (smooth_size(bend) if with_smooth else 0)
     size, first = PARAMETERS + q, TURNS if with_turns else 0
     state, coefficients = start.copy(), np.zeros(q)
     gate, noise, scales = first_gate, first_noise, log_scales.copy()
@@ -571,13 +600,13 @@ def fit_frame(
     inliers = squared_errors(data, count, state, gradient) < gate * gate
     prior_cost, finite, done = 0.0, True, False
     lines = linearized(data, count, state, gradient, shake_at(tau, turns))
-    errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:])
+    errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:], bend)
     for turn in range(most):
         kept = int(np.count_nonzero(inliers))
         if kept < _FEWEST:
             finite = False
             break
-        normal = products_of(lines, inliers, errors, with_turns, with_smooth)
+        normal = products_of(lines, inliers, errors, with_turns, with_smooth, bend)
         information, slope, prior_cost = full_prior(prior, state, turns, size)
         solved = with_scales(
             normal, information, slope, coefficients, scales, hyper_mean, hyper_precision, noise,
@@ -594,7 +623,7 @@ def fit_frame(
             for axis in range(3):
                 turns[k, axis] = coefficients[3 * k + axis]
         lines = linearized(data, count, state, gradient, shake_at(tau, turns))
-        errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:])
+        errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:], bend)
         noise = noise_deviation(squared, gate, max(2.0 * kept - solved.freedom, 0.0))
         closed = gate <= WIDEST_GATE * threshold
         gate = max(_CLOSING * gate, min(max(threshold, GATE * noise), WIDEST_GATE * threshold))
@@ -610,21 +639,29 @@ def fit_frame(
     smooth = math.exp(scales[SCALES - 1]) if with_smooth else 0.0
     agreement = neighbours_agree(errors, tau, lines.image, inliers)
     finite = finite and bool(np.all(np.isfinite(solved.covariance)))
+    by_smooth = solved.covariance[:chosen, chosen:] / max(smooth, _TINY)
+    own = solved.covariance[:chosen, :chosen] - by_smooth @ by_smooth.T
     return FrameFit(
-        state, turns, solved.covariance[:chosen, :chosen].copy(), noise, solved.freedom, inliers,
-        squared, scales, solved.decided, smooth, agreement, evidence,
+        state, turns, own, noise, solved.freedom, inliers, squared, scales,
+        solved.decided, smooth, agreement, evidence,
         solved.left / variance, prior_cost + solved.prior_cost, solved.log_determinant, finite,
     )  # fmt: skip
 
 
 @kernel
 def _beside(
-    data: Array, state: Array, gradient: Array, lines: Lines, inliers: BoolArray, smooth: Array
+    data: Array,
+    state: Array,
+    gradient: Array,
+    lines: Lines,
+    inliers: BoolArray,
+    smooth: Array,
+    bend: Array,
 ) -> tuple[Array, Array]:
     """Errors (n,2) beside the smooth one, and their squares (n,); infinite behind the camera."""
     errors = lines.errors.copy()
     if len(smooth) > 0:
-        errors += smooth_at(lines, inliers, smooth)
+        errors += smooth_at(lines, inliers, smooth, bend)
     squared = squared_errors(data, len(errors), state, gradient)
     for i in range(len(errors)):
         if np.isfinite(squared[i]):

@@ -12,17 +12,26 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.stats import norm
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.shake import CYCLES
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, at_rest, step_between
+from rs_localizer.core.state import (
+    LINEAR,
+    PARAMETERS,
+    VELOCITIES,
+    at_rest,
+    step_between,
+)
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.averaging import averaged
 from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.frame_fit import (
+    DEGREE_SIZES,
+    SMOOTH_DEGREE,
     SMOOTH_TERMS,
     FrameFit,
     fit_frame,
@@ -123,6 +132,8 @@ class _Frame(NamedTuple):
     hyper: Hyperprior
     smooth: bool  # beside a smooth error
     planar: bool
+    bend: Array  # (n,b) of the declared errors of the map (see frame_fit); (n,0): none
+    pixels: float  # by how many a smooth error of scale 1 moves points
 
 
 class Mode(NamedTuple):
@@ -133,7 +144,7 @@ class Mode(NamedTuple):
     evidence: float
     cost: float  # noise variances
     speed: int  # index of SPEEDS
-    smooth: float = 0.0  # px
+    smooth: float = 0.0  # its scale
 
 
 def frame_posterior(
@@ -152,7 +163,9 @@ def frame_posterior(
         part = _of_points(observations.thinned(_MOST_POINTS), start, terms, threshold, assumed)
         gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
         errors = observations.squared_errors(part.state)
-        return replace(part, squared_errors=errors, inliers=errors <= gate**2)
+        inliers = errors <= gate**2
+        bend = _bend(observations.points, inliers, SMOOTH_DEGREE) if part.bend.size else part.bend
+        return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed)
 
 
@@ -173,7 +186,7 @@ def _of_points(
             best, other = again, mirrored(observations.points, again.inliers, again.state)
     depth = max(median_depth(best.state, observations.points, best.inliers), _NEAREST)
     declared = assumed.map_deviation * assumed.focal_length / depth  # px
-    hyper = _hyperprior(assumed, declared)
+    hyper = _hyperprior(assumed)
     explained, agreement, vibration = _look(
         observations.packed, len(observations), best.state, observations.row_time_gradient,
         best.inliers, terms, best.noise, best.freedom, hyper.mean, hyper.precision,
@@ -188,13 +201,18 @@ def _of_points(
     hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
-    smooth = declared > 0.1 * best.noise or (
+    smooth = declared > 0.0 or (
         assumed.turn is None
         and bool(excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
     )
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
-    frame = _Frame(observations, best, terms, threshold, assumed, hyper, smooth, other is not None)
+    bend = _bend(observations.points, best.inliers, SMOOTH_DEGREE if declared > 0.0 else -1)
+    pixels = assumed.focal_length / depth if declared > 0.0 else 1.0
+    frame = _Frame(
+        observations, best, terms, threshold, assumed, hyper, smooth, other is not None, bend,
+        pixels,
+    )  # fmt: skip
     shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
     weighed = frame.smooth or frame.planar
     if weighed or (assumed.may_rest and not _clearly_moving(best, terms, assumed)):
@@ -244,14 +262,35 @@ def _standard(explained: Array, freedom: float) -> Array:
     return np.where(enough, np.clip(standard, -_CLIPPED, _CLIPPED), -_CLIPPED)
 
 
-def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
-    """What is known of the scales of a frame; ``declared``: px, of the map."""
+def _bend(points: Array, inliers: BoolArray, degree: int) -> Array:
+    """Polynomials (n,b) of the places of points, together of a mean square of 1 over the inliers.
+
+    Of each degree as much as the smooth error of the image has.
+    """
+    chosen = points[inliers]
+    low, high = chosen.min(axis=0), chosen.max(axis=0)
+    places = (points - 0.5 * (low + high)) / max(0.5 * float(np.max(high - low)), _NEAREST)
+    x, y, z = (legvander(places[:, k], max(degree, 0)) for k in range(3))
+    columns = [
+        DEGREE_SIZES[i + j + k]
+        * math.sqrt((2 * i + 1) * (2 * j + 1) * (2 * k + 1)) * x[:, i] * y[:, j] * z[:, k]
+        for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)
+    ]  # fmt: skip
+    if not columns:
+        return np.zeros((len(points), 0))
+    bend = np.column_stack(columns)
+    whole: Array = bend / math.sqrt(np.mean(np.sum(bend[inliers] ** 2, axis=1)))
+    return np.ascontiguousarray(whole)
+
+
+def _hyperprior(assumed: Assumed) -> Hyperprior:
+    """What is known of the scales of a frame."""
     mean = np.append(_TURN_SCALES, _SMOOTH_SCALE)
     precision = np.append(np.full(SCALES - 1, _PRECISION), _SMOOTH_PRECISION)
-    if declared > 0.0:
-        mean[-1], precision[-1] = math.log(declared), _DECLARED_PRECISION
+    if assumed.map_deviation > 0.0:
+        mean[-1], precision[-1] = math.log(assumed.map_deviation), _DECLARED_PRECISION
     first = np.full(SCALES, _FIRST_TURN)
-    first[-1] = max(_FIRST_SMOOTH, mean[-1])
+    first[-1] = mean[-1] if assumed.map_deviation > 0.0 else max(_FIRST_SMOOTH, mean[-1])
     known = assumed.scales
     both = precision + known.precisions
     mean = (precision * mean + known.precisions * known.means) / both
@@ -261,7 +300,7 @@ def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
 
 def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior, float] | None:
     """The posterior of a camera that turns within the frame, and its evidence; None: no such."""
-    observations, best, terms, threshold, assumed, hyper, _, _ = frame
+    observations, best, terms, threshold, assumed, hyper, _, _, bend, pixels = frame
     mean, precision, first = hyper
     gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
     if asked.wide:
@@ -272,7 +311,7 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         fit = fit_frame(
             observations.packed, len(observations), state, observations.row_time_gradient, terms,
             threshold, gate, noise, first, mean, precision,
-            True, asked.smooth, _STEPS,
+            True, asked.smooth, bend, _STEPS,
         )  # fmt: skip
         if fit.finite:
             fits.append(fit)
@@ -299,7 +338,9 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         inliers=fit.inliers,
         squared_errors=fit.squared_errors,
         shake=fit.turns,
-        model_error=fit.smooth,
+        model_error=pixels * fit.smooth,
+        smooth_scale=fit.smooth,
+        bend=bend,
         agreement=fit.agreement,
         scales=scales,
         near_outliers=0,
@@ -352,7 +393,9 @@ def _merged(frame: _Frame) -> tuple[Posterior, float]:
         covariance=covariance,
         squared_errors=frame.observations.squared_errors(state),
         # Beside a motion that is free: at rest, what moves looks like an error of the map.
-        model_error=modes[-1].smooth,
+        model_error=frame.pixels * modes[-1].smooth,
+        smooth_scale=modes[-1].smooth,
+        bend=frame.bend,
         speeds=np.eye(len(SPEEDS))[[mode.speed for mode in modes]].T @ weights,
         scales=Scales.nothing()._replace(speeds=by_speed),
         mirror=farthest(costs, evidence, steps, covariance) if frame.planar else None,
@@ -445,7 +488,7 @@ def _mode(frame: _Frame, start: Array, terms: PriorTerms, speed: int, odds: floa
         fit = fit_frame(
             observations.packed, len(observations), state, gradient, terms, frame.threshold,
             WIDEST_GATE * frame.threshold, best.noise, frame.hyper.first, frame.hyper.mean,
-            frame.hyper.precision, False, True, _STEPS,
+            frame.hyper.precision, False, True, frame.bend, _STEPS,
         )  # fmt: skip
         if fit.finite:
             state, covariance, smooth = fit.state, fit.covariance, fit.smooth

@@ -11,7 +11,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
-from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
+from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.packing import weighted
 from rs_localizer.estimation.prior_terms import PriorTerms
@@ -76,9 +76,10 @@ class Posterior:
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
-    undetected: Array = field(
-        default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
-    )
+    undetected: Array = field(default_factory=lambda: np.zeros((12, 12)))
+    # Of the smooth error, which other frames share and the covariance does not have, either
+    smooth_scale: float = 0.0  # px, or m of a bent map; 0: none was fitted
+    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n,b), see frame_fit
 
     @property
     def determined(self) -> bool:

@@ -29,9 +29,10 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from rs_localizer.io.detections import DEFINITIONS
 from rs_localizer.io.remote import Location, is_url, local_copy
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.yaml_text import load_yaml
@@ -122,8 +123,11 @@ with contextlib.suppress(KeyError, AttributeError):  # of versions that are made
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """The message types of ROS 2 Jazzy, and of detections."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
 
 
 def make_message(type_name: str, **fields: Any) -> Any:
@@ -179,7 +183,7 @@ class BagReader:
     def _check_types(self, names: Collection[str]) -> None:
         """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
         own, known = self._reader.typestore.fielddefs, typestore().fielddefs
-        for name in set(names) & set(known) if self._reader.is2 else ():
+        for name in (set(names) & set(known)) - set(DEFINITIONS) if self._reader.is2 else ():
             if _fields_of(name, own) != _fields_of(name, known):
                 raise BagError(f"{self._path} describes {name} otherwise than ROS 2 Jazzy does")
 

@@ -46,6 +46,8 @@ def sequence(camera: Camera, names: list[str], stamps_ns: IntArray, poses: Array
         )
         slopes = np.hypot(*camera.rays(corners.astype(float)).T)  # NaN beyond 90 degrees
         model["max_angle"] = float(np.nanmax(np.arctan(slopes), initial=0.0))
+    elif not camera.law.is_polynomial:
+        raise ValueError(f"ncore.json has no lens {camera.distortion_model}")
     else:
         model |= {
             "camera_model_type": "opencv-pinhole",

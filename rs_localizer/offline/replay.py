@@ -11,7 +11,7 @@ from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.topics import CAMERA_INFO, IMU, MAP_POINTS, TF, TF_STATIC
+from rs_localizer.io.topics import CAMERA_INFO, DETECTIONS, IMU, MAP_POINTS, TF, TF_STATIC
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import IMU_TYPE, INPUTS, Input, Role, with_role
@@ -137,7 +137,7 @@ def imu_topics(bag: BagReader) -> list[str]:
 
 def has_frames(bag: BagReader) -> bool:
     """Whether there is anything to localize: a cloud of any kind."""
-    return any(item.type in bag.topics.values() for item in with_role(Role.FRAMES))
+    return any(set(item.types) & set(bag.topics.values()) for item in with_role(Role.FRAMES))
 
 
 def _named(bag: BagReader, item: Input) -> list[str]:
@@ -145,12 +145,12 @@ def _named(bag: BagReader, item: Input) -> list[str]:
     return sorted(
         topic
         for topic, kind in bag.topics.items()
-        if kind == item.type and topic.split("/")[-1] == item.topic
+        if kind in item.types and topic.split("/")[-1] == item.topic
     )
 
 
 def _find(bag: BagReader, item: Input, given: str | None) -> str:
-    of_type = sorted(topic for topic, kind in bag.topics.items() if kind == item.type)
+    of_type = sorted(topic for topic, kind in bag.topics.items() if kind in item.types)
     if given is not None:
         if given in of_type:
             return given
@@ -258,6 +258,8 @@ def prepare(
         topics = topics.without(IMU)
     if topics.lacks_map and not config.map_file:
         raise BagError(f"{bag.path} has {topics.frames} and no map; give one with --map")
+    if DETECTIONS in topics.of and not config.marker_map:
+        raise BagError(f"{bag.path} has {topics.frames}; -p marker_map:=FILE says where tags are")
     localizer = FrameLocalizer(config, notice, find_transforms(bag, topics, config))
     localizer.load_map()
     return topics, localizer

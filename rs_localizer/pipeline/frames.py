@@ -40,6 +40,7 @@ from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
+from rs_localizer.pipeline.tags import Tags, read_tags
 from rs_localizer.solvers.table import find_solver
 from rs_localizer.tracking import Memory, Tracker
 
@@ -291,9 +292,10 @@ class FrameLocalizer:
     ) -> None:
         self._notice = notice
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
-        self.imu = ImuInput(notice)
+        self.imu: ImuInput = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
+        self._tags: Tags | None = None
         self._resets = StreamResets()
         self._calibration: Calibration | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
@@ -394,11 +396,13 @@ class FrameLocalizer:
         return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
     def load_map(self) -> None:
-        """Use the map of the setting ``map_file``, if there is one.
+        """Use the maps of the settings ``map_file`` and ``marker_map``, where there are any.
 
         Raises:
-            MapError: for a file that cannot be read or holds no map to match keypoints with.
+            ValueError: for a file that cannot be read or holds no such map.
         """
+        if self.config.marker_map:
+            self._tags = read_tags(self.config.marker_map, self._notice)
         if self.config.map_file:
             self.use_map(read_landmarks(self.config.map_file, self.config.map_frame))
 
@@ -414,6 +418,10 @@ class FrameLocalizer:
             return Refusal(Reason.EMPTY_CLOUD, str(error))
         except MessageError as error:
             return Refusal(Reason.BAD_CLOUD, str(error))
+        return self.localize_cloud(cloud)
+
+    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
+        """Localize correspondences, however they came."""
         self._follow(cloud.stamp_ns, cloud.frame)
         result = self._localize(cloud)
         if result:
@@ -444,6 +452,13 @@ class FrameLocalizer:
             if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
                 return result
         return self._localize_by_map(keypoints, None)
+
+    def localize_detections(self, message: Any) -> Localized | Refusal:
+        """Localize one AprilTagDetectionArray by ``marker_map``; never raises for bad ones."""
+        if self._tags is None:
+            return Refusal(Reason.NO_MAP, "detections need the setting marker_map")
+        cloud = self._tags.match(message)
+        return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
 
     def _localize_by_map(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
         cloud = self._landmarks.match(keypoints, self._config.matching, self._camera, prior)

@@ -18,12 +18,6 @@ from rs_localizer.evaluation.comparison import (
     table,
     true_rates,
 )
-from rs_localizer.evaluation.plots import (
-    error_picture,
-    inlier_picture,
-    residual_picture,
-    trajectory_picture,
-)
 
 MIDDLE_NS = 15_000_000
 
@@ -100,20 +94,6 @@ def test_table(recording, results):
     # Without truth there is nothing to say about errors, and no empty lines about it.
     blind = Recording(recording.stamps_ns, [], recording.clouds, {}, None)
     assert "error" not in table("A flight", blind, {"good": compare({}, None)})
-
-
-def test_pictures(recording, results, tmp_path):
-    """They are drawn at all, also where a method has no answer."""
-    matches = np.full(len(recording.stamps_ns), 105.0)
-    assert recording.truth is not None
-    for shown in (results, results | {"bad": compare({}, recording.truth)}):
-        for figure in (
-            trajectory_picture(recording, shown),
-            error_picture(shown),
-            inlier_picture(recording, shown, matches),
-        ):
-            figure.savefig(tmp_path / "figure.png")
-    assert residual_picture(recording, results, 0.03) is None  # there are no images
 
 
 def project(camera: Camera, points: Array, rotation: Rotation, centre: Array) -> Array:

@@ -41,15 +41,6 @@ def test_an_edge_along_the_pixels_is_where_it_is(blur):
         assert error(square(left, top, side, blur), left, top, side) < 0.015
 
 
-def test_noise_costs_hundredths_of_a_pixel():
-    rng, errors = np.random.default_rng(0), []
-    for _ in range(40):
-        left, top = 20.0 + rng.uniform(0.0, 1.0, 2)
-        image = square(left, top, 36.0, 0.7) + rng.normal(0.0, 4.0, (80, 80))
-        errors.append(error(image, left, top, 36.0))
-    assert np.median(errors) < 0.053
-
-
 def ring(left: float, top: float, side: float, smear: tuple[float, float]) -> np.ndarray:
     """A square with a border of a cell, a sixth of its side, which moves by ``smear`` cells."""
     cell, steps = side / 6.0, (np.arange(60) + 0.5) / 60 - 0.5

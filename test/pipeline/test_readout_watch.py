@@ -172,13 +172,6 @@ def test_what_changes_starts_afresh(change):
     assert frames.readout_watch.fault == ""
 
 
-@pytest.mark.parametrize("settings", [{}, {"solver": "p3p", "readout_time": READOUT}])
-def test_nothing_is_measured_that_nobody_uses(settings):
-    frames, notices = watched(30, **settings)
-    assert frames.readout_watch.measured is None
-    assert notices == []
-
-
 @pytest.mark.parametrize(
     "direction", ["bottom_to_top", pytest.param("top_to_bottom", marks=pytest.mark.bench)]
 )

@@ -111,15 +111,6 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
     assert not any("times less likely" in remark for remark in verdict.remarks(found))
 
 
-def test_images_without_the_board_are_not_missing():
-    images = list(recording(0.02))
-    nothing = np.zeros((0, 3)), np.zeros((0, 2))
-    images[30:33] = [Observed(image.stamp_ns, *nothing) for image in images[30:33]]
-    found = calibrate(CAMERA, images)
-    assert found.stamps.missing == 0
-    assert found.images == len(images) - 3
-
-
 def test_a_bent_board_is_found_and_its_lens_with_it():
     """A board that is bent by 1 %: shape and lens, and what the lens is off by."""
     rng = np.random.default_rng(3)

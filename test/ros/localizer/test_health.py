@@ -97,8 +97,8 @@ def test_numbers_of_a_working_node(world):
         "Poses published": "100",
         "Frames replaced": "0",
         "Frames refused": "0",
-        "Topic /camera_info": "messages come, best effort",
-        "Topic /correspondences": "messages come, best effort",
+        "Topic /camera_info": "messages arrive, best effort",
+        "Topic /correspondences": "messages arrive, best effort",
     }
     assert health.values == expected
     world.now += 6.0  # the window is over: nothing of it is said to be so now

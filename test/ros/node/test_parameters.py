@@ -5,7 +5,6 @@ from collections.abc import Iterator
 
 import pytest
 import rclpy
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -57,24 +56,6 @@ def test_every_setting_is_a_parameter_with_its_default(recorder):
         value = recorder.node.get_parameter(name).value
         assert value == setting.default
         assert type(value) is type(setting.default)
-
-
-def test_descriptions_ranges_and_choices(recorder):
-    def describe(name: str) -> ParameterDescriptor:
-        return recorder.node.describe_parameter(name)
-
-    for name, setting in settings().items():
-        assert describe(name).description == setting.description
-        assert describe(name).read_only == setting.read_only
-    threshold = describe("inlier_threshold").floating_point_range[0]
-    assert (threshold.from_value, threshold.to_value) == (0.01, 1000.0)
-    seed = describe("seed").integer_range[0]
-    assert (seed.from_value, seed.to_value) == (0, 2**31 - 1)
-    assert describe("scan_direction").additional_constraints == (
-        "one of top_to_bottom, bottom_to_top, left_to_right, right_to_left"
-    )
-    assert describe("autostart").read_only
-    assert not describe("solver").read_only
 
 
 @pytest.mark.parametrize(
