@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.real.clips import Clip, Shutter, halved
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
@@ -182,14 +182,14 @@ def _halves(
     return row
 
 
-def _sides(image: Observed, number: int) -> tuple[Array, Array]:
+def _sides(image: Observed, number: int) -> tuple[IntArray, IntArray]:
     """Left and right, or upper and lower half of the board in turn."""
     order = np.argsort(image.points[:, number % 2], kind="stable")
     return order[: len(order) // 2], order[len(order) // 2 :]
 
 
 def _parts(
-    images: Sequence[Observed], split: Callable[[Observed, int], tuple[Array, Array]]
+    images: Sequence[Observed], split: Callable[[Observed, int], tuple[IntArray, IntArray]]
 ) -> list[list[Observed]]:
     """The images with one part of their corners, and with the other."""
     parts: list[list[Observed]] = [[], []]
