@@ -203,10 +203,8 @@ def _of_points(
     hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
-    smooth = declared > 0.0 or (
-        assumed.turn is None
-        and bool(excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
-    )
+    shows = excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED
+    smooth = bool(declared > 0.0 or (assumed.turn is None and shows)) and best.inliers.any()
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
     frame = _Frame(
