@@ -204,7 +204,7 @@ def _of_points(
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
     shows = excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED
-    smooth = bool(declared > 0.0 or (assumed.turn is None and shows)) and best.inliers.any()
+    smooth = bool(best.inliers.any() and (declared > 0.0 or (assumed.turn is None and shows)))
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
     frame = _Frame(
