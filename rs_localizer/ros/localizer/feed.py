@@ -17,6 +17,7 @@ from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
+from rs_localizer.pipeline.compiling import compile_in_child
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
 from rs_localizer.pipeline.refusal import Refusal
@@ -175,5 +176,6 @@ def described(landmarks: Map) -> str:
 def warm_up(frames: FrameLocalizer) -> float:
     """Compile all kernels that the settings need; how many seconds it took."""
     started = time.monotonic()
+    compile_in_child(frames.config.solver)
     frames.warm_up()
     return time.monotonic() - started

@@ -175,7 +175,8 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
     ("change", "level", "state", "message"),
     [
         ({"life_cycle": "inactive"}, Level.OK, "inactive", "the node is inactive: activate it"),
-        ({"life_cycle": "configuring"}, Level.WARN, "compiling", "the node is being configured"),
+        ({"life_cycle": "compiling"}, Level.WARN, "compiling", "configured: kernels are compiled"),
+        ({"life_cycle": "loading"}, Level.WARN, "loading", "configured: kernels are loaded"),
         (
             {"life_cycle": "unconfigured"},
             Level.OK,
