@@ -28,8 +28,8 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Pose, Twist
 from rs_localizer.io.transforms import Transform
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.body import Mounting, about_angles, base_pose, base_twist
 from rs_localizer.pipeline.pose_at_time import pose_at, twist_at
+from rs_localizer.pipeline.published import Mounting, about_angles, base_pose, base_twist
 from rs_localizer.tracking import Tracker
 
 NOISE = 1.0  # px

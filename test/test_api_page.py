@@ -4,8 +4,6 @@ import importlib.util
 from pathlib import Path
 from types import ModuleType
 
-import rs_localizer
-
 DOCS = Path(__file__).parents[1] / "docs"
 
 
@@ -23,12 +21,3 @@ def test_the_pages_are_up_to_date():
     made = generator()
     assert (DOCS / "api.md").read_text(encoding="utf-8") == made.page()
     assert (DOCS / "reasons.md").read_text(encoding="utf-8") == made.reasons_page()
-
-
-def test_all_public_names_are_there_and_documented():
-    text = (DOCS / "api.md").read_text(encoding="utf-8")
-    for name in rs_localizer.__all__:
-        assert f"\n## {name}\n" in text
-        assert f"* [`{name}`]" in text
-    assert "### Localizer.localize\n" in text
-    assert "### Estimate.position\n" in text

@@ -296,40 +296,6 @@ def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
         rsl.Localizer(camera()).localize(*arguments)
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"solver": "epnp"}, "solver must be one of .*; got 'epnp'"),
-        ({"inlier_threshold": -1.0}, "inlier_threshold must lie between .* got -1.0"),
-        ({"max_iterations": 2.5}, "max_iterations must be of type int, got 2.5"),
-        ({"iterations": 3}, "'iterations' is not a setting of the localizer; did you mean"),
-        ({"velocity_prior": 0.1}, "velocity_prior must be of type VelocityPrior, got 0.1"),
-    ],
-)
-def test_wrong_settings_are_refused_with_what_was_found(settings, said):
-    with pytest.raises(ValueError, match=said):
-        rsl.Localizer(camera(), **settings)
-
-
-def test_config_and_settings_exclude_each_other():
-    with pytest.raises(ValueError, match="either config or settings, got both: seed"):
-        rsl.Localizer(camera(), rsl.LocalizerConfig(), seed=1)
-
-
-def test_warming_up_compiles_all_that_a_frame_needs():
-    from rs_localizer.estimation import packing, refine, residuals, scoring
-
-    cam = camera()
-    localizer = rsl.Localizer(cam, solver="joint")
-    localizer.warm_up()
-    kernels = [refine.refine, packing.pack, residuals.squared_errors, packing.weighted,
-               scoring.best_models, scoring.optimize]  # fmt: skip
-    before = [len(kernel.signatures) for kernel in kernels]
-    points, pixels, inliers = frame(cam, Path(0), 40, 0.5, 0.2)
-    assert localizer.localize(points, pixels, inliers.astype(float))
-    assert [len(kernel.signatures) for kernel in kernels] == before
-
-
 @pytest.mark.bench
 def test_the_larger_of_two_moving_groups_wins():
     """Half of the points are the scene, three tenths another object, the rest is strewn."""

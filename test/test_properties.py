@@ -22,7 +22,7 @@ from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.messages import MessageError
 from rs_localizer.settings import SettingsError, build, parse_assignment
 from rs_localizer.settings import settings as all_settings
-from rs_localizer.simulation.landmarks import map_rows
+from rs_localizer.simulation.scene import map_rows
 
 quick = settings(max_examples=60, deadline=None)
 # Of a PointField; 32 bits hold all of these.

@@ -59,16 +59,6 @@ def test_the_detectors_files_hold_exactly_their_defaults_and_choices(file, kind)
         assert setting.description, name
 
 
-def test_names_are_dotted_and_described():
-    assert "velocity_prior.angular" in settings()
-    for name, setting in settings().items():
-        assert setting.description, name
-        if isinstance(setting.default, (int, float)) and not isinstance(setting.default, bool):
-            assert setting.minimum <= setting.default <= setting.maximum, name
-        if setting.choices:
-            assert setting.default in setting.choices
-
-
 @pytest.mark.parametrize(
     "heading",
     ["/**", "rs_localizer", "/rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*"],

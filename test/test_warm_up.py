@@ -51,14 +51,6 @@ def test_shaking_is_followed_once(direction, monkeypatch):
     assert any(one.finite and len(one.turns) > 0 for one in fits)
 
 
-def test_a_matrix_is_no_camera_and_a_dictionary_no_prior():
-    with pytest.raises(ValueError, match=r"must be an rs_localizer.Camera, got ndarray"):
-        rsl.Localizer(K)
-    localizer = rsl.Localizer(rsl.Camera(640, 480, K))
-    with pytest.raises(ValueError, match=r"must be an rs_localizer.Prior, got dict"):
-        localizer.localize(np.zeros((20, 3)), np.zeros((20, 2)), prior={})
-
-
 def test_no_frame_waits_for_the_compiler():
     """Slow and fast, few points and thousands, planes and rooms, alone and in tracking."""
     ran = subprocess.run(

@@ -15,7 +15,7 @@ from rs_localizer.config import FeatureConfig, FeatureKind, NodeConfig
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.features.methods import Descriptors as Bytes
+from rs_localizer.features.extraction import Descriptors as Bytes
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.images import Image

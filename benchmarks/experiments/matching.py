@@ -27,8 +27,7 @@ from rs_localizer.simulation.frames import (
     frame_stamps,
     simulate_frames,
 )
-from rs_localizer.simulation.landmarks import keypoint_rows, random_descriptors
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import RecordedMotion
 
 _LANDMARKS = 100_000

@@ -23,8 +23,7 @@ from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 _COUNT = 5

@@ -26,7 +26,7 @@ from benchmarks.load.camera import Camera
 from benchmarks.load.frames import READOUT_TIME, Frames
 from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
-from rs_localizer.ros.node.intake import Intake, NotByExecutor
+from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.settings import NODE_NAME
 
 NODE_PROGRAM = "import sys; from rs_localizer.ros.main import main; sys.exit(main())"

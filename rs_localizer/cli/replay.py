@@ -14,12 +14,15 @@ from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
-from rs_localizer.cli.replay_exports import POSES, TWISTS, Exports, add_export_arguments
 from rs_localizer.cli.replay_result import (
     BRIDGED,
+    POSES,
     RESULT,
+    TWISTS,
     VIEW,
+    Exports,
     Tally,
+    add_export_arguments,
     figures,
     fresh,
     print_summary,

@@ -5,37 +5,273 @@ Frames are written as they come; of each, some numbers stay (250 bytes).
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import json
 import shutil
 import textwrap
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli.replay_exports import POSES, TWISTS, Track, written_names
-from rs_localizer.config import NodeConfig
+from rs_localizer.cli.settings_args import row_time
+from rs_localizer.config import NodeConfig, PoseTime
+from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.camera import Camera
 from rs_localizer.io.atomic_files import atomic_directory
-from rs_localizer.io.bags import BagWriter
+from rs_localizer.io.bags import BagReader, BagWriter
+from rs_localizer.io.gsplat import exposed_rows, write_gsplat
 from rs_localizer.io.image_clock import readout_fault
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.nerfstudio import View, middle_of_image, transforms
 from rs_localizer.io.outputs import Localized, messages
 from rs_localizer.io.topics import TF
+from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms import TransformError, make_transform
 from rs_localizer.offline.fleet.identity import MARKER
 from rs_localizer.offline.fleet.task import LOG, Figures
+from rs_localizer.offline.image_sources import IMAGE_TYPES
 from rs_localizer.offline.replay import TF_TYPE
 from rs_localizer.offline.smoothed import SmoothedFrames
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.imu import ImuState
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.reasons import explained
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.solvers.table import find_solver
+
+TRANSFORMS, IMAGES = "transforms.json", "images"
+_ROW_FILES = "poses_{}.txt"
+_PNG = b"\x89PNG"
+POSES, TWISTS = "poses.txt", "twists.txt"
+_UNKNOWN_TWIST = (np.nan,) * 6
+
+
+def add_export_arguments(parser: argparse._ActionsContainer) -> None:
+    """For :class:`Exports`."""
+    parser.add_argument(
+        "--row",
+        dest="rows",
+        action="append",
+        default=[],
+        metavar="ROW",
+        type=_named_row,
+        help="also write poses_ROW.txt (TUM), at the exposure of this row of each image: first, "
+        "middle, last, or a row time from -0.5 to 0.5; may be repeated",
+    )
+    parser.add_argument(
+        "--nerfstudio",
+        action="store_true",
+        help=f"also write {TRANSFORMS}, with velocities and rolling-shutter time, and to "
+        f"{IMAGES}/ the compressed images of the recording",
+    )
+
+    parser.add_argument(
+        "--gsplat",
+        type=Path,
+        metavar="DIR",
+        help="also make a directory for gsplat: poses at the first and the last row as viewmats, "
+        "intrinsics, a text model of COLMAP, and the compressed images of the recording",
+    )
+
+
+def written_names(out: Path) -> list[Path]:
+    """What an earlier result holds of these."""
+    return [*out.glob(_ROW_FILES.format("*")), *out.glob(TRANSFORMS), *out.glob(f"{IMAGES}/*")]
+
+
+class Track:
+    """Poses and twists by their stamps."""
+
+    def __init__(self) -> None:
+        self._stamps_ns, self._rows = array("q"), array("d")
+        self._bodies: set[str] = set()
+        self._maps: set[str] = set()
+
+    def add(self, frame: Localized) -> None:
+        twist = frame.twist
+        rotation = np.ascontiguousarray(frame.pose.rotation)
+        self._stamps_ns.append(frame.stamp_ns)
+        self._rows.extend(frame.pose.position)
+        self._rows.extend(so3.quaternion(rotation))
+        self._rows.extend(_UNKNOWN_TWIST if twist is None else (*twist.angular, *twist.linear))
+        self._bodies.add(repr(frame.body_frame))
+        self._maps.add(repr(frame.map_frame))
+
+    def once(self) -> tuple[IntArray, Array]:
+        """Stamps in order, and the first pose and twist of each (n,13)."""
+        stamps, first = np.unique(np.array(self._stamps_ns, np.int64), return_index=True)
+        return stamps, np.array(self._rows).reshape(-1, 13)[first]
+
+    def write(self, out: Path, pose_time: str) -> tuple[int, bool]:
+        """Write :data:`POSES` and :data:`TWISTS`; how many stamps came repeatedly, and whether
+        there are twists.
+        """
+        bodies = " or ".join(sorted(self._bodies)) or "the camera"
+        maps = " or ".join(sorted(self._maps)) or "the map"
+        when = {
+            PoseTime.STAMP.value: "the stamp of the image (pose_time: stamp)",
+            PoseTime.MID_FRAME.value: "the exposure of its middle row (pose_time: mid_frame)",
+        }[pose_time]
+        stamps, rows = self.once()
+        write_tum(
+            out / POSES,
+            Trajectory(stamps, rows[:, :3], rows[:, 3:7]),
+            [
+                f"pose of {bodies} in {maps}, map_from_body; t: s, {when}",
+                "x y z: m, its origin; qx qy qz qw: unit quaternion from its axes to the map's",
+            ],
+        )
+        moving = np.isfinite(rows[:, 7])
+        if moving.any():
+            write_twists(
+                out / TWISTS,
+                Twists(stamps[moving], rows[moving, 7:10], rows[moving, 10:]),
+                [
+                    f"velocity of {bodies} with respect to {maps}, in its own axes; t: s, {when}",
+                    "wx wy wz: rad/s; vx vy vz: m/s, of its origin",
+                ],
+            )
+        return len(self._stamps_ns) - len(stamps), bool(moving.any())
+
+
+class Exports:
+    """What other programs want of each frame, as it comes.
+
+    Args:
+        args: of :func:`add_export_arguments`; ``smooth`` among them.
+        localizer: that makes the frames; it has their camera.
+        out: directory of the result.
+    """
+
+    def __init__(self, args: argparse.Namespace, localizer: FrameLocalizer, out: Path) -> None:
+        self._localizer, self._out = localizer, out
+        self._named: dict[str, float] = dict(args.rows)
+        self._wants_views: bool = args.nerfstudio
+        self._gsplat: Path | None = args.gsplat
+        self._smoothed: bool = args.smooth
+        self._rows = {name: Track() for name in self._named}
+        self._views: dict[int, View] = {}
+        self._rolling: dict[int, Array] = {}  # (3,4,4) at the first, middle and last row
+
+    def add(self, frame: Localized) -> None:
+        """Take a frame."""
+        if self._gsplat is not None:
+            first, last = exposed_rows(self._camera)
+            poses = [self._of_camera(frame, tau).pose for tau in (first, 0.0, last)]
+            self._rolling[frame.input_stamp_ns] = np.stack(
+                [
+                    np.block([[pose.rotation, pose.position[:, None]], [np.eye(4)[3:]]])
+                    for pose in poses
+                ]
+            )
+        for name, tau in self._named.items():
+            then = self._localizer.mounted(self._of_camera(frame, tau))
+            if isinstance(then, Localized):
+                self._rows[name].add(then)
+        if self._wants_views:
+            then = self._of_camera(frame, middle_of_image(self._camera))
+            self._views[frame.input_stamp_ns] = View(
+                f"{IMAGES}/{frame.input_stamp_ns}.jpg",
+                then.pose.rotation,
+                then.pose.position,
+                None if then.twist is None else then.twist.linear,
+                None if then.twist is None else then.twist.angular,
+            )
+
+    def write(self, bag: BagReader) -> None:
+        """Write the files, with images of the recording."""
+        for name, track in self._rows.items():
+            stamps, rows = track.once()
+            if len(stamps):
+                write_tum(
+                    self._out / _ROW_FILES.format(name),
+                    Trajectory(stamps, rows[:, :3], rows[:, 3:7]),
+                    [f"map_from_body; t: s, the exposure of the row {name} (-0.5 first, 0.5 last)"],
+                )
+        if self._views:
+            self._write_transforms(bag)
+        if self._gsplat is not None and self._rolling:
+            images, landmarks = sorted(self._rolling), self._localizer.map
+            with atomic_directory(self._gsplat) as folder:
+                folder.mkdir()
+                files = _write_images(bag, set(images), folder)
+                write_gsplat(
+                    folder,
+                    self._camera,
+                    [files.get(stamp, f"{IMAGES}/{stamp}.jpg") for stamp in images],
+                    np.stack([self._rolling[stamp] for stamp in images]),
+                    np.zeros((0, 3)) if landmarks is None else landmarks.points,
+                )
+            print(f"written to {self._gsplat}: poses of {len(images)} images for gsplat")
+
+    @property
+    def _camera(self) -> Camera:
+        calibration, config = self._localizer.calibration, self._localizer.config
+        assert calibration is not None  # without one there is no frame
+        return calibration.camera(config.readout_time, config.scan_direction)
+
+    def _of_camera(self, frame: Localized, tau: float) -> Localized:
+        """The frame of the camera at the exposure of a row."""
+        config = self._localizer.config
+        middle = middle_row_ns(config, self._camera, frame.input_stamp_ns)
+        stamp = middle + round(1e9 * config.readout_time * tau)
+        # A sample of a smoothed motion is centred on its own moment instead of the middle row.
+        if self._smoothed:
+            tau = (stamp - frame.stamp_ns) * 1e-9 / config.readout_time
+        twist = None
+        if frame.twist is not None:
+            twist = twist_at(frame.estimate, tau, config.readout_time)
+        return replace(
+            frame,
+            stamp_ns=stamp,
+            body_frame=self._localizer.camera_frame,
+            pose=pose_at(frame.estimate, tau),
+            twist=twist,
+        )
+
+    def _write_transforms(self, bag: BagReader) -> None:
+        files = _write_images(bag, set(self._views), self._out)
+        views = [
+            replace(view, file=files.get(stamp, view.file))
+            for stamp, view in sorted(self._views.items())
+        ]
+        text = json.dumps(transforms(self._camera, views), indent=1)
+        (self._out / TRANSFORMS).write_text(text, encoding="utf-8")
+        if missing := len(views) - len(files):
+            print(
+                f"{missing} images of {TRANSFORMS} are not in the recording (detect --images keeps "
+                f"them): put them to {IMAGES}/STAMP_IN_NS.jpg"
+            )
+
+
+def _named_row(text: str) -> tuple[str, float]:
+    return text, row_time(text)
+
+
+def _write_images(bag: BagReader, stamps: set[int], out: Path) -> dict[int, str]:
+    """The compressed images of these stamps; their files by stamp."""
+    topics = [topic for topic, kind in bag.topics.items() if kind == IMAGE_TYPES[1]]
+    files: dict[int, str] = {}
+    if len(topics) != 1:
+        return files
+    (out / IMAGES).mkdir(exist_ok=True)
+    for _, _, message in bag.messages(topics):
+        stamp = stamp_ns(message)
+        if stamp in stamps:
+            data = bytes(message.data)
+            suffix = "png" if data.startswith(_PNG) else "jpg"
+            files[stamp] = f"{IMAGES}/{stamp}.{suffix}"
+            (out / files[stamp]).write_bytes(data)
+    return files
+
 
 RESULT, BRIDGED = "result", "bridged.txt"
 VIEW = "view.rrd"

@@ -4,37 +4,273 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from rs_localizer import data
 from rs_localizer.cli import UsageError, add_overwrite, replaced
-from rs_localizer.cli.simulated_camera import (
-    add_camera_arguments,
-    add_motion_arguments,
-    camera_of,
-    motion_of,
-    option,
-    stamps_of,
-)
-from rs_localizer.cli.simulated_imu import add_imu_arguments, bag_of
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.atomic_files import atomic_directory
-from rs_localizer.io.bags import STORAGES
+from rs_localizer.io.bags import STORAGES, BagWriter
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.recording import MAP, MAP_FRAME, MARKER_MAP, PARAMETERS
+from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.process.arguments import integer, number
-from rs_localizer.settings import write_parameters
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.settings import settings, write_parameters
+from rs_localizer.simulation.frames import FrameSettings, frame_stamps, simulate_frames
 from rs_localizer.simulation.image_sequence import FORMATS, Encoding, rendered_frames
-from rs_localizer.simulation.landmarks import described, keypoint_rows
+from rs_localizer.simulation.imu import ImuBagWriter, ImuSettings, Lever, simulate_imu
 from rs_localizer.simulation.recording import write_rendered, write_simulated
 from rs_localizer.simulation.renderer import ImageSettings, Renderer
-from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.true_motion import TrueMotion, sampled_states
+from rs_localizer.simulation.scene import described, keypoint_rows, room
+from rs_localizer.simulation.true_motion import (
+    BODY_FROM_CAMERA,
+    KNOT_SPACING,
+    ConstantVelocity,
+    RecordedMotion,
+    TrueMotion,
+    sampled_states,
+    shaken,
+)
 from rs_localizer.simulation.walls import SCENES
+
+# A still hand is no example: without any motion given, the camera turns and walks like this.
+_ANGULAR_VELOCITY = (0.0, 1.0, 0.0)
+_LINEAR_VELOCITY = (0.3, 0.0, 0.0)
+_DURATION = 10.0
+# A time of 0 means "none" to ROS.
+_START_NS = 1_000_000_000
+# The random numbers of a vibration are its own.
+_VIBRATION_STREAM = 60
+# Stands for the bundled trajectory.
+_BUNDLED = "tum_vi_room5"
+
+
+def option(
+    group: argparse._ArgumentGroup,
+    name: str,
+    kind: Callable[[str], float],
+    default: float,
+    unit: str,
+    text: str = "",
+) -> None:
+    """An option with a number, whose help ends with its default."""
+    said = f"{text} (default: %(default)s)".strip()
+    group.add_argument(name, type=kind, default=default, metavar=unit, help=said)
+
+
+def add_motion_arguments(group: argparse._ArgumentGroup) -> None:
+    """Options that :func:`motion_of` and :func:`stamps_of` read."""
+    group.add_argument(
+        "--trajectory",
+        type=Path,
+        metavar="FILE",
+        help="follow recorded poses: TUM text, also .gz; gaps are left out, never bridged "
+        f"({_BUNDLED}: the bundled motion of a hand-held rig)",
+    )
+    group.add_argument(
+        "--axes",
+        choices=sorted(BODY_FROM_CAMERA),
+        default="forward_left_up",
+        help="axes of the recorded body; the camera looks forward (default: %(default)s)",
+    )
+    group.add_argument(
+        "--knot-spacing",
+        type=number(0.0),
+        default=KNOT_SPACING,
+        metavar="S",
+        help="seconds between the knots of the spline through recorded poses; 0: through every "
+        "pose, shaking with its noise (default: %(default)s)",
+    )
+    group.add_argument(
+        "--angular-velocity",
+        type=number(),
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="rad/s in camera axes (x right, y down, z forward) "
+        f"(without any motion given: {_words(_ANGULAR_VELOCITY)})",
+    )
+    group.add_argument(
+        "--linear-velocity",
+        type=number(),
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="m/s along the camera axes at the start "
+        f"(without any motion given: {_words(_LINEAR_VELOCITY)})",
+    )
+    group.add_argument(
+        "--vibration",
+        type=number(0.0),
+        nargs=2,
+        metavar=("DEG", "HZ"),
+        action="append",
+        default=[],
+        help="shake the camera besides, to and fro by DEG about any axis; may be repeated",
+    )
+    option(group, "--start", number(0.0), 0.0, "S", "seconds to skip")
+    group.add_argument(
+        "--duration",
+        type=number(0.0, above=True),
+        metavar="S",
+        help=f"seconds (default: the whole trajectory; {_DURATION:g} at constant velocity)",
+    )
+
+
+def add_camera_arguments(group: argparse._ArgumentGroup) -> None:
+    """Options that :func:`camera_of` and :func:`stamps_of` read."""
+    option(group, "--width", integer(2), 640, "PX")
+    option(group, "--height", integer(2), 480, "PX")
+    option(group, "--focal", number(0.0, above=True), 500.0, "PX", "focal length")
+    group.add_argument(
+        "--distortion-model",
+        choices=[model.value for model in DistortionModel],
+        default=DistortionModel.PLUMB_BOB.value,
+        help="(default: %(default)s)",
+    )
+    group.add_argument(
+        "--distortion",
+        type=number(),
+        nargs="+",
+        default=[],
+        metavar="D",
+        help="coefficients in the order of CameraInfo (default: none)",
+    )
+    longest = settings()["readout_time"].maximum or 0.0
+    option(
+        group, "--readout-time", number(0.0, longest), 0.03, "S", "from the first row to the last"
+    )
+    group.add_argument(
+        "--scan-direction",
+        choices=[direction.value for direction in ScanDirection],
+        default=ScanDirection.TOP_TO_BOTTOM.value,
+        help="(default: %(default)s)",
+    )
+    option(
+        group, "--rate", number(0.0, above=True), FrameSettings().rate, "HZ", "frames per second"
+    )
+
+
+def camera_of(args: argparse.Namespace) -> Camera:
+    """The camera; UsageError for a lens that cannot be."""
+    K = np.array(
+        [
+            [args.focal, 0.0, 0.5 * (args.width - 1)],
+            [0.0, args.focal, 0.5 * (args.height - 1)],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    try:
+        return Camera(
+            width=args.width,
+            height=args.height,
+            K=K,
+            D=np.array(args.distortion),
+            distortion_model=args.distortion_model,
+            readout_time=args.readout_time,
+            scan_direction=args.scan_direction,
+        )
+    except ValueError as error:  # the other arguments are checked already
+        raise UsageError(f"--distortion: {error}") from error
+
+
+def motion_of(args: argparse.Namespace) -> TrueMotion:
+    """The recorded motion, or one at constant velocity, with its vibrations."""
+    vibrations = [(degrees, hertz) for degrees, hertz in args.vibration]
+    return shaken(
+        _unshaken(args), vibrations, np.random.default_rng([args.seed, _VIBRATION_STREAM])
+    )
+
+
+def _unshaken(args: argparse.Namespace) -> TrueMotion:
+    velocities = (args.angular_velocity, args.linear_velocity)
+    if args.trajectory is not None:
+        if velocities != (None, None):
+            raise UsageError("give either --trajectory or velocities, not both")
+        file = args.trajectory
+        if file == Path(_BUNDLED) and not file.exists():
+            file = data.path(data.HAND_MOTION)
+        return RecordedMotion(read_tum(file), args.axes, args.knot_spacing)
+    angular, linear = velocities
+    if angular is None and linear is None:
+        angular, linear = _ANGULAR_VELOCITY, _LINEAR_VELOCITY
+    return ConstantVelocity(
+        np.array(angular or (0.0, 0.0, 0.0)),
+        np.array(linear or (0.0, 0.0, 0.0)),
+        args.start + (_DURATION if args.duration is None else args.duration),
+        start_ns=_START_NS,
+    )
+
+
+def stamps_of(args: argparse.Namespace, camera: Camera, motion: TrueMotion) -> list[int]:
+    """When the frames begin, ns; ValueError when there are none."""
+    start_ns = motion.intervals_ns[0][0] + round(args.start * 1e9)
+    stamps = [stamp for stamp in frame_stamps(motion, camera, args.rate) if stamp >= start_ns]
+    if args.duration is not None:
+        stamps = [stamp for stamp in stamps if stamp < start_ns + round(args.duration * 1e9)]
+    if not stamps:
+        raise ValueError("no frame lies within the motion, --start and --duration")
+    return stamps
+
+
+def _words(numbers: tuple[float, ...]) -> str:
+    return " ".join(f"{number:g}" for number in numbers)
+
+
+# Its random numbers are its own: the frames are the same with and without it.
+_STREAM = 14
+_OPTIONS = (
+    "imu_rate",
+    "gyroscope_noise",
+    "gyroscope_bias",
+    "gyroscope_bias_walk",
+    "accelerometer_noise",
+    "accelerometer_bias",
+    "imu_offset",
+)
+
+
+def add_imu_arguments(group: argparse._ArgumentGroup) -> None:
+    """Options that :func:`bag_of` reads."""
+    imu = ImuSettings()
+    group.add_argument(
+        "--imu", action="store_true", help="write an IMU, too, and its mounting on /tf_static"
+    )
+    option(group, "--imu-rate", number(0.0, above=True), imu.rate, "HZ")
+    option(group, "--gyroscope-noise", number(0.0), imu.gyroscope_noise, "N", "rad/s/sqrt(Hz)")
+    option(group, "--gyroscope-bias", number(0.0), imu.gyroscope_bias, "B", "rad/s, any direction")
+    option(
+        group, "--gyroscope-bias-walk", number(0.0), imu.gyroscope_bias_walk, "N",
+        "rad/s^2/sqrt(Hz)",
+    )  # fmt: skip
+    option(
+        group, "--accelerometer-noise", number(0.0), imu.accelerometer_noise, "N",
+        "m/s^2/sqrt(Hz)",
+    )  # fmt: skip
+    option(group, "--accelerometer-bias", number(0.0), imu.accelerometer_bias, "B", "m/s^2")
+    option(
+        group, "--imu-offset", number(), imu.time_offset, "S",
+        "to add to its stamps to get the camera's time",
+    )  # fmt: skip
+
+
+def bag_of(args: argparse.Namespace, out: Path, motion: TrueMotion) -> BagWriter:
+    """The recording that is written; with ``--imu`` one that holds its readings besides."""
+    defaults = ImuSettings()
+    settings = ImuSettings(*(getattr(args, name) for name in _OPTIONS))
+    if not args.imu:
+        if settings != defaults:
+            raise UsageError("options of the IMU need --imu")
+        return BagWriter(out, args.storage)
+    lever = Lever()
+    track = simulate_imu(motion, settings, lever, np.random.default_rng([args.seed, _STREAM]))
+    return ImuBagWriter(out, args.storage, args.readout_time, track, settings, lever)
+
 
 # Options of the one kind of recording that mean nothing to the other.
 _OF_POINTS = ("points", "noise", "outliers", "keypoints")

@@ -5,7 +5,7 @@ A pose is as certain as the points are spread; the best keypoints alone lie wher
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,8 +13,194 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.config import FeatureKind
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.features.methods import METHODS, Descriptors, FeatureError, Gray
+
+# A corner is looked for within so many pixels of FAST's, gradients are summed over as many.
+_REACH = _WINDOW = 1
+# Around a corner: its reach, a neighbour for the parabola, the window, a neighbour for gradients.
+_MARGIN = _REACH + 1 + _WINDOW + 1
+
+
+def refined(image: NDArray[np.uint8], corners: IntArray, levels: IntArray, step: float) -> Array:
+    """Corners (n,2) in pixels of the image, the centre of the first one at 0, 0.
+
+    Args:
+        image: (h,w)
+        corners: (n,2) x, y, whole pixels of their level.
+        levels: (n,) of the pyramid.
+        step: how much smaller each level is than the one before.
+    """
+    result = np.empty(corners.shape)
+    height, width = image.shape
+    reduced = image
+    for level in range(int(levels.max(initial=-1)) + 1):
+        if level:
+            # As ORB does, so that corners are where it places them.
+            size = tuple(max(1, round(length / step**level)) for length in (width, height))
+            reduced = np.asarray(
+                cv2.resize(reduced, size, interpolation=cv2.INTER_LINEAR_EXACT), np.uint8
+            )
+        rows = np.flatnonzero(levels == level)
+        scale = np.array([width / reduced.shape[1], height / reduced.shape[0]])
+        precise = corners[rows] + _offsets(reduced, corners[rows])
+        # Pixels are squares: the centre of the first one of a level is not that of the image's.
+        result[rows] = (precise + 0.5) * scale - 0.5
+    return result
+
+
+def _offsets(image: NDArray[np.uint8], corners: IntArray) -> Array:
+    """From whole pixels (n,2) of an image to the corners beside them (n,2)."""
+    around = np.arange(-_MARGIN, _MARGIN + 1)
+    padded = np.pad(image, _MARGIN, mode="edge")
+    columns, rows = corners[:, :1] + _MARGIN + around, corners[:, 1:] + _MARGIN + around
+    strength = _strength(padded[rows[:, :, None], columns[:, None, :]].astype(np.float64))
+    count, side = len(corners), 2 * _REACH + 1
+    best = strength[:, 1:-1, 1:-1].reshape(count, side * side).argmax(axis=1)
+    y, x = best // side + 1, best % side + 1
+    n, peak = np.arange(count), strength[np.arange(count), y, x]
+    across = _vertex(strength[n, y, x - 1], peak, strength[n, y, x + 1])
+    along = _vertex(strength[n, y - 1, x], peak, strength[n, y + 1, x])
+    return np.column_stack([x + across, y + along]) - (_REACH + 1)
+
+
+def _strength(patches: Array) -> Array:
+    """The smaller eigenvalue of the second moments (n,s,s) in patches (n,s+4,s+4)."""
+    dx = _smooth(patches[:, :, 2:] - patches[:, :, :-2], 1)
+    dy = _smooth(patches[:, 2:] - patches[:, :-2], 2)
+    xx, yy, xy = _window(dx * dx), _window(dy * dy), _window(dx * dy)
+    smaller: Array = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
+    return smaller
+
+
+def _smooth(values: Array, axis: int) -> Array:
+    """By 1, 2, 1 along an axis, for Sobel's gradients."""
+    first = np.moveaxis(values, axis, 0)
+    smooth: Array = np.moveaxis(first[:-2] + 2.0 * first[1:-1] + first[2:], 0, axis)
+    return smooth
+
+
+def _window(values: Array) -> Array:
+    """Sums over windows."""
+    side = 2 * _WINDOW + 1
+    windows = np.lib.stride_tricks.sliding_window_view(values, (side, side), (1, 2))
+    sums: Array = windows.sum(axis=(3, 4))
+    return sums
+
+
+def _vertex(before: Array, peak: Array, after: Array) -> Array:
+    """Where (n,) the parabola through three values has its vertex, at most a pixel away."""
+    bend = before - 2.0 * peak + after
+    apart = 0.5 * (before - after)
+    vertex: Array = np.divide(apart, bend, np.zeros_like(bend), where=bend < 0.0)
+    return np.clip(vertex, -1.0, 1.0)
+
+
+Gray = NDArray[np.uint8]
+Descriptors = NDArray[np.uint8]  # (n,d)
+
+# Keypoints to choose from, as a multiple of those that are wanted, where OpenCV has to be told.
+_CHOICE = 4
+# COLMAP's threshold: its peak_threshold of 0.02 / 3 is OpenCV's before the division by layers.
+_SIFT_CONTRAST = 0.02
+# OpenCV takes pixel x of the doubled image for x / 2; it is (x + 0.5) / 2 - 0.5.
+_SIFT_OFFSET = -0.25
+# What COLMAP multiplies the square roots with, so that they fill a byte.
+_SIFT_SCALE = 512.0
+# Steps of brightness around a corner; ORB-SLAM (Mur-Artal et al., T-RO 2015) takes 20, or 7.
+_FAST_THRESHOLD = 10
+# Keypoints lie at least so far (px of their level) inside; the descriptor reaches 15 px.
+_ORB_EDGE = 19
+_ORB_LEVELS, _ORB_STEP = 8, 1.2
+# A quarter of OpenCV's.
+_AKAZE_THRESHOLD = 0.00025
+
+
+class FeatureError(ValueError):
+    """A method that this OpenCV does not have; the text says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One way to find keypoints and to describe them.
+
+    ``find`` and ``describe`` of OpenCV repeat much of each other's work. ``at_once`` says that to
+    describe all that is found costs less than that.
+    """
+
+    create: Callable[[int], Any]  # OpenCV's detector for this many keypoints
+    at_once: bool
+    place: Callable[[Gray, Sequence[Any]], Array]  # pixels (n,2) of keypoints, sub-pixel, unbiased
+    pack: Callable[[NDArray[Any]], Descriptors]  # OpenCV's descriptors (n,d) as they are sent
+
+
+def root_descriptors(descriptors: NDArray[Any]) -> Descriptors:
+    """SIFT as COLMAP has it: L1-normalised, square roots, times 512 in bytes.
+
+    Arandjelovic, Zisserman, *Three things everyone should know to improve object retrieval*, CVPR
+    2012. Euclidean distances of these numbers are Hellinger distances of the histograms.
+    """
+    values = descriptors.astype(np.float64)
+    sums = np.maximum(values.sum(axis=1, keepdims=True), 1e-12)
+    roots: Array = np.minimum(np.rint(_SIFT_SCALE * np.sqrt(values / sums)), 255.0)
+    return roots.astype(np.uint8)
+
+
+def _sift(_: int) -> Any:
+    return cv2.SIFT.create(contrastThreshold=_SIFT_CONTRAST)
+
+
+def _orb(count: int) -> Any:
+    return cv2.ORB.create(
+        _CHOICE * count,
+        scaleFactor=_ORB_STEP,
+        nlevels=_ORB_LEVELS,
+        edgeThreshold=_ORB_EDGE,
+        fastThreshold=_FAST_THRESHOLD,
+    )
+
+
+def _akaze(_: int) -> Any:
+    # OpenCV 5 has it in its contrib modules only, where an older one has none.
+    for module in (cv2, getattr(cv2, "xfeatures2d", None)):
+        if (akaze := getattr(module, "AKAZE", None)) is not None:
+            return akaze.create(threshold=_AKAZE_THRESHOLD)
+    raise FeatureError(
+        f"OpenCV {cv2.__version__} has no AKAZE: take sift or orb, or install "
+        f'"opencv-python-headless<5" or opencv-contrib-python-headless'
+    )
+
+
+def _points(keypoints: Sequence[Any]) -> Array:
+    return np.array([keypoint.pt for keypoint in keypoints], np.float64).reshape(-1, 2)
+
+
+def _sift_place(_: Gray, keypoints: Sequence[Any]) -> Array:
+    return _points(keypoints) + _SIFT_OFFSET
+
+
+def _orb_place(image: Gray, keypoints: Sequence[Any]) -> Array:
+    octaves = np.array([keypoint.octave for keypoint in keypoints], np.int64)
+    scale = _ORB_STEP**octaves
+    corners = np.rint(_points(keypoints) / scale[:, None]).astype(np.int64)
+    return refined(image, corners, octaves, _ORB_STEP)
+
+
+def _akaze_place(_: Gray, keypoints: Sequence[Any]) -> Array:
+    return _points(keypoints)
+
+
+def _as_it_is(descriptors: NDArray[Any]) -> Descriptors:
+    return np.ascontiguousarray(descriptors, np.uint8)
+
+
+METHODS: dict[str, Method] = {
+    FeatureKind.SIFT: Method(_sift, False, _sift_place, root_descriptors),
+    FeatureKind.ORB: Method(_orb, False, _orb_place, _as_it_is),
+    FeatureKind.AKAZE: Method(_akaze, True, _akaze_place, _as_it_is),
+}
+"""All methods by their name."""
+
 
 # Keypoints that a cell of the grid holds on average.
 _PER_CELL = 8

@@ -6,10 +6,19 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
 
-from rs_localizer.config import MatchBy, NodeConfig
+import numpy as np
+
+from rs_localizer import matching
+from rs_localizer.config import MatchBy, Matching, NodeConfig
+from rs_localizer.core import so3
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.camera_info import Calibration
 from rs_localizer.io.clouds import (
@@ -19,18 +28,294 @@ from rs_localizer.io.clouds import (
     thinned,
 )
 from rs_localizer.io.keypoints import Keypoints, read_keypoints
-from rs_localizer.io.maps.landmarks import Map
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.messages import MessageError
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import CAMERA_INFO, MAP_POINTS
 from rs_localizer.io.transforms import Transforms, TransformTree
-from rs_localizer.pipeline.imu import ImuInput
-from rs_localizer.pipeline.input_checks import StreamResets, lens_is_off, oddities
-from rs_localizer.pipeline.landmarks import Landmarks, read_landmarks
-from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
+from rs_localizer.localizer import Localizer
+from rs_localizer.matching import Matcher, MatchError
+from rs_localizer.pipeline.imu import ImuInput, inertial_settings
+from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
+from rs_localizer.pipeline.single_frames import SingleFrames
+from rs_localizer.solvers.table import find_solver
+from rs_localizer.tracking import Tracker
+
+
+class Landmarks:
+    """The map that keypoints are matched with, as soon as there is one.
+
+    Args:
+        notice: told what is odd.
+    """
+
+    def __init__(self, notice: Notify) -> None:
+        self._notice = notice
+        self._matcher: Matcher | None = None
+        self.lacking = False
+        """Whether keypoints have come before a map, and no frame has been localized since."""
+
+    @property
+    def map(self) -> Map | None:
+        """The present one."""
+        return None if self._matcher is None else self._matcher.map
+
+    def use(self, landmarks: Map) -> None:
+        """Match with this map from now on."""
+        previous = self.map
+        if previous is not None and landmarks.equals(previous):
+            return  # published again
+        for name, text in oddities_of_map(landmarks, previous).items():
+            self._notice(name, text)
+        self._matcher = Matcher(landmarks)
+        self.lacking = False
+
+    def how(self, keypoints: Keypoints, settings: Matching) -> MatchBy | Refusal:
+        """By what they can be matched."""
+        if self._matcher is None:
+            self.lacking = True
+            return Refusal(
+                Reason.NO_MAP, "no usable map has come yet, on map_points or as map_file"
+            )
+        try:
+            by = self._matcher.choose(keypoints, settings)
+        except MatchError as error:
+            return Refusal(Reason.BAD_KEYPOINTS, str(error))
+        if by == MatchBy.DESCRIPTOR and len(keypoints) > settings.max_keypoints:
+            self._notice(
+                Notice.TOO_MANY_KEYPOINTS,
+                f"{len(keypoints)} keypoints have come, matching.max_keypoints of them, "
+                f"{settings.max_keypoints}, are matched",
+            )
+        return by
+
+    def match(
+        self, keypoints: Keypoints, settings: Matching, camera: Camera, prior: Prior | None
+    ) -> Correspondences | Refusal:
+        """Correspondences, all over the map or where a motion predicts them only."""
+        assert self._matcher is not None
+        matches = self._matcher.match(keypoints, settings, camera, prior)
+        if len(matches) == 0:
+            return Refusal(
+                Reason.NO_MATCHES,
+                f"none of {len(keypoints)} keypoints matches one of {len(self._matcher.map)} "
+                f"landmarks by {matches.by}",
+            )
+        return matching.correspondences(matches, keypoints, self._matcher.map)
+
+
+def read_landmarks(file: str, frame: str) -> Map:
+    """The map of a file, to match keypoints with.
+
+    Args:
+        file: its path; ``~`` is the user's home.
+        frame: of its points.
+
+    Raises:
+        MapError: for a file that cannot be read or holds no such map.
+    """
+    path = Path(file).expanduser()
+    try:
+        landmarks = read_map_file(path, frame)
+    except MapError as error:
+        raise MapError(f"map_file: {error}") from error
+    except OSError as error:
+        raise MapError(f"map_file: {path} cannot be read: {error.strerror or error}") from error
+    if landmarks.ids is None and landmarks.descriptors is None:
+        raise MapError(
+            f"map_file: {path}: keypoints cannot be matched with a map that has neither ids "
+            "nor descriptors"
+        )
+    return landmarks
+
+
+def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
+    """What is worth telling of a map that takes the place of another, or of none."""
+    found: dict[Notice, str] = {}
+    if landmarks.dropped:
+        found[Notice.MAP_INCOMPLETE] = (
+            f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
+            "descriptor"
+        )
+    if previous is not None:
+        found[Notice.MAP_REPLACED] = (
+            f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
+            f"one of {len(previous)} in frame {previous.frame!r}"
+        )
+    return found
+
+
+# Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
+_FINE = 0.00097
+# Trackers of features may find a point somewhat outside, in px.
+_SLACK = 1.0
+
+
+def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[Notice, str]:
+    """What is odd, a sentence each.
+
+    Args:
+        cloud: of one image.
+        camera: that ``camera_info`` describes.
+        camera_frame: its optical frame.
+    """
+    found = {
+        Notice.MAP_IS_CAMERA: _frame(cloud.frame, camera_frame),
+        Notice.COARSE_COORDINATES: _coordinates(cloud),
+        Notice.PIXELS_OUTSIDE: _pixels(cloud, camera),
+    }
+    return {name: text for name, text in found.items() if text}
+
+
+def _frame(frame: str, camera_frame: str) -> str:
+    if frame != camera_frame:
+        return ""
+    return (
+        f"the points are given in {frame!r}, which is the camera's own frame: header.frame_id of "
+        "the cloud (or map) must name the frame of x, y, z"
+    )
+
+
+def _coordinates(cloud: Correspondences) -> str:
+    if len(cloud.points) == 0 or cloud.table.dtype["x"].itemsize > 4:
+        return ""
+    largest = np.abs(cloud.points).max()
+    step = float(np.spacing(np.float32(largest)))
+    if step < _FINE:
+        return ""
+    return (
+        f"coordinates of {largest:.0f} m in FLOAT32 are known to {1e3 * step:.0f} mm only: send "
+        "them as FLOAT64, or from an origin nearby"
+    )
+
+
+def _pixels(cloud: Correspondences, camera: Camera) -> str:
+    width, height = camera.size
+    limit = np.array(camera.size) - 0.5 + _SLACK
+    outside = np.any((cloud.pixels < -0.5 - _SLACK) | (cloud.pixels > limit), axis=1)
+    if not np.any(outside):
+        return ""
+    u, v = cloud.pixels[outside][0]
+    return (
+        f"{outside.sum()} of {len(outside)} pixels lie outside the {width} x {height} of "
+        f"camera_info, as ({u:.0f}, {v:.0f}): are both of the same camera and resolution?"
+    )
+
+
+def lens_is_off(lens: LensError) -> str:
+    """What to say of a calibration that lacks distortion."""
+    return (
+        f"residuals vary smoothly over the image (up to {lens.pixels:.1f} px): recalibrate the "
+        "lens; until then poses allow for it"
+    )
+
+
+class StreamResets:
+    """Remembers the stamp of the last frame and the frame of its points."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, str] | None = None
+
+    def forget(self) -> None:
+        """The next frame is the first."""
+        self._last = None
+
+    def breaks(self, stamp_ns: int, frame: str) -> dict[Notice, str]:
+        """Why the next frame cannot follow, a sentence each; it is the last one now.
+
+        Args:
+            stamp_ns: of its image.
+            frame: of its points.
+        """
+        last, self._last = self._last, (stamp_ns, frame)
+        if last is None:
+            return {}
+        last_ns, last_frame = last
+        found: dict[Notice, str] = {}
+        if stamp_ns < last_ns:
+            found[Notice.TIME_WENT_BACK] = (
+                f"the stamp {stamp_ns * 1e-9:.3f} s lies {(last_ns - stamp_ns) * 1e-9:.3f} s "
+                "before the last one; the previous frames are forgotten"
+            )
+        if frame != last_frame:
+            found[Notice.MAP_CHANGED] = (
+                f"the points are in frame {frame!r}, the last ones were in {last_frame!r}; "
+                "the previous frames are forgotten"
+            )
+        return found
+
+
+ANY_CALIBRATION = Calibration(
+    "camera", 640, 480, (500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0), (), "plumb_bob",
+    (1, 1), None,
+)  # fmt: skip
+"""Stands in until the first camera_info: kernels are compiled and settings checked before it."""
+# Something to publish before there is anything.
+_STILL = Estimate(
+    rotation=np.eye(3),
+    translation=np.zeros(3),
+    angular_velocity=np.zeros(3),
+    linear_velocity=np.zeros(3),
+    inliers=np.zeros(0, dtype=np.bool_),
+    residuals=np.zeros(0),
+    joint_covariance=np.zeros((18, 18)),
+    global_shutter_inliers=0,
+    iterations=0,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """Camera, localizer and what leads it from frame to frame, which belong together."""
+
+    calibration: Calibration
+    config: NodeConfig
+    camera: Camera
+    localizer: Localizer
+    frames: Tracker | SingleFrames
+
+    @classmethod
+    def of(cls, calibration: Calibration, config: NodeConfig) -> Self:
+        """The method of these settings.
+
+        Raises:
+            ValueError: for settings that the localizer refuses.
+        """
+        camera = calibration.camera(config.readout_time, config.scan_direction)
+        localizer = Localizer(camera, config)
+        estimates_motion = find_solver(config.solver).rolling_shutter
+        timed = config.readout_time > 0.0 and estimates_motion
+        inertial = inertial_settings(config) if timed else None
+        frames: Tracker | SingleFrames
+        if timed and config.tracking:
+            frames = Tracker(localizer, inertial)
+        else:
+            # Without a readout time frames cannot predict each other; map and lens stay the same.
+            remembers = config.tracking and estimates_motion
+            frames = SingleFrames(localizer, inertial, remembers)
+        return cls(calibration, config, camera, localizer, frames)
+
+    @property
+    def tracker(self) -> Tracker | None:
+        """None: no frame predicts the next."""
+        return self.frames if isinstance(self.frames, Tracker) else None
+
+    def middle_row_ns(self, stamp_ns: int) -> int:
+        """When the middle row of the image with this stamp was exposed."""
+        return middle_row_ns(self.config, self.camera, stamp_ns)
+
+    def warm_up(self) -> None:
+        """Compile all that it needs, from points to messages."""
+        self.localizer.warm_up()
+        so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
+        twist_at(_STILL, 0.5, 1.0)
+        so3.log(np.eye(3))
+        so3.exp_many(np.zeros((1, 3)))  # of the watch over the readout time
+        matching.warm_up()
 
 
 class FrameLocalizer:

@@ -1,17 +1,34 @@
-"""From an estimate to what is published of it: the moment, the velocities, and the body."""
+"""From an estimate to what is published of it: the moment, the velocities, and the body.
+
+With ``R = map_from_camera`` and ``p`` the camera's position, the camera's velocities ``v, w`` in
+its own axes, and the mounting ``camera_from_base`` with rotation ``C`` and translation ``r`` (where
+the base's origin is in camera axes), pose, twist and errors of ``base_frame`` are:
+
+    position   p + R r                 error  dp + theta x R r
+    rotation   R C                     error  theta, about the fixed axes of the map
+    linear     C' (v + w x r + r')     error  C' (dv + dw x r)
+    angular    C' w + u                error  C' dw
+
+``r'`` and ``u`` are the velocities of the base with respect to the camera, for a camera on a moving
+head: of its origin in camera axes, and its turn in base axes. TF carries no covariance; the
+extrinsics are treated as exact.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from rs_localizer.config import NodeConfig, OrientationCovariance
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.types import Estimate
 from rs_localizer.io.clouds import Correspondences, select_inliers
-from rs_localizer.io.outputs import Localized
-from rs_localizer.io.transforms import NotYetError, TransformError, Transforms
-from rs_localizer.pipeline.body import about_angles, base_pose, base_twist, find_mounting
+from rs_localizer.io.outputs import Localized, Pose, Twist
+from rs_localizer.io.transforms import NotYetError, Transform, TransformError, Transforms
 from rs_localizer.pipeline.pose_at_time import (
     backwards,
     either,
@@ -22,6 +39,106 @@ from rs_localizer.pipeline.pose_at_time import (
 )
 from rs_localizer.pipeline.refusal import Refusal, Waiting
 from rs_localizer.solvers.table import find_solver
+
+_LINEAR, _ANGULAR = slice(0, 3), slice(3, 6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounting:
+    """How the base hangs on the camera at one moment."""
+
+    camera_from_base: Transform
+    linear: Array  # (3,) m/s, of the base's origin with respect to the camera, in camera axes
+    angular: Array  # (3,) rad/s, of the base with respect to the camera, in base axes
+
+
+def find_mounting(
+    transforms: Transforms, camera: str, base: str, stamp_ns: int | None, span_ns: int
+) -> Mounting:
+    """The mounting at a time, from the transforms between two frames.
+
+    Args:
+        transforms: where they come from.
+        camera: optical frame of the camera.
+        base: frame of the body.
+        stamp_ns: the moment; None: the latest.
+        span_ns: of a mounting that moves, the velocity is that between half of this before and
+            half of it after; 0: it is not asked for, and zero.
+
+    Raises:
+        TransformError: when the transform is not known for that time.
+    """
+    now = transforms.lookup(camera, base, stamp_ns)
+    if stamp_ns is None or span_ns < 2 or not transforms.moves(camera, base):
+        return Mounting(now, np.zeros(3), np.zeros(3))
+    half_ns = span_ns // 2
+    before = transforms.lookup(camera, base, stamp_ns - half_ns)
+    after = transforms.lookup(camera, base, stamp_ns + half_ns)
+    seconds = 2e-9 * half_ns
+    turn = np.ascontiguousarray(before.rotation.T @ after.rotation)
+    return Mounting(
+        now, (after.translation - before.translation) / seconds, so3.log(turn) / seconds
+    )
+
+
+def base_pose(camera: Pose, mounting: Mounting) -> Pose:
+    """Pose of the base in the map, from that of the camera."""
+    lever = camera.rotation @ mounting.camera_from_base.translation
+    jacobian = np.eye(6)
+    jacobian[_LINEAR, _ANGULAR] = -so3.hat(lever)
+    return Pose(
+        position=camera.position + lever,
+        rotation=camera.rotation @ mounting.camera_from_base.rotation,
+        covariance=_propagate(jacobian, camera.covariance),
+    )
+
+
+def base_twist(camera: Twist, mounting: Mounting) -> Twist:
+    """Velocity of the base with respect to the map, in base axes, from that of the camera."""
+    base_from_camera = mounting.camera_from_base.rotation.T
+    lever = mounting.camera_from_base.translation
+    linear = camera.linear + np.cross(camera.angular, lever) + mounting.linear
+    jacobian = np.zeros((6, 6))
+    jacobian[_LINEAR, _LINEAR] = jacobian[_ANGULAR, _ANGULAR] = base_from_camera
+    jacobian[_LINEAR, _ANGULAR] = -base_from_camera @ so3.hat(lever)
+    return Twist(
+        linear=base_from_camera @ linear,
+        angular=base_from_camera @ camera.angular + mounting.angular,
+        covariance=_propagate(jacobian, camera.covariance),
+    )
+
+
+def _propagate(jacobian: Array, covariance: Array) -> Array:
+    result: Array = jacobian @ covariance @ jacobian.T
+    return 0.5 * (result + result.T)  # rounding must not cost the symmetry
+
+
+# A body that looks straight up or down has no yaw.
+_LEAST_COSINE = 0.02
+
+
+def about_angles(pose: Pose) -> Pose:
+    """The pose with the covariance of x, y, z, roll, pitch and yaw.
+
+    REP-103 means small rotations about the fixed axes of the map; an extended Kalman filter whose
+    state has roll, pitch and yaw (robot_localization) takes the numbers for errors of these angles.
+    With ``R = Rz(yaw) Ry(pitch) Rx(roll)`` a small rotation about the fixed axes is
+
+        theta = E (d_roll, d_pitch, d_yaw),   E = [Rz Ry x, Rz y, z]
+
+    Within a degree of looking straight up or down, where the angles do not say how a body is
+    turned, it is the pose as it came.
+    """
+    x_axis = pose.rotation[:, 0]  # Rz Ry x
+    level = float(np.hypot(x_axis[0], x_axis[1]))  # cosine of the pitch
+    if level < _LEAST_COSINE:
+        return pose
+    left = np.array([-x_axis[1], x_axis[0], 0.0]) / level  # Rz y
+    axes = np.column_stack([x_axis, left, [0.0, 0.0, 1.0]])
+    jacobian: Array = np.eye(6)
+    jacobian[_ANGULAR, _ANGULAR] = np.linalg.inv(axes)
+    covariance = jacobian @ pose.covariance @ jacobian.T
+    return replace(pose, covariance=0.5 * (covariance + covariance.T))
 
 
 @dataclass(frozen=True, slots=True)

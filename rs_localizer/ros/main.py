@@ -63,7 +63,7 @@ def main(args: list[str] | None = None) -> int:
 
     def load() -> Run:
         from rs_localizer.ros.localizer.node import LocalizerNode
-        from rs_localizer.ros.node.run import run
+        from rs_localizer.ros.node.managed import run
         from rs_localizer.settings import NODE_NAME
 
         return functools.partial(run, LocalizerNode, NODE_NAME)
@@ -76,7 +76,7 @@ def marker_detector(args: list[str] | None = None) -> int:
 
     def load() -> Run:
         from rs_localizer.ros.detector.markers import MarkerDetectorNode
-        from rs_localizer.ros.node.run import run
+        from rs_localizer.ros.node.managed import run
         from rs_localizer.settings import DETECTOR_NAME
 
         return functools.partial(run, MarkerDetectorNode, DETECTOR_NAME)
@@ -89,7 +89,7 @@ def feature_detector(args: list[str] | None = None) -> int:
 
     def load() -> Run:
         from rs_localizer.ros.detector.features import FeatureDetectorNode
-        from rs_localizer.ros.node.run import run
+        from rs_localizer.ros.node.managed import run
         from rs_localizer.settings import FEATURES_NAME
 
         return functools.partial(run, FeatureDetectorNode, FEATURES_NAME)

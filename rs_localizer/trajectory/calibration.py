@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -171,7 +171,7 @@ def disagreement(values: Array, deviations: Array) -> float:
     mean = np.sum(weights * values) / total
     squared = float(np.sum(weights * (values - mean) ** 2))
     freedoms = len(values) - 1
-    if chi2.sf(squared, freedoms) > _DISAGREEMENT:
+    if chdtrc(freedoms, squared) > _DISAGREEMENT:
         return 1.0
     # What the blocks disagree in is not their noise: none of them is better than the others.
     scatter = np.std(values, ddof=1) / math.sqrt(len(values))

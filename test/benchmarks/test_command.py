@@ -35,41 +35,6 @@ def test_tables_figures_and_summary(tmp_path, capsys):
         assert f"({name})" in text
 
 
-@pytest.mark.bench
-def test_same_seed_same_tables(tmp_path):
-    from benchmarks.experiments.trials import draw_trials
-
-    for folder, seed in (("a", "0"), ("b", "0"), ("c", "1")):
-        draw_trials.cache_clear()
-        words = ["translation", "--trials", "10", "--seed", seed]
-        assert main([*words, "--out", str(tmp_path / folder)]) == 0
-    a, b, c = ((tmp_path / folder / "translation.csv").read_text() for folder in "abc")
-    assert a == b
-    assert a != c
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["flight"], "no experiment 'flight'; choose from motion, translation"),
-        (["--trials", "0"], "--trials must be 1 or more"),
-        (["--seed", "-1"], "--seed 0 or more"),
-        (["--trials", "many"], "invalid int value: 'many'"),
-    ],
-)
-def test_wrong_usage(words, text, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    assert text in capsys.readouterr().err
-
-
-def test_an_output_that_is_a_file(tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert main(["translation", "--out", str(tmp_path / "file")]) == 1
-    assert "file" in capsys.readouterr().err
-
-
 def test_the_help_names_every_tool_and_none_besides(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])

@@ -38,13 +38,6 @@ def test_measurements_are_weighed_as_two_averages():
     assert nees(np.ones(2), np.diag([1.0, 4.0])) == 1.25
 
 
-def test_angles_go_round():
-    turned = Rotation.from_euler("z", 3.1).as_matrix()
-    filtered = Ekf(np.full(15, 1e-4), Pose(np.zeros(3), turned, np.eye(6)), (1.0, 1.0), 1.0)
-    filtered.correct_pose(Pose(np.zeros(3), Rotation.from_euler("z", -3.1).as_matrix(), np.eye(6)))
-    assert abs(abs(filtered.state[5]) - np.pi) < 1e-9
-
-
 @pytest.fixture(scope="module")
 def flights() -> tuple[fusion.Frames, fusion.Outputs]:
     frames = fusion.fly(8, 70, 0)

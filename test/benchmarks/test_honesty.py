@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.experiments.results import Verdict
 from benchmarks.honesty import __main__ as command
-from benchmarks.honesty import against_p3p, claims
+from benchmarks.honesty import claims
 from benchmarks.honesty.benches import Recordings, benches
 from benchmarks.honesty.estimating import Found
-from benchmarks.honesty.scores import Score, Scores, Truth, normalised, score
+from benchmarks.honesty.scores import Score, Scores, Truth, score
 from rs_localizer.io.outputs import Pose, Twist
 
 BENCHES = benches(Recordings(Path("tags"), {}, Path("nowhere")))
@@ -59,71 +59,6 @@ def test_too_small_and_too_large_covariances_are_seen(wider, verdict):
     found = {f"{motion}/all": Found(some, some) for motion in ("rest", "hand")}
     judged = {claim.name: claim.verdict for claim in claims.rendered_claims(found)}
     assert judged == {"honesty.rendered_pose": verdict, "honesty.rendered_twist": verdict}
-
-
-def test_few_frames_decide_nothing():
-    some = scores(40, 1.0)
-    (claim, _) = claims.rendered_claims({"x/all": Found(some, some)})
-    assert claim.verdict is Verdict.UNDECIDED
-
-
-def test_one_bad_condition_among_many_is_seen():
-    good, bad = scores(400, 1.0), scores(60, 0.1)
-    found = {f"good {k}": Found(good, good) for k in range(20)} | {"bad": Found(bad, bad)}
-    claim = claims.rendered_claims(found)[0]
-    assert claim.verdict is Verdict.NOT_HELD
-    assert "bad" in claim.finding
-
-
-def pair(ours: np.ndarray, p3p: np.ndarray) -> against_p3p.Pair:
-    def of(errors: np.ndarray) -> Scores:
-        return Scores(
-            [
-                Score(k, "residual") if np.isinf(error) else Score(k, orientation=error, moving=1.0)
-                for k, error in enumerate(errors)
-            ]
-        )
-
-    return against_p3p.Pair(of(ours), of(p3p))
-
-
-@pytest.mark.parametrize(
-    ("factor", "verdict"), [(0.7, Verdict.HELD), (1.5, Verdict.NOT_HELD), (1.08, Verdict.UNDECIDED)]
-)
-def test_p3p_is_compared_frame_by_frame(factor, verdict):
-    rng = np.random.default_rng(0)
-    p3p = rng.exponential(size=300)
-    ours = factor * p3p * rng.uniform(0.8, 1.2, 300)
-    judged = {c.name: c.verdict for c in claims.p3p_claims({"board/0ms/x": pair(ours, p3p)})}
-    assert judged["honesty.p3p_median"] is verdict
-    assert judged["honesty.p3p_refused"] is Verdict.HELD
-    assert judged["honesty.global_shutter"] is Verdict.HELD
-
-
-def test_more_refusals_than_p3ps_are_seen():
-    ours, p3p = np.ones(100), np.ones(100)
-    ours[:20], p3p[20:22] = np.inf, np.inf
-    judged = {c.name: c for c in claims.p3p_claims({"board/0ms/x": pair(ours, p3p)})}
-    assert judged["honesty.p3p_refused"].verdict is Verdict.NOT_HELD
-    assert "20 and 2 refused" in judged["honesty.p3p_refused"].finding
-
-
-def test_a_covariance_that_denies_an_error_is_infinitely_wrong():
-    flat = np.diag([1.0, 1.0, 0.0])
-    assert normalised(np.zeros(3), flat) == 0.0
-    assert normalised(np.array([0.0, 0.0, 1e-9]), flat) == np.inf
-    assert normalised(np.array([3.0, 4.0, 0.0]), np.diag([1.0, 4.0, 1.0])) == pytest.approx(13.0)
-
-
-def test_conditions_have_names_of_their_own():
-    for bench in BENCHES.values():
-        names = [condition.name for condition in bench.conditions]
-        assert len(set(names)) == len(names)
-    chosen = BENCHES["p3p"].matching(["board", "lens 10%", "bend 0mm", "0.1px", "5ms"])
-    faults = "board/lens 10% bend 0mm/0.1px/5ms"
-    assert [one.name for one in chosen] == [
-        f"{faults}/{told}" for told in ("unset", "set", "tracked")
-    ]
 
 
 @pytest.mark.bench

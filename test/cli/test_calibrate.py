@@ -25,29 +25,6 @@ def flight(tmp_path_factory) -> Path:
     return out
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "--map {wall}",
-        "--board 9x6 --square 0.02",
-        "--board 4x11 --square 0.02 --pattern asymmetric_circles",
-    ],
-)
-def test_what_is_looked_for_in_images(tmp_path, capsys, words):
-    """As ``detect`` has it: the images of a video are what is missing here."""
-    assert main(["markers", "make", str(tmp_path / "wall"), "--standing"]) == 0
-    video = tmp_path / "grey.avi"
-    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
-    for _ in range(5):
-        writer.write(np.full((240, 320, 3), 128, np.uint8))
-    writer.release()
-    wanted = words.format(wall=tmp_path / "wall.yaml").split()
-    assert main(["calibrate", str(video), *wanted]) == 1
-    said = capsys.readouterr()
-    assert "0 of 5 images show the map" in said.out
-    assert "Traceback" not in said.err
-
-
 def test_the_webcam(tmp_path, capsys):
     """Its images have no times of their own: refused, and written on request only."""
     out, plots = tmp_path / "webcam.yaml", tmp_path / "plots"
@@ -177,9 +154,3 @@ def test_smooth(flight, tmp_path, capsys):
     assert main(["replay", str(flight), "--smooth", "--out", str(tmp_path / "none")]) == 1
     assert "readout time" in capsys.readouterr().err
     assert main(["replay", str(flight), "--rate", "10", "--out", str(tmp_path / "none")]) == 2
-
-
-def test_readout(capsys):
-    assert main(["readout", "imx219", "1920x1080"]) == 0
-    assert "20.40" in capsys.readouterr().out
-    assert main(["readout", "no such camera"]) == 1

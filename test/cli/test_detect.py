@@ -20,7 +20,6 @@ from rs_localizer.io.recording import make_camera_info
 from rs_localizer.markers.dictionaries import pattern
 from rs_localizer.markers.map_files import write_marker_map
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.offline.image_sources import SourceError, from_bag
 from rs_localizer.pipeline.images import FrameDetector, correspondences
 from rs_localizer.settings import build, load_params_file
 
@@ -189,24 +188,6 @@ def test_georeferenced_maps_keep_their_millimetres(files, tmp_path):
     assert found.points[0] == pytest.approx([691607.966, 5334764.037, 0.0], abs=1e-6)
 
 
-def test_folder_of_images(files, tmp_path):
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for name in ("900000000000000000.png", "1000000000000000000.jpg"):
-        cv2.imwrite(str(folder / name), markers())
-    assert detect(files, str(folder), *files.map, *files.calibration) == 0
-    assert [cloud.stamp_ns for cloud in clouds(files.out)] == [9 * 10**17, 10**18]
-
-
-@pytest.mark.parametrize("name", ["1650000000000000", "1" + 29 * "0"])
-def test_other_numbers_are_no_times(files, tmp_path, capsys, name):
-    """Microseconds, and what no stamp can hold."""
-    (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), markers())
-    assert detect(files, str(tmp_path / "images"), *files.map, *files.calibration) == 2
-    assert "the names of the files are not times in ns" in capsys.readouterr().err
-
-
 def test_nothing_is_left_where_nothing_was_seen(files, tmp_path, capsys):
     other = MarkerMap(wall("5x5_50", (1, 1), 0.1, 0.1, first_id=7))
     write_marker_map(tmp_path / "map.yaml", other)
@@ -214,58 +195,6 @@ def test_nothing_is_left_where_nothing_was_seen(files, tmp_path, capsys):
     assert detect(files, str(tmp_path / "bag"), *files.map) == 1
     error = capsys.readouterr().err
     assert "none of the 1 images shows anything of the map (5x5_50); they show 5x5_50 0, " in error
-    assert not files.out.exists()
-
-
-def test_a_map_that_does_not_fit_is_told(files, tmp_path, capsys):
-    text = (tmp_path / "map.yaml").read_text()
-    path = tmp_path / "map.yaml"
-    path.write_text(text.replace("[-0.05, 0.0, 0.0]", "[-0.25, 0.0, 0.0]"))
-    assert path.read_text() != text
-    image_bag(tmp_path / "bag", [markers()])
-    assert detect(files, str(tmp_path / "bag"), *files.map) == 0
-    assert "note (1 images): the map does not fit the image" in capsys.readouterr().out
-
-
-def test_faults_end_the_command(files, tmp_path, capsys):
-    calibration = tmp_path / "camera.yaml"
-    calibration.write_text(CALIBRATION.replace("240", "480"))
-    words = [*files.calibration, *files.board, "--rate", "30"]
-    assert detect(files, files.video, *words) == 1
-    error = capsys.readouterr().err
-    assert "images are of 320x240, the calibration is for 320x480" in error
-    image_bag(tmp_path / "bag", [markers()], info=False)
-    assert detect(files, str(tmp_path / "bag"), *files.map) == 1
-    assert "no topic of type sensor_msgs/msg/CameraInfo: none" in capsys.readouterr().err
-    silent = SimpleNamespace(path=tmp_path / "bag", topics={}, messages=lambda topics: iter(()))
-    with pytest.raises(SourceError, match="bag has no message on /info; give --calibration"):
-        next(from_bag(silent, "/image", "/info", None))  # type: ignore[arg-type]
-    assert detect(files, str(tmp_path / "bag"), "--map", str(tmp_path / "none.yaml")) == 1
-    assert "none.yaml cannot be read: No such file" in capsys.readouterr().err
-    assert not files.out.exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        ((), "give --map, --board or --features"),
-        (("--board", "6x4"), "--board needs --square"),
-        (("--board", "six", "--square", "1"), "--board must be of the form 6x4, got 'six'"),
-        (("--board", "1x1", "--square", "1"), "--board: a board needs 3x3 inner corners"),
-        (("--board", "6x4", "--square", "0"), "--square: must be more than 0, got 0"),
-        (("--board", "6x4", "--square", "1"), "a video or folder has no camera_info"),
-        (("--board", "6x4", "--square", "1", "--calibration", "x"), "x cannot be read"),
-        (("--board", "6x4", "--square", "25"), "--square: chessboard 6x4 with 25 m"),
-        (("--map", "x", "--pattern", "circles"), "--pattern goes with --board"),
-        (("--map", "x", "--image", "/i", "--rate", "1"), "cannot be read"),
-        (("--rate", "0"), "--rate: must be more than 0, got 0"),
-        (("--readout-time", "7"), "--readout-time: must lie between 0 and 0.2, got 7"),
-    ],
-)
-def test_wrong_usage(files, capsys, words, text):
-    failed = "--image" in words or "--calibration" in words  # the work, not the usage
-    assert detect(files, files.video, *words) == (1 if failed else 2)
-    assert text in capsys.readouterr().err
     assert not files.out.exists()
 
 
@@ -288,12 +217,3 @@ def test_settings_are_passed_on(files, tmp_path):
     assert detect(files, files.video, *again, "--overwrite") == 0
     config = build(load_params_file(files.out / "parameters.yaml"))
     assert (config.readout_time, config.scan_direction) == (0.011, "top_to_bottom")
-
-
-def test_only_recordings_are_overwritten(files, capsys):
-    files.out.mkdir()
-    (files.out / "thesis.tex").write_text("mine")
-    words = [*files.calibration, *files.board, "--rate", "20", "--overwrite"]
-    assert detect(files, files.video, *words) == 1
-    assert "it is no earlier result, and stays as it is" in capsys.readouterr().err
-    assert (files.out / "thesis.tex").read_text() == "mine"

@@ -81,23 +81,3 @@ def test_a_bag_of_images(here, kind, width, capsys):
         assert 10 < len(read) <= 40
     with open_bag(here.out) as bag:
         assert bag.count(["/camera_info"]) == len(found) == 3
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (
-            ["--features", "orb", "--map", "wall.yaml"],
-            "--map is for markers; give it or --features",
-        ),
-        (["--features", "orb", "--min-side", "5"], "--min-side is for markers"),
-        (["--max-keypoints", "50", "--map", "wall.yaml"], "--max-keypoints goes with --features"),
-        (["--features", "surf"], "invalid choice: 'surf'"),
-        (["--features", "orb", "--max-keypoints", "3"], "must be 7 or more"),
-        (["--features", "orb", "--rate", "30"], "--rate is for videos and folders"),
-    ],
-)
-def test_wrong_usage(here, words, text, capsys):
-    assert main(["detect", here.bag, *words, "--out", str(here.out)]) == 2
-    assert text in capsys.readouterr().err
-    assert not here.out.exists()

@@ -2,7 +2,6 @@
 
 import csv
 import filecmp
-import itertools
 import os
 import shutil
 import signal
@@ -14,10 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from rs_localizer import data
 from rs_localizer.cli import batch as fleet
 from rs_localizer.cli.main import main
-from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.offline.fleet.task import Outcome, Task, perform
 
 pytest.importorskip("distributed", reason="needs Dask")
@@ -123,27 +120,6 @@ def test_results_of_another_command_stay_whatever_may_be_overwritten(recordings,
     assert f"{made} exists and is no result of replay; choose" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("undone")
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["replay", "a", "b"], "many recordings need --out DIR"),
-        (["replay", "a", "b", "--ros"], "--ros plays one recording"),
-        (["replay", "a", "--out", "o", "--workers", "0"], "must be 1 or more, got 0"),
-        (["replay", "a", "--workers", "2", "--scheduler", "tcp://h:1", "--out", "o"], "give it or"),
-        (["replay", "a", "b", "--out", "o", "-p", "solver:=magic"], "-p: solver"),
-        (["calibrate", "a", "b", "--out", "o", "--plots", "x/y"], "--plots is a name in the"),
-        (["detect", "a", "b", "--out", "o"], "give --map, --board or --features"),
-        (["evaluate", "a"], "give EST and TRUTH"),
-        (["evaluate", "a", "b", "--out", "o"], "go with --truths"),
-        (["evaluate", "a", "--truths", "t"], "many recordings need --out DIR"),
-    ],
-)
-def test_wrong_usage(words, text, capsys):
-    assert main(words) == 2
-    assert text in capsys.readouterr().err
-
-
 def test_without_dask_one_sentence_says_what_to_install(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(fleet.importlib.util, "find_spec", lambda name: None)
     assert main(["replay", "a", "b", "--out", str(tmp_path / "out")]) == 1
@@ -215,31 +191,6 @@ def test_evaluate_finds_the_truth_of_each_by_its_name(recordings, tmp_path):
     assert "poses compared\n" in (tmp_path / "out" / "one" / "log.txt").read_text()
     assert "there is no truth of" in found["two"]["reason"]
     assert not (tmp_path / "out" / "two").exists()
-
-
-@pytest.mark.usefixtures("in_process")
-def test_detect_makes_a_recording_of_each(tmp_path):
-    webcam = data.path(data.WEBCAM)
-    with open_bag(webcam) as bag, BagWriter(tmp_path / "some") as some:
-        wanted = ("/camera_info", "/image/compressed")
-        for topic, recorded, message in itertools.islice(bag.messages(wanted), 6):
-            some.write(topic, message, recorded)
-    shutil.copytree(tmp_path / "some", tmp_path / "more")
-    words = [str(tmp_path / "some"), str(tmp_path / "more"), "--board", "6x4", "--square", "0.03"]
-    assert main(["detect", *words, "--out", str(tmp_path / "out")]) == 0
-    for name, row in rows(tmp_path / "out").items():
-        assert row["with corners"] == row["images"]
-        assert float(row["corners"]) == 24.0
-        with open_bag(tmp_path / "out" / name) as bag:
-            assert bag.count(["/correspondences"]) == int(row["images"]) > 1
-
-
-@pytest.mark.usefixtures("in_process")
-def test_calibrate_tells_of_each_what_it_lacks(recordings, tmp_path):
-    """Seven images are too few, and say so; what can be calibrated with has tests of its own."""
-    assert main(["calibrate", *recordings[:2], "--out", str(tmp_path / "out")]) == 1
-    assert {row["state"] for row in rows(tmp_path / "out").values()} == {"failed"}
-    assert all("images" in row["reason"] for row in rows(tmp_path / "out").values())
 
 
 def test_ctrl_c_leaves_whole_results_only_and_the_next_run_goes_on(recordings, tmp_path):

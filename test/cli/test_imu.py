@@ -10,7 +10,6 @@ import pytest
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagError, BagWriter, open_bag
-from rs_localizer.io.estimates import read_motions
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.recording import write_frame
@@ -55,18 +54,6 @@ def test_a_recording_holds_readings_and_where_they_were_taken(tmp_path):
         assert 9.0 < np.linalg.norm(reading.linear_acceleration or 0.0) < 10.6
     stamps = [recorded_ns for _, recorded_ns, _ in messages]
     assert stamps == sorted(stamps)
-
-
-def test_a_vibration_is_in_the_truth(tmp_path):
-    angular = []
-    for name, words in (("still", ()), ("shaken", ("--vibration", "0.3", "60"))):
-        assert simulate(tmp_path / name, *TURN, *words) == 0
-        twists = read_motions(tmp_path / name, "/truth/pose", "/truth/twist").twists
-        assert twists is not None
-        angular.append(twists.angular)
-    shaking = np.linalg.norm(angular[1] - angular[0], axis=1)
-    most = np.radians(0.3) * 2.0 * np.pi * 60.0
-    assert 0.8 * most < shaking.max() <= 1.02 * most
 
 
 def test_replay_uses_it_and_says_so(tmp_path, capsys):

@@ -3,7 +3,6 @@
 import json
 import shutil
 import struct
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -275,10 +274,3 @@ def test_bad_files_are_told_of_in_one_line(tmp_path, capsys):
         refused(told, reference_sfm=broken)
     assert localize(files, "-p", "readout:=1") == 2
     assert localize(files, "--row", "third") == 2
-
-
-def test_without_h5py_it_says_what_to_install(tmp_path, capsys, monkeypatch):
-    files = make(tmp_path, motions(1))
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    assert localize(files) == 1
-    assert "h5py is not installed: pip install h5py (the extra hloc" in capsys.readouterr().err

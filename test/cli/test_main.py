@@ -208,25 +208,6 @@ def test_signals_while_a_command_is_imported(tmp_path, number, slow):
     assert errors == "rs_localizer replay: interrupted\n"
 
 
-def test_sigterm_ends_a_running_command_in_one_line(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rs_localizer", "simulate", "bag", "--duration", "3000"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(rs_localizer.__file__).parents[1])},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    while not list(tmp_path.glob(".unfinished-*/bag")):
-        assert process.poll() is None
-        time.sleep(0.02)
-    time.sleep(0.5)
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (143, "rs_localizer simulate: interrupted\n")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_ctrl_c_while_a_command_runs_leaves_nothing_in_the_way(tmp_path):
     words = ["simulate", "bag", "--duration", "3000"]
     process = subprocess.Popen(

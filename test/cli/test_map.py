@@ -42,19 +42,3 @@ def test_a_model_of_colmap_becomes_a_file(tmp_path, capsys, form):
     assert main(words) == 1
     assert "exists; choose another OUT, or --overwrite" in capsys.readouterr().err
     assert main([*words, "--overwrite"]) == 0
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "text"),
-    [
-        (["map"], 2, "the following arguments are required: ACTION"),
-        (["map", "fly"], 2, "invalid choice: 'fly'"),
-        (["map", "convert", "a.ply", "b.obj"], 2, "OUT must end in .npz or .ply or .yaml"),
-        (["map", "convert", "a.ply", "b.npz", "--text"], 2, "--text goes with .ply"),
-        (["map", "info", "nowhere.ply"], 1, "No such file or directory: 'nowhere.ply'"),
-        (["map", "info", str(COLMAP / "truth.json")], 1, "truth.json is not a marker map"),
-    ],
-)
-def test_what_is_refused(words, code, text, capsys):
-    assert main(words) == code
-    assert text in capsys.readouterr().err

@@ -10,9 +10,8 @@ from rs_localizer.cli import UsageError
 from rs_localizer.cli.main import main
 from rs_localizer.cli.map.build import add_imu_arguments, imu_of
 from rs_localizer.io.bags import BagWriter, open_bag
-from rs_localizer.io.imu_files import ImuFileError
+from rs_localizer.io.imu import ImuFileError
 from rs_localizer.offline.image_sources import SourceError
-from rs_localizer.settings import build, load_params_file, write_parameters
 
 
 def given(images: Path, *words: str) -> argparse.Namespace:
@@ -81,12 +80,3 @@ def test_a_video_may_have_a_file_beside_it(tmp_path):
         imu_of(given(video, "--imu"))
     with pytest.raises(ImuFileError, match="cannot be read"):
         imu_of(given(video, "--imu", "/imu"))
-
-
-def test_the_offset_of_stamps_is_a_parameter(tmp_path):
-    path = tmp_path / "parameters.yaml"
-    shutter = {"readout_time": 0.03, "scan_direction": "bottom_to_top", "imu.time_offset": 0.005}
-    write_parameters(path, shutter)
-    config = build(load_params_file(path))
-    assert config.imu.time_offset == 0.005
-    assert config.readout_time == 0.03

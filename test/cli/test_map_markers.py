@@ -96,17 +96,3 @@ def test_refine_and_survey_what_was_simulated(tmp_path, capsys):
     refused([*again, "--hold", "1", "2", "999999"], 2, "no landmark 999999", capsys)
     refused([*again, "-p", "readout_time:=0.0", "--shutter", "given"], 2, "needs -p", capsys)
     refused(["refine", str(tmp_path), "--out", "a.obj"], 2, "--out must end in", capsys)
-
-
-def test_what_survey_refuses(tmp_path, capsys):
-    base = ["survey", str(tmp_path / "none"), "--out", str(tmp_path / "wall.yaml")]
-    sized = [*base, "--family", "4x4_50", "--size", "0.1"]
-    refused(sized, 1, "does not exist", capsys)
-    refused([*base, "--family", "5x9", "--size", "0.1"], 2, "unknown family '5x9'", capsys)
-    refused([*base, "--family", "4x4_50", "--size", "3:0.1"], 2, "size of all other", capsys)
-    refused([*base, "--family", "4x4_50", "--size", "-1"], 2, "must be metres", capsys)
-    refused([*sized, "--family", "4x4_100"], 2, "share their patterns", capsys)
-    refused([*sized, "--origin", "77"], 2, "have no id 77", capsys)
-    (tmp_path / "none").mkdir()
-    refused(sized, 2, "give --calibration", capsys)
-    assert not (tmp_path / "wall.yaml").exists()

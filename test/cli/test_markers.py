@@ -39,29 +39,6 @@ def test_pages_of_others_are_not_overwritten(tmp_path, capsys):
     assert not (tmp_path / "wall_1.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (("--family", "4x5_50"), "unknown family '4x5_50'"),
-        (("--grid", "10x10"), "4x4_50 has the ids 0 to 49, found 50"),
-        (("--grid", "0x1"), "--grid must be of the form 6x4, got '0x1'"),
-        (("--grid", "two"), "--grid must be of the form 6x4, got 'two'"),
-        (("--gap", "0.001"), "each needs a white rim of a cell"),
-        (("--square", "0.1"), "--square is for a board"),
-        (("--chessboard", "6x4", "--size", "0.1"), "--size is for a grid"),
-        (("--chessboard", "6x4", "--family", "4x4_50"), "--family is for markers"),
-        (("--chessboard", "2x2"), "a board needs 3x3 inner corners"),
-        (("--charuco", "5x7", "--marker", "0.1"), "do not fit into squares"),
-        (("--size", "0"), "--size: must be more than 0"),
-        (("--page", "a5"), "invalid choice: 'a5'"),
-    ],
-)
-def test_wrong_usage(tmp_path, capsys, words, text):
-    assert make(tmp_path / "wall", *words) == 2
-    assert text in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_problems_of_a_map_are_named(tmp_path, capsys):
     assert make(tmp_path / "wall", "--grid", "2x1", "--size", "0.05", "--gap", "0.03") == 0
     path = tmp_path / "wall.yaml"

@@ -90,25 +90,6 @@ def test_transforms_explain_every_pixel(flight, tmp_path):
         assert np.median(np.hypot(seen[0] - u, seen[1] - v)) < 0.25
 
 
-def test_images_of_the_recording_go_with_them(tmp_path, capsys):
-    walls = tmp_path / "walls"
-    words = ["--images", "--duration", "0.1", "--width", "320", "--height", "240", "--focal", "250"]
-    assert main(["simulate", str(walls), *words, "--readout-time", "0.02"]) == 0
-    seen = tmp_path / "seen"
-    marker_map = str(walls / "marker_map.yaml")
-    assert main(["detect", str(walls), "--map", marker_map, "--images", "--out", str(seen)]) == 0
-    params = ["--params", str(seen / "parameters.yaml")]
-    assert main(["replay", str(seen), *params, "--out", str(tmp_path / "a"), "--nerfstudio"]) == 0
-    told = json.loads((tmp_path / "a" / "transforms.json").read_text())
-    for frame in told["frames"]:
-        assert (tmp_path / "a" / frame["file_path"]).read_bytes().startswith(b"\xff\xd8")
-    assert "are not in the recording" not in capsys.readouterr().out
-    assert main(["replay", str(walls), "--nerfstudio", "--ros"]) == 2
-    assert main(["replay", str(seen), "--smooth", "--rate", "100", "--nerfstudio"]) == 2
-    assert main(["replay", str(seen), "--row", "0.7"]) == 2
-    assert "must be first, middle, last, or a row time" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

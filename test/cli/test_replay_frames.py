@@ -130,42 +130,6 @@ def test_transforms_come_out(record, tmp_path):
         assert turn.magnitude() < 1e-8
 
 
-def test_frames_that_odometry_does_not_reach_are_counted(record, tmp_path, capsys):
-    bag = record([("/tf", tf("odom", CAMERA, (0.0, 0.0, 0.0), TURN, 10**12))])
-    replayed(bag, tmp_path / "out", "-p", "publish_tf:=map_to_odom")
-    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines()[:4])
-    assert rows["localized"] == str(FRAMES)
-    assert int(rows["without a transform on /tf"]) >= FRAMES - 1
-
-
-@pytest.mark.parametrize(
-    ("transforms", "text"),
-    [
-        ([], "frame 'base_link' does not exist; there are none (found no topic "),
-        (
-            [("/tf_static", tf("base_link", "lidar", LEVER, TURN))],
-            "frame {camera!r} does not exist; there are base_link, lidar (found /tf_static)",
-        ),
-        (
-            [
-                ("/tf_static", tf("base_link", "lidar", LEVER, TURN)),
-                ("/tf", tf("mast", CAMERA, LEVER, TURN)),
-            ],
-            "frames 'base_link' and {camera!r} are not connected (found /tf_static and /tf)",
-        ),
-    ],
-)
-def test_a_mounting_that_the_recording_does_not_have(record, tmp_path, capsys, transforms, text):
-    bag = record(transforms)
-    arguments = ["replay", str(bag), "--out", str(tmp_path / "out"), "-p", "base_frame:=base_link"]
-    assert main(arguments) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    where = "does not say where the camera 'camera_optical_frame' is in base_frame 'base_link': "
-    assert f"{bag} {where}{text.replace('{camera!r}', repr(CAMERA))}" in error
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_old_recording(record, tmp_path):
     # ROS 1 before tf2: another type, slashes before the names, and the mounting on /tf.
     store = get_typestore(Stores.ROS1_NOETIC)

@@ -14,9 +14,8 @@ from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.simulation.frames import FrameSettings, simulate_frames
-from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
@@ -115,25 +114,6 @@ def test_a_recording_of_everything(flight, tmp_path, capsys):
     )
     assert len(one) == len(other) - 2
     assert np.allclose(one.positions, other.positions[2:], atol=0.01)
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "text"),
-    [
-        (["keypoints"], 1, "has /cam/keypoints and no map; give one with --map"),
-        (["keypoints", "--map", "nowhere.npz"], 1, "map_file: nowhere.npz cannot be read: No"),
-        (["keypoints", "--map", "x.npz", "--ros"], 2, "--smooth, -p are for offline replay"),
-        (["all", "--keypoints", "/a", "--correspondences", "/b"], 2, "not both"),
-        (["all", "--keypoints", "/nowhere"], 1, "topic /nowhere does not exist"),
-        (["all", "--keypoints", "/ids", "--map-points", "/x"], 1, "topic /x does not exist"),
-    ],
-)
-def test_what_is_refused(flight, tmp_path, capsys, words, code, text):
-    bag, *more = words
-    out = [] if "--ros" in more else ["--out", str(tmp_path / "out")]
-    assert main(["replay", str(flight / bag), *more, *out]) == code
-    assert text in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_simulated_recording_and_its_map(tmp_path, monkeypatch, capsys):

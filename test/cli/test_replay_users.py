@@ -11,9 +11,7 @@ import pytest
 import rs_localizer.cli.replay as replay_command
 from rs_localizer.cli.main import main
 from rs_localizer.cli.replay_result import Tally, figures, print_summary
-from rs_localizer.io.bags import BagWriter
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.recording import write_image
 from rs_localizer.trajectory.readout_equations import MeasuredReadout
 
 FRAMES = 8
@@ -40,14 +38,6 @@ def test_the_summary_says_how_good_the_poses_are(flight, tmp_path, capsys):
     assert rows["tracked from the frame before"] == f"{(FRAMES - 1) / FRAMES:.1%}"
 
 
-def test_an_impossible_readout_time_is_warned_of(flight, tmp_path, capsys):
-    words = ["-p", "readout_time:=0.04", "--out", str(tmp_path / "out")]
-    assert main(["replay", str(flight), *words]) == 0
-    assert "warning: the readout time of 40 ms is longer than the 33.33 ms from image" in (
-        capsys.readouterr().out
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "text"),
     [("film.mp4", "is a video"), ("one.PNG", "is an image"), ("folder", "is a folder of 2 images")],
@@ -64,15 +54,6 @@ def test_images_are_sent_to_detect(tmp_path, capsys, name, text):
     error = capsys.readouterr().err
     assert f"{path} {text}, not matches: first run: rs_localizer detect {path} --map" in error
     assert "--calibration camera.yaml" in error
-
-
-def test_a_bag_of_images_is_sent_to_detect(tmp_path, capsys):
-    with BagWriter(tmp_path / "bag") as bag:
-        write_image(bag, "/image", 10**9, "png", b"")
-    assert main(["replay", str(tmp_path / "bag")]) == 1
-    error = capsys.readouterr().err
-    assert f"bag holds images, not matches: first run: rs_localizer detect {tmp_path}/bag" in error
-    assert "--calibration" not in error
 
 
 @pytest.mark.parametrize("before", [False, True])

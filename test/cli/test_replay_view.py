@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.cli import replay
 from rs_localizer.cli.main import main
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.estimates import read_motions
@@ -93,36 +92,6 @@ def test_nothing_else_changes(flight, shown, tmp_path):
     for name in ("poses.txt", "twists.txt", "result/result.mcap"):
         assert filecmp.cmp(tmp_path / "plain" / name, shown[0] / name, shallow=False)
     assert not (tmp_path / "plain" / "view.rrd").exists()
-
-
-def test_a_name_of_one_s_own_is_in_the_current_directory(flight, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["replay", str(flight), *SHUTTER, "--out", "out", "--rerun", "view.rrd"]) == 0
-    assert (tmp_path / "view.rrd").is_file()
-    assert not (tmp_path / "out" / "view.rrd").exists()
-
-
-def test_a_file_that_cannot_be_written_is_one_line(flight, tmp_path, capsys):
-    words = ["--out", str(tmp_path / "out"), "--rerun", str(tmp_path / "no" / "where.rrd")]
-    assert main(["replay", str(flight), *SHUTTER, *words]) == 1
-    assert "where.rrd cannot be written: No such file" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_wrong_usage(capsys):
-    assert main(["replay", "--rerun", "flight", "other"]) == 2
-    assert "--rerun FILE must end in .rrd, got flight (a recording" in capsys.readouterr().err
-    assert main(["replay", "a", "b", "--out", "o", "--view"]) == 2
-    assert "--rerun and --view show one recording" in capsys.readouterr().err
-
-
-def test_without_the_sdk_one_sentence_says_what_to_install(monkeypatch, flight, capsys):
-    monkeypatch.setattr(replay.importlib.util, "find_spec", lambda name: None)
-    assert main(["replay", str(flight), "--view"]) == 1
-    assert capsys.readouterr().err == (
-        "rs_localizer replay: --rerun and --view need the Rerun SDK, which is not installed: "
-        "pip install 'rs_localizer[view]'\n"
-    )
 
 
 def test_without_a_screen_nothing_begins(monkeypatch, flight, tmp_path, capsys):

@@ -53,41 +53,6 @@ def test_bag_holds_frames_and_their_truth(tmp_path, storage):
     assert len(set(read_correspondences(clouds[0]).table["id"])) == 150
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "expected"),
-    [
-        (["--trajectory", "absent.txt"], 1, "absent.txt does not exist"),
-        (["--trajectory", "tum_vi_room5", "--linear-velocity", "1", "0", "0"], 2, "not both"),
-        (["--outliers", "1.5"], 2, "--outliers: must lie between 0 and 1, got 1.5"),
-        (["--distortion", "0.1"], 2, "--distortion: plumb_bob takes 0 or 4 or 5 coefficients"),
-        (["--distortion", "0.1", "nan"], 2, "--distortion: must be a number, got 'nan'"),
-        (["--focal", "0"], 2, "--focal: must be more than 0, got 0"),
-        (["--width", "0"], 2, "--width: must be 2 or more, got 0"),
-        (["--height", "-5"], 2, "--height: must be 2 or more, got -5"),
-        (["--noise", "-1"], 2, "--noise: must be 0 or more, got -1"),
-        (["--noise", "inf"], 2, "--noise: must be a number, got 'inf'"),
-        (["--points", "0"], 2, "--points: must be 1 or more, got 0"),
-        (["--seed", "-1"], 2, "--seed: must be 0 or more, got -1"),
-        (["--start", "-1"], 2, "--start: must be 0 or more, got -1"),
-        (["--duration", "nan"], 2, "--duration: must be a number, got 'nan'"),
-        (["--duration", "0"], 2, "--duration: must be more than 0, got 0"),
-        (["--knot-spacing", "-1"], 2, "--knot-spacing: must be 0 or more, got -1"),
-        (["--readout-time", "0.3"], 2, "--readout-time: must lie between 0 and 0.2, got 0.3"),
-        (["--linear-velocity", "1", "x", "0"], 2, "--linear-velocity: must be a number, got 'x'"),
-        (["--focal", "1e7"], 1, "none of the 300 frames sees any point"),
-        (["--duration", "0.001"], 1, "no frame lies within"),
-        (["--rate", "0"], 2, "--rate: must be more than 0, got 0"),
-        (["--scan-direction", "up"], 2, "invalid choice: 'up'"),
-        (["--points", "many"], 2, "--points: must be a whole number, got 'many'"),
-    ],
-)
-def test_faults(tmp_path, words, code, expected, capsys):
-    assert simulate(tmp_path / "bag", *words) == code
-    assert expected in capsys.readouterr().err
-    assert not (tmp_path / "bag").exists()
-    assert not (tmp_path / "bag").exists()
-
-
 def test_the_next_command_has_the_shutter(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ("--readout-time", "0.025", "--scan-direction", "bottom_to_top", "--duration", "0.2")

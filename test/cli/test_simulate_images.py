@@ -92,23 +92,3 @@ def detect(image: np.ndarray) -> dict[int, np.ndarray]:
         )
         found[int(number)] = refined[:, 0].astype(np.float64)
     return found
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["--images", "--points", "30"], "--points is for points; images have --grey-noise"),
-        (["--images", "--noise", "2"], "--noise is for points"),
-        (["--exposure", "0.01"], "--exposure is for images; give --images, too"),
-        (["--grey-noise", "2"], "--grey-noise is for images"),
-        (["--walls", "room"], "--walls is for images"),
-        (["--images", "--walls", "four"], "invalid choice: 'four'"),
-        (["--images", "--exposure", "-1"], "--exposure: must be 0 or more, got -1"),
-        (["--images", "--vignetting", "2"], "--vignetting: must lie between 0 and 1, got 2"),
-        (["--images", "--quality", "0"], "--quality: must lie between 1 and 100, got 0"),
-    ],
-)
-def test_faults(tmp_path, words, expected, capsys):
-    assert main(["simulate", str(tmp_path / "bag"), *words]) == 2
-    assert expected in capsys.readouterr().err
-    assert not (tmp_path / "bag").exists()

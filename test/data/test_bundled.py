@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.data import GLOBAL_SHUTTER_TAGS, SLOW_HAND_MOTION
+from benchmarks.data import GLOBAL_SHUTTER_TAGS
 from rs_localizer import data
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.camera_info import read_camera_info
@@ -49,14 +49,6 @@ def test_hand_motion():
     assert len(split_at_gaps(trajectory)) == 14
 
 
-def test_slow_hand_motion():
-    trajectory = read_tum(SLOW_HAND_MOTION)
-    assert len(trajectory) == 3000
-    speeds = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    seconds = np.diff(trajectory.stamps_ns) * 1e-9
-    assert np.median(speeds / seconds) == pytest.approx(0.33, abs=0.1)
-
-
 def test_global_shutter_tags():
     with open_bag(GLOBAL_SHUTTER_TAGS) as bag:
         (info, *_) = (message for _, _, message in bag.messages(["/camera/camera_info"]))
@@ -83,8 +75,3 @@ def test_everything_is_attributed_and_small():
             text = (folder / "ATTRIBUTION.md").read_text()
             licences = ("CC BY 4.0", "CC0", "Apache License, Version 2.0")
             assert any(licence in text for licence in licences)
-
-
-def test_missing_data_is_named():
-    with pytest.raises(FileNotFoundError, match=r"absent is missing: .*installed without its data"):
-        data.path("absent")

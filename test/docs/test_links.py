@@ -43,10 +43,6 @@ def test_every_page_can_be_reached_from_the_readme():
     assert reached == set(pages.NAMES)
 
 
-def test_the_readme_is_short():
-    assert len(pages.text("README.md").splitlines()) <= 140
-
-
 def test_modules_that_the_architecture_names_exist():
     modules = {n for n in pages.names_in(pages.prose("docs/architecture.md")) if n.endswith(".py")}
     assert len(modules) > 20

@@ -12,7 +12,7 @@ from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.health import State
 from rs_localizer.settings import Kind, settings
 from rs_localizer.solvers.table import SOLVERS, find_solver
@@ -82,8 +82,8 @@ def test_the_topics_of_the_localizer():
     assert sent == {name: kind.replace("/msg/", "/") for name, kind in TYPES.items()}
 
 
-def test_the_diagram_of_the_readme_has_every_topic():
-    (diagram,) = pages.fenced("README.md", "mermaid")
+def test_the_diagram_of_the_node_has_every_topic():
+    (diagram,) = pages.fenced("docs/node.md", "mermaid")
     unused: Any = None
     for name in Feed(unused, unused, unused, unused).topics():
         assert name in diagram

@@ -138,20 +138,6 @@ def test_an_impossible_prior_is_refused_with_what_was_found(arguments, said):
         Prior(**arguments)
 
 
-@pytest.mark.parametrize(
-    ("part", "value"),
-    [
-        ("rotation", np.eye(3).ravel()),
-        ("translation", 0.0),
-        ("translation", np.zeros(2)),
-        ("angular_velocity", np.zeros((3, 1))),
-    ],
-)
-def test_a_prior_motion_of_the_wrong_shape_is_refused(part, value):
-    with pytest.raises(ValueError, match=f"the prior motion's {part} must be of shape"):
-        Prior(motion=replace(motion(), **{part: value}), covariance=np.eye(12))
-
-
 @pytest.mark.parametrize("size", [12, 18])
 def test_a_motion_of_which_nothing_is_known_adds_and_replaces_nothing(size):
     prior = Prior(motion=motion(), covariance=np.diag(np.full(size, np.inf)))

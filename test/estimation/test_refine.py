@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.core.state import step_between
 from rs_localizer.estimation.prior_terms import held_terms, motion_terms
 from rs_localizer.estimation.refine import (
     apply_step,
@@ -147,13 +146,6 @@ def test_the_inverse_and_the_eigenvalue_do_not_depend_on_units():
     assert smallest_eigenvalue(units @ matrix @ units) == pytest.approx(smallest, rel=1e-6)
 
 
-def test_a_step_between_states_leads_from_one_to_the_other(scene):
-    first = scene.state_of(scene.frame(seed=1)[1])
-    step = 0.3 * np.random.default_rng(0).normal(size=18)
-    second = apply_step(first, step)
-    np.testing.assert_allclose(step_between(first, second), step, atol=1e-12)
-
-
 @pytest.mark.parametrize("size", [1, 12, 18, 54])
 def test_the_inverse_is_numpy_s_also_where_parameters_are_held(size):
     rng = np.random.default_rng(size)
@@ -167,15 +159,3 @@ def test_the_inverse_is_numpy_s_also_where_parameters_are_held(size):
     np.testing.assert_allclose(found[np.ix_(~held, ~held)], free, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(np.diag(found)[held], 1e-18, rtol=1e-9)
     np.testing.assert_array_equal(found, found.T)
-
-
-def test_a_search_holds_the_accelerations(scene):
-    camera, motion, points, true, _ = scene.frame(speed=0.1, count=40)
-    start = apply_step(scene.state_of(motion), 0.01 * np.ones(12))
-    state, information, *_ = refine(
-        scene.pack(camera, points, true), start, camera.row_time_gradient, 1e3, 0.0, NO_PRIOR,
-        1e-3, 1, 30, 1e-6,
-    )  # fmt: skip
-    assert information.shape == (12, 12)
-    assert not state[18:].any()
-    assert distance(scene, state, motion) < 1e-7

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation import packing, residuals
 from rs_localizer.estimation.refine import apply_step
 
@@ -26,56 +25,6 @@ def test_the_error_is_measured_at_the_row_where_the_model_puts_the_point(scene, 
     np.testing.assert_allclose(np.sqrt(found), expected, rtol=0.02)
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_the_jacobian_is_the_finite_difference_of_the_forward_projection(scene, direction):
-    camera, motion, points, true, _ = scene.frame(direction, acceleration=0.2)
-    state, h = scene.state_of(motion), 1e-5
-    columns = []
-    for k in range(18):
-        ahead, behind = (
-            project_rolling(
-                camera, scene.motion_of(apply_step(state, sign * h * np.eye(18)[k])).at_rows, points
-            )[0]
-            for sign in (1, -1)
-        )
-        columns.append((ahead - behind) / (2 * h))
-    jacobian = np.stack(columns, axis=-1)  # (n,2,18)
-    information, slope = np.empty((18, 18)), np.empty(18)
-    residuals.normal_equations(
-        scene.pack(camera, points, true), state, camera.row_time_gradient, 100.0, 0.0,
-        2, information, slope,
-    )  # fmt: skip
-    expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-6
-    )
-    shift = np.array([0.01, -0.02])  # a small error, so that the slope is not zero
-    residuals.normal_equations(
-        scene.pack(camera, points, true + shift), state, camera.row_time_gradient, 100.0, 0.0,
-        2, information, slope,
-    )  # fmt: skip
-    np.testing.assert_allclose(
-        slope / scale, np.einsum("nci,c->i", jacobian, -shift) / scale, atol=1e-3
-    )
-
-
-def test_a_search_looks_at_the_measured_row_and_finds_nearly_the_same_derivatives(scene):
-    camera, motion, points, true, measured = scene.frame(noise=1.0)
-    state, found = scene.state_of(motion), []
-    for pixels, looks, size in ((measured, 1, 12), (measured, 2, 18), (true, 2, 18)):
-        information, slope = np.empty((size, size)), np.empty(size)
-        residuals.normal_equations(
-            scene.pack(camera, points, pixels), state, camera.row_time_gradient, 100.0, 0.0,
-            looks, information, slope,
-        )  # fmt: skip
-        found.append(information[:12, :12])
-    once, twice, noise_free = found
-    scale = np.sqrt(np.outer(np.diag(noise_free), np.diag(noise_free)))
-    assert 1e-5 < np.abs((once - twice) / scale).max() < 0.02
-    np.testing.assert_allclose(once / scale, noise_free / scale, atol=0.02)
-
-
 def test_the_cost_of_a_still_camera_is_that_of_one_that_hardly_moves(scene):
     camera, motion, points, _, measured = scene.frame(speed=0.05, noise=1.0)
     still, creeping = scene.state_of(motion), scene.state_of(motion)
@@ -86,35 +35,6 @@ def test_the_cost_of_a_still_camera_is_that_of_one_that_hardly_moves(scene):
     assert 2500 < cost < 2500 * len(points)
     assert cost == pytest.approx(
         residuals.truncated_cost(data, creeping, gradient, 50.0, np.inf), rel=1e-9
-    )
-
-
-def test_the_derivative_by_the_angular_velocity_is_that_of_the_exponential(scene):
-    """Large turns, where the right Jacobian of the exponential matters, without the row's part."""
-    camera, motion, points, true, _ = scene.frame(speed=0.5, acceleration=0.5)
-    state, h, gradient = scene.state_of(motion), 1e-6, np.zeros(2)
-
-    def errors(s):
-        rays, tau = camera.rays(true), camera.row_time(true)
-        rotations, translations = scene.motion_of(s).at_rows(tau)
-        seen = np.einsum("nij,nj->ni", rotations, points) + translations
-        by_ray = camera.pixel_jacobian(rays)
-        return np.einsum("nij,nj->ni", by_ray, seen[:, :2] / seen[:, 2:] - rays)
-
-    jacobian = np.stack(
-        [
-            (errors(apply_step(state, h * e)) - errors(apply_step(state, -h * e))) / (2 * h)
-            for e in np.eye(18)
-        ],
-        axis=-1,
-    )
-    information, slope = np.empty((18, 18)), np.empty(18)
-    residuals.normal_equations(scene.pack(camera, points, true), state, gradient, 100.0, 0.0,
-                               2, information, slope)  # fmt: skip
-    expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-7
     )
 
 

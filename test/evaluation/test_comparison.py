@@ -70,15 +70,6 @@ def results(recording) -> dict[str, Result]:
     }
 
 
-def test_recording_is_read_as_a_whole_or_in_part(tmp_path):
-    assert main(["simulate", str(tmp_path / "bag"), "--duration", "0.5"]) == 0
-    whole, part = load_recording(tmp_path / "bag"), load_recording(tmp_path / "bag", 4)
-    assert (len(whole.clouds), len(part.clouds)) == (15, 4)
-    assert len(whole.camera_infos) == 15
-    assert None not in whole.camera_infos
-    assert part.stamps_ns == whole.stamps_ns[:4]
-
-
 def test_errors_and_counts(recording, results):
     good, bad = results["good"], results["bad"]
     assert good.errors is not None

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rs_localizer.features import methods
-from rs_localizer.features.extraction import FeatureExtractor, Features
-from rs_localizer.features.methods import FeatureError
+from rs_localizer.features import extraction
+from rs_localizer.features.extraction import FeatureError, FeatureExtractor, Features
 
 # OpenCV 5 has AKAZE in its contrib modules only.
 KINDS = [
@@ -111,8 +110,8 @@ def test_small_images(kind, shape):
 
 
 def test_what_opencv_does_not_have_is_said(monkeypatch):
-    monkeypatch.delattr(methods.cv2, "AKAZE", raising=False)
-    monkeypatch.delattr(methods.cv2, "xfeatures2d", raising=False)
+    monkeypatch.delattr(extraction.cv2, "AKAZE", raising=False)
+    monkeypatch.delattr(extraction.cv2, "xfeatures2d", raising=False)
     with pytest.raises(FeatureError, match="has no AKAZE: take sift or orb, or install"):
         FeatureExtractor("akaze", 100)
     with pytest.raises(FeatureError, match="features must be one of sift, orb, akaze; got 'surf'"):

@@ -147,14 +147,6 @@ def test_the_end_of_the_range_is_noticed():
         assert buffer.between(START + 650 * MS, START + 680 * MS)
 
 
-def test_rest_and_steady_turns_are_no_end_of_a_range():
-    for rate in (0.0, 1.5):
-        buffer = ReadingBuffer()
-        for time in stamps(100):
-            buffer.add(time, "imu", (rate, 0.0, 0.0))
-        assert buffer.between(START + 50 * MS, START + 80 * MS)
-
-
 def test_memory_is_bounded():
     times = stamps(20_000)
     buffer = filled(times)

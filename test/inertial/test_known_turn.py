@@ -42,11 +42,6 @@ def test_rotations_are_the_integral_of_the_rates():
         np.testing.assert_allclose(rotation, integrated(spline, tau), atol=1e-7)
 
 
-def test_no_turn_is_the_identity():
-    turn = KnownTurn.of(TAU, np.zeros((len(TAU), 3)))
-    np.testing.assert_array_equal(turn.at_rows(ROWS)[0], np.broadcast_to(np.eye(3), (7, 3, 3)))
-
-
 def test_a_parabola_leaves_nothing():
     rates = np.column_stack([1.0 + TAU, TAU**2, 0.0 * TAU])
     # A natural spline is none at its ends; a cubic through many samples is one in the middle.

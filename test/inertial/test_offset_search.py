@@ -61,11 +61,6 @@ def test_a_hand_alone_is_left_to_the_filter():
     assert not tracker._aid.wants_sight()
 
 
-def test_a_given_offset_is_not_searched():
-    recorded = record(Camera(), rest, Rich(), (1, 2), 5)
-    assert not followed(tracker_of(recorded, estimated=False), recorded, 2)[0][0]
-
-
 def test_a_reset_begins_anew():
     motion = partial(shaken_hand, shaking=((0.3, 60.0),))
     recorded = record(Camera(), motion, Rich(), (1, 20), 5)

@@ -142,14 +142,6 @@ def test_what_is_no_recording_is_refused(tmp_path, name, content, expected):
         pass
 
 
-def test_directories_that_are_no_recording(tmp_path):
-    with pytest.raises(BagError, match=r"no metadata.yaml and 0 files"), open_bag(tmp_path):
-        pass
-    (tmp_path / "metadata.yaml").write_text("{: not yaml")
-    with pytest.raises(BagError, match="cannot be read"), open_bag(tmp_path):
-        pass
-
-
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("keep", [0.2, 0.6, 0.95])
 def test_truncated_recording(tmp_path, storage, keep):

@@ -21,12 +21,6 @@ def test_presentation_times_from_one_second_on():
     assert clock.fault() is None
 
 
-def test_a_start_by_a_clock_of_the_world_is_told_to_the_millisecond():
-    clock = ImageClock(rate=30.0, start_ns=1520531495575280000)
-    clock.relative(0)
-    assert "the first image at 1520531495.575 s" in clock.told()
-
-
 def test_a_rate_overrides_and_is_compared():
     clock = ImageClock(rate=30.0, start_ns=5 * 10**9)
     stamps = [clock.relative(ms * MS) for ms in OWN]
@@ -41,11 +35,6 @@ def test_a_rate_overrides_and_is_compared():
     without = ImageClock(rate=30.0)
     assert without.relative(None) == 10**9
     assert without.fault() is None
-
-
-def test_the_first_of_a_video_that_starts_later_is_the_origin():
-    clock = ImageClock(start_ns=0)
-    assert [clock.relative(ms * MS) for ms in (500, 533)] == [0, 33 * MS]
 
 
 def test_names_are_times_unless_an_origin_is_given():

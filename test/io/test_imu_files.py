@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.io.imu_files import ImuFileError, read_imu_csv
+from rs_localizer.io.imu import ImuFileError, read_imu_csv
 
 HEAD = "#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z\n"
 LINE = "1403636579758555392,-0.1,0.14,0.07,8.12,-0.3,-3.7\n"
@@ -45,12 +45,3 @@ def test_what_is_wrong_is_said(tmp_path, text, said):
     with pytest.raises(ImuFileError, match=said) as caught:
         read_imu_csv(path)
     assert str(path) in str(caught.value)
-
-
-def test_files_that_are_none(tmp_path):
-    with pytest.raises(ImuFileError, match="cannot be read: No such file"):
-        read_imu_csv(tmp_path / "none.csv")
-    path = tmp_path / "picture.csv"
-    path.write_bytes(b"\x89PNG\r\n\xff\xfe")
-    with pytest.raises(ImuFileError, match="no text file"):
-        read_imu_csv(path)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.io.bags import make_message
-from rs_localizer.io.clouds import EmptyCloudError, make_cloud
+from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.keypoints import read_keypoints, read_map
 from rs_localizer.io.messages import MessageError
 
@@ -98,17 +98,6 @@ def test_rows_that_are_not_finite_are_dropped_and_counted(name):
     assert len(read) == COUNT - 1
 
 
-def test_landmarks_that_are_not_finite():
-    message = cloud(("x", "f4"), ("y", "f4"), ("z", "f4"), ("id", "u4"))
-    data = message.data.copy()
-    data.reshape(COUNT, -1)[1:4, :4] = np.array([np.inf], "<f4").view(np.uint8)
-    message.data = data
-    assert (len(read_map(message)), read_map(message).dropped) == (3, 3)
-    data.reshape(COUNT, -1)[:, :4] = np.array([np.inf], "<f4").view(np.uint8)
-    with pytest.raises(MessageError, match="no landmarks"):
-        read_map(message)
-
-
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
@@ -127,39 +116,3 @@ def test_bad_keypoints(fields, text):
     rows = np.zeros(2, list(fields))
     with pytest.raises(MessageError, match=text):
         read_keypoints(make_cloud(make_message, 0, "camera", rows))
-
-
-@pytest.mark.parametrize(
-    ("fields", "text"),
-    [
-        ((*XYZ,), "neither a field id nor descriptor; found x, y, z"),
-        ((*UV, ("id", "u4")), "no field x, y, z; found u, v, id"),
-        ((*XYZ, ("id", "u4")), "1 ids stand for several landmarks each, the first of them is 0"),
-    ],
-)
-def test_bad_landmarks(fields, text):
-    rows = np.zeros(2, list(fields))
-    with pytest.raises(MessageError, match=text):
-        read_map(make_cloud(make_message, 0, "map", rows))
-
-
-def test_other_bad_clouds():
-    message = cloud(*XYZ, ("id", "u4"), frame="")
-    with pytest.raises(MessageError, match=r"frame_id is empty; it must name the frame of x, y, z"):
-        read_map(message)
-    assert len(read_keypoints(cloud(*UV, ("id", "u4"), frame=""))) == COUNT
-    message = cloud(*UV, BITS)
-    message.fields[2].count = 2**32 - 1
-    with pytest.raises(MessageError, match="'descriptor' ends at byte"):
-        read_keypoints(message)
-    message.width = 2**31
-    with pytest.raises(MessageError, match="truncated"):
-        read_keypoints(message)
-    message.width = 0
-    with pytest.raises(EmptyCloudError):
-        read_keypoints(message)
-    # A wrong descriptor is nobody's business who does not read it.
-    far = np.zeros(2, [*XYZ, ("u", "f4"), ("v", "f4"), ("id", "u4"), ("descriptor", "i4")])
-    far["x"], far["id"] = 1e10, (1, 2)
-    with pytest.raises(MessageError, match=r"within 1e\+09 m"):
-        read_map(make_cloud(make_message, 0, "map", far[["x", "y", "z", "id"]].copy()))

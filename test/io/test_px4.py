@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.io.outputs import Localized, Pose, Twist
-from rs_localizer.io.px4 import vehicle_odometry
+from rs_localizer.pipeline.px4 import vehicle_odometry
 
 UP = {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}
 # Numbers of the message: PX4-Autopilot, msg/versioned/VehicleOdometry.msg.
@@ -47,31 +47,6 @@ def test_east_north_up_becomes_north_east_down():
     assert fields["pose_frame"] == NED
     np.testing.assert_allclose(fields["position"], [2.0, 1.0, -3.0])
     assert attitude(fields) == pytest.approx((0.0, 0.0, 90.0))  # it looks east
-
-
-def test_a_map_without_north_only_turns_over():
-    fields = vehicle_odometry(localized((1.0, 2.0, 3.0), yaw=30.0), "frd", 0, 0)
-    assert fields["pose_frame"] == FRD
-    np.testing.assert_allclose(fields["position"], [1.0, -2.0, -3.0])
-    assert attitude(fields) == pytest.approx((0.0, 0.0, -30.0), abs=1e-4)  # left is against it
-
-
-def test_what_is_not_known_is_nan():
-    fields = vehicle_odometry(localized(), "ned", 0, 0)
-    for name in ("velocity", "angular_velocity", "velocity_variance"):
-        assert np.isnan(fields[name]).all()
-    assert np.isfinite(fields["position"]).all()
-
-
-def test_variances_go_with_their_axes():
-    deviations = (0.1, 0.2, 0.3, 0.01, 0.02, 0.03)  # east, north, up; turns about them
-    level = vehicle_odometry(localized(pose_deviations=deviations), "ned", 0, 0)
-    np.testing.assert_allclose(level["position_variance"], [0.04, 0.01, 0.09], rtol=1e-6)
-    # It looks east: its roll is a turn about east, its pitch one about north.
-    np.testing.assert_allclose(level["orientation_variance"], [1e-4, 4e-4, 9e-4], rtol=1e-6)
-    turned = vehicle_odometry(localized(pose_deviations=deviations, yaw=90.0), "ned", 0, 0)
-    np.testing.assert_allclose(turned["position_variance"], [0.04, 0.01, 0.09], rtol=1e-6)
-    np.testing.assert_allclose(turned["orientation_variance"], [4e-4, 1e-4, 9e-4], rtol=1e-6)
 
 
 def test_variances_are_those_of_the_errors():

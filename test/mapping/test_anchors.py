@@ -47,15 +47,6 @@ def test_markers_that_are_off_are_named():
     assert "mm (rms) off their map" in placement.doubt
 
 
-def test_corners_that_are_not_seen_do_not_count():
-    points = back(WALL.points)
-    points[8:] = np.nan
-    assert placed(Anchors(WALL), points).similarity.scale == pytest.approx(TO_MAP.scale)
-    points[3:] = np.nan
-    with pytest.raises(MappingError, match="3 corners"):
-        placed(Anchors(WALL), points)
-
-
 def test_a_wrong_marker_map_is_refused():
     points = back(WALL.points)
     points[:4] += 0.5
@@ -91,9 +82,3 @@ def test_points_that_are_missing_are_named():
     anchors = Anchors(None, sights("a", "b"), (Distance("a", "b", 3.0),))
     with pytest.raises(MappingError, match="two images or more"):
         placed(anchors, np.full((2, 3), np.nan))
-
-
-def test_nothing_known_leaves_the_scale():
-    placement = placed(Anchors(), np.zeros((0, 3)))
-    assert not placement.scaled
-    assert placement.similarity.scale == 1.0

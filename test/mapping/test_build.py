@@ -130,18 +130,6 @@ def test_the_refinement_lowers_the_noise(built):
     assert built.refined.after < 0.6 * built.refined.before
 
 
-def test_each_stage_tells_how_far_it_is(built, stages):
-    assert set(stages) == {"extract", "match", "map", "track", "refine"}
-    assert min(stages.values()) > 0
-
-
-def test_the_report_says_it(built, views):
-    page = written(built, 60, views)
-    assert "| scale | " in page
-    assert "corners of markers" in page
-    assert "![map.png](map.png)" in page
-
-
 def test_the_report_says_what_an_imu_says(built, views):
     felt = Felt.random(0)
     metres = inertial_metres(refined_of(felt), imu_of(felt))

@@ -18,10 +18,6 @@ from rs_localizer.simulation.walls import collage
 K = np.array([[260.0, 0.0, 161.0], [0.0, 255.0, 118.0], [0.0, 0.0, 1.0]])
 
 
-def test_few_images_are_matched_each_with_each():
-    assert len(pairs_of(20)) == 20 * 19 // 2
-
-
 def test_of_many_images_neighbours_are_matched_and_some_with_all():
     pairs = set(pairs_of(300))
     assert len(pairs) < 300 * 20
@@ -62,11 +58,6 @@ def test_the_lens_of_a_part_of_the_sensor():
     np.testing.assert_allclose(
         part.project(point)[0], [fx * 0.1 + cx - 0.5, fy * -0.05 + cy - 0.5], atol=1e-9
     )
-
-
-def test_a_lens_that_colmap_does_not_know():
-    with pytest.raises(ValueError, match="the lens has 12"):
-        colmap_parameters(Camera(320, 240, K, np.full(12, 1e-3), "rational_polynomial"))
 
 
 def build(images: Path, folder: Path, count: int) -> colmap.Structure:

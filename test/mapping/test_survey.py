@@ -53,15 +53,6 @@ def test_markers_are_where_they_are(spotted, poses):
     assert all(marker.size == pytest.approx(SIZE) for marker in found.markers)
 
 
-def test_another_origin_and_the_readout_time(spotted, poses):
-    found = survey(camera(0.0), spotted, MARKERS, origin=2, stamp_offset=0.0)
-    assert found.markers[0].id == 2
-    np.testing.assert_allclose(found.markers[0].pose.position, 0.0, atol=1e-12)
-    deviation = found.fit.readout_time_deviation
-    assert abs(found.fit.state.readout_time - READOUT) < 4.0 * deviation < 4e-3
-    check(found, poses, 0.03)
-
-
 def only(spotted: list[Spotted], kept: list[set[int]]) -> list[Spotted]:
     """Each image shows one of these sets of markers, in turn, as far as it does."""
     parts = []

@@ -50,14 +50,6 @@ def test_of_a_long_one_the_sharpest_four_a_second_are():
     assert np.mean([values[row] for row in rows]) > np.mean(values) + 0.2
 
 
-def test_the_image_is_kept_for_colmap(tmp_path):
-    image = np.asarray(PICTURE[:240, :320])
-    view = Looker(100, tmp_path).look(Image(7, "camera", image))
-    kept = cv2.imread(str(view.image), cv2.IMREAD_GRAYSCALE)
-    assert kept is not None
-    assert np.abs(kept.astype(int) - image).mean() < 1.0
-
-
 def test_a_camera_that_stands_still_is_refused_early(tmp_path):
     looker = Looker(300, tmp_path)
     images = [np.asarray(PICTURE[20:500, x : x + 640]) for x in (0, 1, 2, 1, 0)]

@@ -154,21 +154,3 @@ def field(number: object, turn: str) -> str:
 def test_broken_json(tmp_path, text, said):
     with pytest.raises(MarkerMapError, match=said):
         read_any(written(tmp_path, text, "a.json"), Unsaid(size=SIZE))
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("a: [", "is not a YAML file"),
-        ("a: 1", "is not a marker map of a known format .*: it has a"),
-        ("bodies: 3", "bodies cannot be 3"),
-        ("bodies: [{a: {tags: [{id: 1, pose: {}}]}}]", r"\(id 1\) has no size"),
-        ("bodies: []", "none of its static bodies has tags with a pose"),
-        ("standalone_tags: []", "standalone tags have no place"),
-        ("tag_bundles: [{layout: [{id: 1}]}]", "has no size"),
-        ("tag_bundles: [{layout: [{id: 1, size: -1}]}]", "size must be a length"),
-    ],
-)
-def test_broken_yaml(tmp_path, text, said):
-    with pytest.raises(MarkerMapError, match=said):
-        read_any(written(tmp_path, text))

@@ -124,25 +124,6 @@ def test_faults_of_markers(tmp_path, entry, text):
 
 
 @pytest.mark.parametrize(
-    ("entry", "text"),
-    [
-        (CHESSBOARD | {"type": "rings"}, r"board 1 \(rings\): type must be one of chess"),
-        (CHESSBOARD | {"type": "circles"}, r"board 1 \(circles\) has no spacing"),
-        (CHESSBOARD | {"columns": 2}, "needs 3x3 inner corners, got 2x4"),
-        (CHESSBOARD | {"columns": 10**9}, "may be 200 squares wide and high, got 1000000000x4"),
-        (CHARUCO | {"rows": 10**9}, "may be 200 squares wide and high, got 3x1000000000"),
-        (CHESSBOARD | {"columns": 2.5}, "columns cannot be 2.5"),
-        (CHARUCO | {"marker": 0.05}, "markers of 0.05 m do not fit into squares of 0.04 m"),
-        (CHARUCO | {"first_id": 95}, "needs the ids 95 to 100; 5x5_100 has 0 to 99"),
-        (CHARUCO | {"family": "5x6"}, "unknown family '5x6'"),
-    ],
-)
-def test_faults_of_boards(tmp_path, entry, text):
-    with pytest.raises(MarkerMapError, match=text):
-        read(tmp_path, {"map_frame": "map", "boards": [entry]})
-
-
-@pytest.mark.parametrize(
     ("tree", "text"),
     [
         ({"map_frame": "map", "markers": []}, "neither markers nor boards"),

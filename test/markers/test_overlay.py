@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.core.camera import Camera
 from rs_localizer.markers.detection import Detections, Seen
 from rs_localizer.markers.maps import MarkerMap, wall
-from rs_localizer.markers.overlay import CameraPath, draw_detections, draw_world
+from rs_localizer.markers.overlay import CameraPath, draw_world
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
 READOUT = 0.03
@@ -78,33 +78,3 @@ def test_a_pose_of_another_instant_is_brought_to_each_row():
     mask = drawn(path, 10**9)
     for marker in MAP.markers:
         assert all(near(mask, rolling(corner)) for corner in marker.corners)
-
-
-def test_a_pose_without_a_twist_misses_them():
-    still = CameraPath(10**9, POSITION, FACING, np.zeros(3), np.zeros(3))
-    mask = drawn(still, 10**9)
-    assert not all(near(mask, rolling(c)) for m in MAP.markers for c in m.corners)
-
-
-def test_outlines_tell_what_is_used():
-    found = detections()
-    item = found.markers[0]
-    seen = Seen(item.family, item.ids, item.quads, item.found, np.array([True, False]))
-    image = np.full((480, 640), 128, np.uint8)
-    picture = draw_detections(
-        image,
-        Detections(*(found.ids, found.points, found.pixels, found.scores), (seen,), (), (), ()),
-    ).astype(int)
-    left, right = (quad[2:].mean(axis=0).round().astype(int) for quad in item.quads)
-
-    def color(pixel: Any) -> Any:
-        x, y = pixel
-        patch = picture[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3)
-        return patch[np.argmax(np.ptp(patch, axis=1))]
-
-    assert np.argmax(color(left)) == 0  # blue
-    assert np.argmin(color(right)) == 0  # orange
-    # What is not used is crossed out, besides.
-    inside = [quad.mean(axis=0) * 0.6 + quad[1] * 0.4 for quad in item.quads]
-    assert np.ptp(color(inside[0].round().astype(int))) == 0
-    assert np.ptp(color(inside[1].round().astype(int))) > 50

@@ -1,6 +1,5 @@
 """Matches against plain loops; what passes, what is kept, what is refused."""
 
-import re
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from rs_localizer.config import Matching
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.matching import Matcher, MatchError
+from rs_localizer.matching import Matcher
 from rs_localizer.matching.descriptors import Visible, make_index
 
 
@@ -145,37 +144,6 @@ def test_the_mutual_check_and_the_best_of_several():
     assert matched(matcher, given, mutual=False) == {1: 0, 2: 1}
     # The same distance twice: the first.
     assert matched(matcher, keypoints(2, descriptors=bits(2, 2))) == {0: 0}
-
-
-@pytest.mark.parametrize(
-    ("landmarks", "points", "settings", "text"),
-    [
-        (
-            {"ids": np.arange(2)},
-            {"descriptors": bits(0, 1)},
-            {},
-            "by descriptor or id: the keypoints have descriptors of 4 x uint8, the map has ids",
-        ),
-        ({"ids": np.arange(2)}, {"ids": np.arange(2)}, {"by": "descriptor"}, "by descriptor: "),
-        ({}, {"ids": np.arange(2)}, {}, "the keypoints have ids, the map has neither"),
-        (
-            {"descriptors": bits(0, 1)},
-            {"descriptors": np.zeros((2, 64), np.uint8)},
-            {},
-            "the keypoints have descriptors of 64 x uint8, the map has descriptors of 4 x uint8",
-        ),
-        (
-            {"descriptors": bits(0, 1)},
-            {"descriptors": np.zeros((2, 4), np.float32)},
-            {},
-            "the keypoints have descriptors of 4 x float32, the map has",
-        ),
-    ],
-)
-def test_what_cannot_be_compared(landmarks, points, settings, text):
-    matcher = Matcher(make_map(2, **landmarks))
-    with pytest.raises(MatchError, match=re.escape(text)):
-        matcher.match(keypoints(2, **points), Matching(**settings))
 
 
 def test_bytes_are_numbers_where_the_map_has_numbers():

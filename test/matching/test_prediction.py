@@ -12,9 +12,8 @@ from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation.prior import Prior
 from rs_localizer.io.keypoints import Keypoints
 from rs_localizer.io.maps.landmarks import Map
-from rs_localizer.matching import Matcher
+from rs_localizer.matching import Matcher, find_view, predict
 from rs_localizer.matching.descriptors import Visible
-from rs_localizer.matching.prediction import find_view, predict
 from rs_localizer.simulation.scene import room
 
 K = np.array([[400.0, 0.0, 319.5], [0.0, 410.0, 239.5], [0.0, 0.0, 1.0]])
@@ -93,26 +92,6 @@ def test_a_prediction_tells_apart_what_looks_the_same(points, mutual):
     assert len(found) > 150
     assert np.mean(found.landmarks == shown[found.keypoints]) > 0.95
     assert len(set(found.landmarks.tolist())) == len(found)
-
-
-@pytest.mark.parametrize(("in_view", "everywhere"), [(3_000, False), (40_000, True)])
-def test_where_too_much_is_in_view_all_landmarks_are_compared(in_view, everywhere):
-    """To predict and to look near 40,000 landmarks takes longer than to compare 500 with all."""
-    rng = np.random.default_rng(2)
-    view = camera("ideal")
-    still = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    prior = Prior(motion=still, covariance=1e-10 * np.eye(12))
-    pixels = rng.uniform([0, 0], [639, 479], (in_view, 2))
-    count = 40_000
-    depths = np.where(np.arange(count) < in_view, 3.0, -3.0)  # the others are behind
-    rays = np.resize(view.rays(pixels), (count, 2))
-    points = depths[:, None] * np.column_stack([rays, np.ones(count)])
-    descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
-    shown = rng.permutation(in_view)[:500]
-    misplaced = 0.5 * pixels[shown]  # not where they are predicted
-    given = Keypoints(0, misplaced, None, descriptors[shown], None, 0)
-    found = Matcher(Map(points, None, descriptors, "map")).match(given, Matching(), view, prior)
-    assert (len(found) == 500) == everywhere
 
 
 @pytest.mark.parametrize(("seen", "whole"), [(40_000, True), (400, False)])

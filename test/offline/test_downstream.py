@@ -19,13 +19,12 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.outputs import Localized, messages
-from rs_localizer.io.px4 import vehicle_odometry
 from rs_localizer.io.recording import CAMERA_FRAME, write_frame
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.offline.replay import TF_TYPE, find_topics, find_transforms, replay
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.jumps import Jumps
+from rs_localizer.pipeline.px4 import Jumps, vehicle_odometry
 from rs_localizer.settings import build, load_params_file
 
 CONFIG = Path(__file__).parents[2] / "config"

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -24,14 +23,13 @@ from rs_localizer.core.types import Estimate
 from rs_localizer.io.bags import make_message
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.outputs import Localized, Pose, Twist, messages
-from rs_localizer.io.transforms import Transform, TransformError, TransformTree, read_transform
+from rs_localizer.io.transforms import Transform, TransformError, TransformTree
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.body import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.published import base_pose, base_twist, find_mounting
 from rs_localizer.pipeline.refusal import Refusal
 
-Make = Callable[..., SimpleNamespace]
 READOUT_TIME = 0.03
 STAMP_NS = 5_000_000_000
 # Axes of the optical frame (right, down, forward) in a body's (forward, left, up): REP-103.
@@ -185,7 +183,7 @@ class KnowsTheMotion(Localizer):
 
 @pytest.fixture(autouse=True)
 def known_motion(monkeypatch) -> None:
-    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", KnowsTheMotion)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", KnowsTheMotion)
 
 
 @pytest.fixture
@@ -298,27 +296,6 @@ def as_matrix(item: Broadcast) -> Array:
     return matrix(item.parent_from_child.translation, item.parent_from_child.rotation)
 
 
-@pytest.mark.bench
-def test_covariances_cover_what_is_published(localize, robot):
-    # No derivative at all: the scatter of poses and twists of many disturbed motions.
-    frame = localized(localize(robot))
-    truth = Chain(estimate(), middle=5.0 + 0.5 * READOUT_TIME)
-    errors = np.random.default_rng(3).multivariate_normal(
-        np.zeros(18), 0.01 * estimate().joint_covariance, size=3000
-    )
-    assert frame.twist is not None
-    for function, found in (
-        (truth.pose_error, 0.01 * frame.pose.covariance),
-        (truth.twist_error, 0.01 * frame.twist.covariance),
-    ):
-        scatter = np.array([function(5.0, error) for error in errors])
-        squares = np.einsum("ni,ij,nj->n", scatter, np.linalg.inv(found), scatter)
-        # Chi-square of six degrees of freedom: mean 6, and 5 % beyond 12.59.
-        assert np.mean(squares) == pytest.approx(6.0, abs=0.3)
-        assert np.mean(squares > 12.59) == pytest.approx(0.05, abs=0.016)
-        assert np.array_equal(found, found.T)
-
-
 @pytest.mark.parametrize("pose_time", list(PoseTime))
 def test_a_camera_on_a_moving_head(localize, robot, pose_time):
     truth = Panning(estimate(), middle=5.0 + 0.5 * READOUT_TIME)
@@ -374,25 +351,6 @@ def test_laws():
         assert not same(there[index], original)
 
 
-def test_the_twist_is_the_screw_of_the_motion():
-    # expm of the body's twist is the motion of the body: another way to the same velocities.
-    twist = Twist(np.array([0.3, -0.1, 0.2]), np.array([0.4, 0.5, -0.6]), np.eye(6))
-    by = Transform(turned("x", 40.0), np.array([0.2, -0.3, 0.5]))
-    tree = TransformTree()
-    tree.add(tf("camera", "base", matrix(by.translation, by.rotation)), static=True)
-    found = base_twist(twist, find_mounting(tree, "camera", "base", None, 0))
-
-    def screw(linear: Array, angular: Array) -> Array:
-        result = np.zeros((4, 4))
-        result[:3, 3] = linear
-        result[:3, :3] = logm(Rotation.from_rotvec(angular).as_matrix())
-        return result
-
-    mounting = matrix(by.translation, by.rotation)
-    expected = np.linalg.inv(mounting) @ expm(screw(twist.linear, twist.angular)) @ mounting
-    assert np.allclose(expm(screw(found.linear, found.angular)), expected, atol=1e-12)
-
-
 def test_a_missing_transform_refuses_the_frame_only(localize):
     tree = TransformTree()
     refused, _ = localize(tree)
@@ -417,26 +375,6 @@ def test_a_missing_transform_refuses_the_frame_only(localize):
         assert np.allclose(frame.pose.position, expected[:3, 3], atol=1e-12)
 
 
-def test_without_a_base_frame_nothing_is_looked_up(localize):
-    for name in ("", "camera"):
-        frame = localized(localize(None, base_frame=name))
-        assert frame.body_frame == "camera"
-    frame, config = localize(None, base_frame="", publish_tf="map_to_camera")
-    direct = broadcast(frame, config, TransformTree())
-    assert (direct.parent, direct.child) == ("map", "camera")
-    assert np.allclose(direct.parent_from_child.translation, frame.pose.position)
-    assert broadcast(frame, NodeConfig(), TransformTree()) is None
-
-
-def test_odometry_straight_to_the_camera(localize, robot):
-    robot.add(
-        tf("odom", "base_link", matrix([1.0, 2.0, 0.0], turned("z", 30.0)), 5.0), static=False
-    )
-    results = [localize(robot, base_frame=n, publish_tf="map_to_odom") for n in ("", "base_link")]
-    corrections = [broadcast(frame, config, robot) for frame, config in results]
-    assert np.allclose(*map(as_matrix, corrections), atol=1e-12)
-
-
 def test_odometry_that_is_missing_costs_no_pose(localize, robot):
     frame, config = localize(robot, publish_tf="map_to_odom")
     assert frame
@@ -457,15 +395,3 @@ def test_a_stamp_of_zero(localize, robot, pose_time):
     assert frame.stamp_ns == (0 if pose_time == PoseTime.STAMP else -10_000_000)
     with pytest.raises(TransformError, match=r"header.stamp of the input is zero"):
         broadcast(frame, config, robot)
-
-
-def test_transforms_that_are_none():
-    good = tf("a", "b", BASE_FROM_MAST).transforms[0].transform
-    read = read_transform(good)
-    assert np.allclose(matrix(read.translation, read.rotation), BASE_FROM_MAST, atol=1e-15)
-    good.rotation.w = float("nan")
-    with pytest.raises(TransformError, match="not a rotation"):
-        read_transform(good)
-    good.rotation.w, good.translation.x = 1.0, float("inf")
-    with pytest.raises(TransformError, match="not finite"):
-        read_transform(good)

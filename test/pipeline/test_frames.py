@@ -1,6 +1,5 @@
 """From message to pose: refusals and their reasons, times, changes of camera and settings."""
 
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import LocalizerConfig, NodeConfig, PoseTime, VelocityPrior
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -29,8 +28,6 @@ from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.simulation.scene import room
 from rs_localizer.simulation.true_motion import ConstantVelocity
-
-Make = Callable[..., SimpleNamespace]
 
 FIELDS = [(name, 8 * i, 8) for i, name in enumerate("xyzuv")]
 READOUT_TIME = 0.03
@@ -91,7 +88,7 @@ class MockLocalizer(Localizer):
 @pytest.fixture
 def mock(monkeypatch) -> type[MockLocalizer]:
     MockLocalizer.made = []
-    monkeypatch.setattr(rs_localizer.pipeline.method, "Localizer", MockLocalizer)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Localizer", MockLocalizer)
     return MockLocalizer
 
 
@@ -148,62 +145,6 @@ def test_inliers_are_the_rows_that_were_kept(make_cloud_message, make_camera_inf
     # Of 1, 2, 4, 5, 6, 7 every second one.
     assert frame.inliers["x"].tolist() == [1.0, 4.0, 6.0]
     assert frame.inliers["residual"].tolist() == [1.0, 4.0, 6.0]
-
-
-@pytest.mark.usefixtures("mock")
-@pytest.mark.parametrize("stamp", [(5, 0), (0, 0)])
-@pytest.mark.parametrize("stamp_offset", [0.0, 0.004, -0.02])
-@pytest.mark.parametrize("pose_time", list(PoseTime))
-@pytest.mark.parametrize("direction", list(ScanDirection))
-@pytest.mark.parametrize("region", [None, (40, 100, 320, 300)])
-def test_pose_and_twist_are_those_of_the_published_time(
-    make_cloud_message, make_camera_info, stamp, stamp_offset, pose_time, direction, region
-):
-    frames = FrameLocalizer(
-        NodeConfig(
-            readout_time=READOUT_TIME,
-            scan_direction=direction,
-            stamp_offset=stamp_offset,
-            pose_time=pose_time,
-        )
-    )
-    x, y, width, height = region or (0, 0, 0, 0)
-    roi = SimpleNamespace(x_offset=x, y_offset=y, width=width, height=height)
-    frames.calibrate(read_camera_info(make_camera_info(roi=roi)))
-    rows = [[1.0, 2.0, 3.0, 100.0, 200.0]] * 8
-    message = make_cloud_message(rows, FIELDS, point_step=40, stamp=stamp)
-    frame = localized(frames.localize(message))
-
-    # Lines that the shutter passes from the first one that is delivered to the middle of the
-    # sensor, whose exposure is tau = 0.
-    width, height = (width, height) if region else (640, 480)
-    lines = {
-        "top_to_bottom": (239.5 - y) / 479,
-        "bottom_to_top": (y + height - 1 - 239.5) / 479,
-        "left_to_right": (319.5 - x) / 639,
-        "right_to_left": (x + width - 1 - 319.5) / 639,
-    }[direction]
-    middle = stamp[0] + stamp_offset + READOUT_TIME * lines
-    published = frame.stamp_ns * 1e-9
-    if pose_time == PoseTime.STAMP:
-        assert frame.stamp_ns == frame.input_stamp_ns == stamp[0] * 1_000_000_000
-    else:
-        assert published == pytest.approx(middle, abs=1e-9)
-
-    def pose(seconds: float) -> tuple[Array, Array]:
-        rotation, translation = MOTION.at((seconds - middle) / READOUT_TIME)
-        return rotation.T, -rotation.T @ translation
-
-    rotation, position = pose(published)
-    assert np.allclose(frame.pose.rotation, rotation, atol=1e-6)
-    assert np.allclose(frame.pose.position, position, atol=1e-6)
-    step = 1e-5
-    before, after = pose(published - step), pose(published + step)
-    assert frame.twist is not None
-    linear = rotation.T @ (after[1] - before[1]) / (2 * step)
-    angular = Rotation.from_matrix(before[0].T @ after[0]).as_rotvec() / (2 * step)
-    assert np.allclose(frame.twist.linear, linear, atol=1e-5)
-    assert np.allclose(frame.twist.angular, angular, atol=1e-5)
 
 
 @pytest.mark.usefixtures("mock")

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose, Twist
-from rs_localizer.pipeline.jumps import Jumps
+from rs_localizer.pipeline.px4 import Jumps
 
 PERIOD = 1 / 30
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rs_localizer.pipeline.method
+import rs_localizer.pipeline.frames
 from rs_localizer.config import Matching, NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import make_message
@@ -19,8 +19,7 @@ from rs_localizer.matching import Matcher
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
@@ -98,23 +97,6 @@ def test_the_true_pose(frames, make_camera_info, names, tracking):
             assert [inlier[name] for name in "xyz"] == point.astype(np.float32).tolist()
             assert inlier["u"] in frame.pixels[:, 0].astype(np.float32)
         assert result.estimate.tracked == (tracking and frame is not frames[0])
-
-
-def test_by_id_and_by_correspondences_is_the_same(frames, make_camera_info):
-    """Keypoints by id are correspondences that are put together here."""
-    one, other = localizer(make_camera_info), localizer(make_camera_info)
-    one.use_map(read_map(map_cloud(LANDMARKS)))
-    for frame in frames[:4]:
-        rows = np.zeros(len(frame.ids), [(n, "<f8") for n in "xyz"] + [("u", "<f4"), ("v", "<f4")])
-        for name, column in zip("xyzuv", [*frame.points.T, *frame.pixels.T], strict=True):
-            rows[name] = column
-        expected = localized(
-            other.localize(make_cloud(make_message, frame.stamp_ns, "map", rows)), frame
-        )
-        found = localized(one.localize_keypoints(keypoints(frame, "id")), frame)
-        assert found.pose.position.tolist() == expected.pose.position.tolist()
-        assert found.pose.covariance.tolist() == expected.pose.covariance.tolist()
-        assert found.inliers["residual"].tolist() == expected.inliers["residual"].tolist()
 
 
 def test_a_map_that_is_missing_and_comes_late(frames, make_camera_info):
@@ -212,7 +194,7 @@ def test_a_wrong_prediction_is_found_out(frames, make_camera_info, monkeypatch):
             asked.append(arguments[3] is not None)
             return super().match(*arguments)
 
-    monkeypatch.setattr(rs_localizer.pipeline.landmarks, "Matcher", Asked)
+    monkeypatch.setattr(rs_localizer.pipeline.frames, "Matcher", Asked)
     node = localizer(make_camera_info)
     node.use_map(read_map(map_cloud(LANDMARKS)))
     for frame in frames[:3]:

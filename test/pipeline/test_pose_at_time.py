@@ -132,15 +132,6 @@ def test_twist_is_the_rate_of_change_of_the_pose(rate, tau):
     assert np.allclose([*result.linear, *result.angular], expected, rtol=1e-6, atol=2e-6)
 
 
-def test_many_rows_are_single_rows():
-    motion, taus = estimate(0.5, acceleration=0.1, shake=0.003), np.array([-0.5, 0.0, 0.37])
-    rotations, translations = motion.at_rows(taus)
-    for tau, rotation, translation in zip(taus, rotations, translations, strict=True):
-        map_from_camera, position = pose(motion, tau)
-        assert np.allclose(rotation.T, map_from_camera, atol=1e-13)
-        assert np.allclose(-rotation.T @ translation, position, atol=1e-13)
-
-
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("rate", RATES)
 def test_pose_covariance(rate, tau):
@@ -178,37 +169,6 @@ def test_covariances_of_an_uneven_motion(acceleration, shake, tau):
         scale = np.sqrt(np.diag(expected))
         assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale),
                            atol=0.005)  # fmt: skip
-
-
-def test_covariances_cover_what_is_published():
-    # No derivative at all: the scatter of poses and twists of many disturbed motions.
-    motion, tau = estimate(0.5, acceleration=0.01, shake=0.003), -0.5
-    rng = np.random.default_rng(3)
-    errors = rng.multivariate_normal(
-        np.zeros(3 * len(DEVIATIONS)), 0.01 * motion.joint_covariance, size=4000
-    )
-    poses = np.array([pose_error(motion, tau, error) for error in errors])
-    now = twist(motion, tau)
-    twists = np.array([twist(disturbed(motion, error), tau) - now for error in errors])
-    for scatter, covariance in (
-        (poses, 0.01 * pose_at(motion, tau).covariance),
-        (twists, 0.01 * twist_at(motion, tau, READOUT_TIME).covariance),
-    ):
-        squares = np.einsum("ni,ij,nj->n", scatter, np.linalg.inv(covariance), scatter)
-        # Chi-square of six degrees of freedom: mean 6, and 5 % beyond 12.59.
-        assert np.mean(squares) == pytest.approx(6.0, abs=0.25)
-        assert np.mean(squares > 12.59) == pytest.approx(0.05, abs=0.015)
-
-
-@pytest.mark.parametrize("tau", TAUS)
-def test_covariances_are_symmetric(tau):
-    motion = estimate(0.5)
-    for covariance in (
-        pose_at(motion, tau).covariance,
-        twist_at(motion, tau, READOUT_TIME).covariance,
-    ):
-        assert np.array_equal(covariance, covariance.T)
-        assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
 
 
 def test_an_uncertain_readout_time_enters_both_covariances():

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
 from rs_localizer.io.transforms import TransformTree
-from rs_localizer.pipeline.body import about_angles
-from rs_localizer.pipeline.published import of_body
+from rs_localizer.pipeline.published import about_angles, of_body
 
 
 def pose(roll: float, pitch: float, yaw: float, root: Any) -> Pose:

@@ -9,7 +9,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scales import SCALES, Scales
 from rs_localizer.core.types import Failure
-from rs_localizer.pipeline.method import ANY_CALIBRATION, Method
+from rs_localizer.pipeline.frames import ANY_CALIBRATION, Method
 from rs_localizer.pipeline.single_frames import SingleFrames
 
 SAID = Scales.nothing()._replace(means=np.full(SCALES, -6.0), precisions=np.ones(SCALES))

@@ -17,7 +17,7 @@ from rclpy.context import Context
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
-from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
 
 ROOT = Path(__file__).parents[2]
@@ -165,11 +165,6 @@ def test_every_input_can_be_remapped(describe):
 
 
 @pytest.mark.parametrize("file", LOCALIZING)
-def test_arguments_that_are_not_given_change_nothing(describe, file):
-    assert parameters(describe(file, **MAP.get(file, {})), "localizer") == {}
-
-
-@pytest.mark.parametrize("file", LOCALIZING)
 def test_every_setting_can_be_given(describe, file):
     names = {name for name in settings() if "." not in name}
     if file in DETECTORS:
@@ -186,11 +181,6 @@ def test_every_setting_can_be_given(describe, file):
     }  # fmt: skip
 
 
-def test_a_value_that_cannot_be_read_goes_to_the_node(describe):
-    description = describe("localizer.launch.py", readout_time="20ms", tracking="maybe")
-    assert parameters(description, "localizer") == {"readout_time": "20ms", "tracking": "maybe"}
-
-
 def test_the_detector_knows_the_localizers_shutter(describe, tmp_path):
     file = tmp_path / "camera.yaml"
     file.write_text(
@@ -203,19 +193,6 @@ def test_the_detector_knows_the_localizers_shutter(describe, tmp_path):
         "min_side": 12.0, "use_sim_time": True,
     }  # fmt: skip
     assert parameters(description, "localizer") == {"stamp_offset": 0.005, "use_sim_time": True}
-
-
-def test_features_and_localizer_share_the_camera(describe):
-    chosen = {"features": "orb", "max_keypoints": "500", "map_file": WALL, "image": "eye"}
-    description = describe("features.launch.py", **chosen, use_sim_time="true")
-    launched = node(description, "feature_detector")
-    assert dict(launched.options["remappings"]).keys() == {
-        "image", "image/compressed", "camera_info",
-    }  # fmt: skip
-    assert parameters(description, "feature_detector") == {
-        "features": "orb", "max_keypoints": 500, "use_sim_time": True,
-    }  # fmt: skip
-    assert parameters(description, "localizer") == {"map_file": WALL, "use_sim_time": True}
 
 
 def test_markers_need_a_map(describe, tmp_path):
@@ -261,13 +238,6 @@ def test_a_missing_file_ends_the_launch(describe, file, name):
         describe(file, **given)
 
 
-def test_a_missing_file_of_a_params_file_ends_the_launch(describe, tmp_path):
-    file = tmp_path / "camera.yaml"
-    file.write_text("/**:\n  ros__parameters: {map_file: /nowhere/map.npz}\n")
-    with pytest.raises(RuntimeError, match=r"^map_file: /nowhere/map\.npz does not exist$"):
-        describe("localizer.launch.py", params_file=str(file))
-
-
 def test_a_misspelled_argument_is_named(describe):
     from_launch = describe("localizer.launch.py")
     launching = sys.modules["rs_localizer.ros.launching"]
@@ -285,15 +255,6 @@ def test_a_node_that_ends_ends_the_others_or_starts_again(describe, file):
             if piece.kind == "Node" and piece.options["package"] == "rs_localizer":
                 assert ("on_exit" in piece.options) == (respawn == "false")
                 assert piece.options.get("respawn", False) == (respawn == "true")
-
-
-def test_a_driver_that_is_installed_is_started(describe, tmp_path, monkeypatch):
-    index = tmp_path / "share" / "ament_index" / "resource_index" / "packages"
-    index.mkdir(parents=True)
-    (index / "usb_cam").touch()
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    description = describe("markers.launch.py", marker_map=WALL, camera="usb_cam")
-    assert node(description, "usb_cam_node_exe").options["package"] == "usb_cam"
 
 
 def test_two_cameras_pass_on_what_one_camera_takes(describe):

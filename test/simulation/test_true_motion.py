@@ -92,9 +92,3 @@ def test_gaps_split_the_motion():
     np.testing.assert_allclose(seconds, [[0.0, 0.9917], [1.4083, 3.9917]], atol=1e-4)
     after = motion.state(START_NS + 1_500_000_000, np.zeros(1))
     np.testing.assert_allclose(after.positions[0], recorded_way(np.array([1.5]))[0][0], atol=1e-3)
-
-
-@pytest.mark.parametrize("count", [1, 4])
-def test_too_short_recordings_are_refused(count):
-    with pytest.raises(ValueError, match=rf"more than 4 poses .* has {count} poses"):
-        RecordedMotion(recording(np.arange(count) * 0.01))

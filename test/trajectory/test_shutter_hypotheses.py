@@ -54,13 +54,6 @@ def test_a_camera_that_shakes_within_its_frames_has_no_global_shutter():
     assert not found.certain
 
 
-def test_what_was_seen_is_forgotten():
-    found = odds(0.0, speed=1.0)
-    found.reset()
-    assert found.logarithm == 0.0
-    assert not found.certain
-
-
 def test_a_reversed_shutter_may_be_reversed_and_is_no_global_one():
     found = odds(-SET, speed=1.0)
     assert found.may_be_reversed

@@ -152,8 +152,3 @@ def test_gaps_are_bridged_only_where_the_neighbours_determine_them():
     for k in (0, 1, 3):
         squared = offsets[k, :6] @ np.linalg.inv(covariances[k, :6, :6]) @ offsets[k, :6]
         assert squared < 25.0
-
-
-def test_smoothing_needs_a_readout_time():
-    with pytest.raises(ValueError, match="needs the readout time"):
-        smooth(Camera(width=640, height=480, K=projector.K), [], [])

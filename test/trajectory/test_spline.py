@@ -77,13 +77,6 @@ def test_a_constant_turn_and_a_straight_line_are_kept():
     np.testing.assert_allclose(states.angular_acceleration, 0.0, atol=1e-9)
 
 
-def test_pose_velocity_and_acceleration_are_continuous_at_the_knots():
-    spline = random_spline(np.random.default_rng(3), 0.3)
-    knots = 1.0 + 0.05 * np.arange(1, 6)
-    for before, after in zip(spline.states(knots - 1e-9), spline.states(knots + 1e-9), strict=True):
-        np.testing.assert_allclose(before, after, atol=1e-4)
-
-
 def test_stretches_do_not_share_controls():
     layout = Layout.over(np.array([[0.0, 1.0], [2.0, 2.11]]), 0.05)
     first, u = layout.locate(np.array([-1.0, 0.0, 0.999, 1.2, 1.9, 2.05, 5.0]))

@@ -31,7 +31,7 @@ from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.calibration import write_calibration
 from rs_localizer.io.images import Image
-from rs_localizer.io.imu_files import read_imu_csv
+from rs_localizer.io.imu import read_imu_csv
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.topics import IMU

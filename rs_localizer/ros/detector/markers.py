@@ -10,8 +10,7 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.messages import Make
 from rs_localizer.io.topics import CORRESPONDENCES
 from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
-from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Work
-from rs_localizer.ros.detector.outputs import Show
+from rs_localizer.ros.detector.node import Drawing, Finder, ImageNode, Show, Work
 from rs_localizer.ros.node.worker import Worker
 from rs_localizer.settings import DETECTOR_NAME
 

@@ -5,20 +5,30 @@ It listens to images only while somebody listens to it.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CompressedImage, PointCloud2
+from sensor_msgs.msg import Image as ImageMessage
 
 from rs_localizer.config import DetectorConfig, FeatureConfig, ImageTransport
 from rs_localizer.core.reasons import Notice
-from rs_localizer.io.messages import Make
+from rs_localizer.io import topics
+from rs_localizer.io.images import Image
+from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.detector.outputs import ImageOutputs, Show
+from rs_localizer.ros.node.conversion import make_message
 from rs_localizer.ros.node.health import (
     SOME,
     Health,
@@ -35,6 +45,8 @@ from rs_localizer.ros.node.inputs import Silence, Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW, Summary
 from rs_localizer.ros.node.worker import Worker
+
+Found = TypeVar("Found")
 
 
 class Sight(Protocol):
@@ -114,12 +126,11 @@ def _judge(condition: Condition, summary: Summary[Sight]) -> Judgement:
 
 
 # Types of the topics whose messages are looked at.
-_IMAGES = {IMAGE: Image, COMPRESSED_IMAGE: CompressedImage}
+_IMAGES = {IMAGE: ImageMessage, COMPRESSED_IMAGE: CompressedImage}
 # How often the node looks whether somebody listens, in s.
 _LOOK_PERIOD = 0.2
 
 Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
-Found = TypeVar("Found")
 Found_co = TypeVar("Found_co", covariant=True)
 
 
@@ -314,3 +325,101 @@ def _image_topics(worker: Worker[Work[Settings, Found], Found]) -> dict[str, Top
         return take
 
     return {name: Topic(kind, images(name)) for name, kind in _IMAGES.items()}
+
+
+_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
+_JPEG_QUALITY = 85
+
+Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
+Show = Callable[[Image, Picture], None]
+
+
+class ImageOutputs(Generic[Found]):
+    """The clouds, ``~/debug_image`` and ``~/debug_image/compressed``.
+
+    Nothing is built that nobody listens to. All methods may be called from any thread.
+
+    Args:
+        node: creates the publishers, which publish while it is active.
+        topic: of the clouds.
+        make_cloud: the sensor_msgs/PointCloud2 of what was found in an image.
+    """
+
+    def __init__(
+        self, node: LifecycleNode, topic: str, make_cloud: Callable[[Found, Make], Any]
+    ) -> None:
+        self._node = node
+        self._make_cloud = make_cloud
+        self._clouds = self._create(PointCloud2, topic)
+        self._pictures = self._create(ImageMessage, f"~/{topics.DEBUG_IMAGE}")
+        self._jpegs = self._create(CompressedImage, f"~/{topics.COMPRESSED_DEBUG_IMAGE}")
+        # Held while publishing: after close() nothing is published any more.
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def topics(self) -> tuple[str, str]:
+        """Full names of the topic of clouds and of the debug image."""
+        return self._clouds.topic_name, self._pictures.topic_name
+
+    def clouds_wanted(self) -> bool:
+        return not self._closed and self._clouds.get_subscription_count() > 0
+
+    def pictures_wanted(self) -> bool:
+        publishers = (self._pictures, self._jpegs)
+        return not self._closed and any(p.get_subscription_count() > 0 for p in publishers)
+
+    def publish(self, found: Found) -> None:
+        """The cloud of an image."""
+        with self._lock:
+            if self.clouds_wanted():
+                self._clouds.publish(self._make_cloud(found, make_message))
+
+    def show(self, image: Image, picture: Picture) -> None:
+        """The debug picture of an image."""
+        header = make_header(make_message, image.stamp_ns, image.frame)
+        with self._lock:
+            if self._closed:
+                return
+            if self._pictures.get_subscription_count():
+                self._pictures.publish(_raw(header, picture))
+            if self._jpegs.get_subscription_count():
+                self._jpegs.publish(_compressed(header, picture))
+
+    def close(self) -> None:
+        with self._lock:
+            self._closed = True
+            for publisher in (self._clouds, self._pictures, self._jpegs):
+                self._node.destroy_lifecycle_publisher(publisher)
+
+    def _create(self, kind: type, topic: str) -> Any:
+        return self._node.create_lifecycle_publisher(
+            kind,
+            topic,
+            QoSProfile(**_QOS),  # a new one each: overrides are written into it
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+
+def _raw(header: Any, picture: Picture) -> Any:
+    height, width, _ = picture.shape
+    return make_message(
+        "sensor_msgs/msg/Image",
+        header=header,
+        height=height,
+        width=width,
+        encoding="bgr8",
+        is_bigendian=0,
+        step=3 * width,
+        data=picture.ravel(),
+    )
+
+
+def _compressed(header: Any, picture: Picture) -> Any:
+    _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return make_message(
+        "sensor_msgs/msg/CompressedImage",
+        header=header,
+        format="bgr8; jpeg compressed bgr8",
+        data=jpeg.ravel(),
+    )

@@ -8,10 +8,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from rs_localizer.config import NodeConfig, Px4Odometry
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.px4 import TYPE, vehicle_odometry
 from rs_localizer.io.topics import VEHICLE_ODOMETRY
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.jumps import Jumps
+from rs_localizer.pipeline.px4 import TYPE, Jumps, vehicle_odometry
 from rs_localizer.ros.node.conversion import make_message, message_class
 
 

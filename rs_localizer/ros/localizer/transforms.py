@@ -37,7 +37,7 @@ from rs_localizer.io.transforms import (
 )
 from rs_localizer.pipeline.broadcasts import Broadcast, broadcast
 from rs_localizer.ros.node.conversion import make_message
-from rs_localizer.ros.node.intake import Intake, NotByExecutor
+from rs_localizer.ros.node.inputs import Intake, NotByExecutor
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.statistics import WINDOW
 

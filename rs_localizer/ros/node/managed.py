@@ -7,20 +7,110 @@ diagnostics; that of the inputs takes messages; the worker's does the work and p
 from __future__ import annotations
 
 import functools
+import gc
+import os
+import sys
 import traceback
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
-from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+import rclpy
+from lifecycle_msgs.msg import State as Label
+from lifecycle_msgs.msg import Transition
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
+from rs_localizer.process.stopping import StopRequest
 from rs_localizer.ros.node import parameters
 from rs_localizer.ros.node.health import Diagnostics, Health
 from rs_localizer.ros.node.inputs import Inputs, Silence, Topic
-from rs_localizer.ros.node.lifecycle import RobustLifecycleNode
 from rs_localizer.ros.node.refusals import Refusals, describe
 from rs_localizer.ros.node.statistics import Statistics
-from rs_localizer.ros.node.worker import State, Worker
+from rs_localizer.ros.node.worker import State, Worker, in_thread, wait_for_workers
 from rs_localizer.settings import Config
+
+_ON_CHANGE_STATE = "_LifecycleNodeMixin__on_change_state"
+
+
+class RobustLifecycleNode(LifecycleNode):
+    """A managed node that answers impossible transitions instead of raising.
+
+    Before it is configured, a thread compiles what it needs (see :meth:`prepare`), which takes up
+    to a minute at the first start on a machine; services and diagnostics answer meanwhile.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self._prepared: Future | None = None
+        # A request to configure waits; others shall not wait for it.
+        group = ReentrantCallbackGroup()
+        for service in self.services:
+            service.callback_group = group
+            group.add_entity(service)
+
+    def kernels(self) -> Callable[[], None]:
+        """What compiles the kernels of the present settings, to be called in another thread."""
+        raise NotImplementedError
+
+    @property
+    def state(self) -> str:
+        """Label of the present state; ``configuring`` also while kernels are compiled for it."""
+        label: str = self._state_machine.current_state[1]
+        if self._prepared is not None and not self._prepared.done() and label == "unconfigured":
+            return "configuring"
+        return label
+
+    def prepare(self) -> Future:
+        """Compile in a thread; the result is what failed, or empty."""
+        if self._prepared is None or self._prepared.done():
+            self._prepared = prepared = Future()
+            compiles = self.kernels()
+            in_thread(lambda: prepared.set_result(_failure(compiles)))
+        return self._prepared
+
+    def configure(self, failure: str) -> bool:
+        """Configure after :meth:`prepare`, if nobody else has; whether that worked."""
+        if failure:
+            self.get_logger().error(f"not configured:\n{failure}")
+            return False
+        if self._unconfigured():
+            self.trigger_configure()
+        return not self._unconfigured()
+
+    def _unconfigured(self) -> bool:
+        return bool(self._state_machine.current_state[0] == Label.PRIMARY_STATE_UNCONFIGURED)
+
+    # rclpy (7.x, Jazzy) lets the error of a transition that the present state does not have out of
+    # the service's callback: the client waits for ever and the executor stops. This is the name,
+    # private to its class, under which it registers the callback; where there is none of this name
+    # the override does nothing, and the node's loop still survives the error.
+    async def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
+        wanted = request.transition.label or request.transition.id
+        if wanted in ("configure", Transition.TRANSITION_CONFIGURE) and self._unconfigured():
+            failure = await self.prepare()
+            if failure:
+                response.success = self.configure(failure)
+                return response
+        try:
+            return getattr(super(), _ON_CHANGE_STATE)(request, response)
+        except RuntimeError:  # RCLError; what callbacks raise does not come here
+            _, present = self._state_machine.current_state
+            self.get_logger().warning(f"transition {wanted} is refused: the node is {present}")
+            response.success = False
+            return response
+
+
+def _failure(function: Callable[[], None]) -> str:
+    try:
+        function()
+    except Exception:
+        return traceback.format_exc()
+    return ""
+
 
 Result = TypeVar("Result")
 Told = TypeVar("Told")
@@ -202,3 +292,88 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Told]):
             self.worker.close()
             self.worker = None
         self.close()
+
+
+# A waiting executor does not see signals: it looks up this often, in s.
+_SIGNAL_LATENCY = 0.1
+# How long the end waits for the frame that is worked on, in s.
+_LAST_FRAME_TIMEOUT = 0.5
+# How long a thread waits for the GIL before it asks for it, in s.
+_SWITCH_INTERVAL = 0.001
+
+
+def run(
+    make: Callable[[], ManagedNode[Any, Any, Any, Any]],
+    name: str,
+    stop: StopRequest,
+    args: list[str] | None = None,
+) -> int:
+    """Run a node until ``stop`` is requested; the exit code.
+
+    Args:
+        make: the node's class.
+        name: of the node.
+        stop: asks for the end.
+        args: of the command line.
+    """
+    try:
+        # rclpy's own handlers end the context from a thread while the node still uses it.
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = make()
+    except (ValueError, RuntimeError) as error:
+        rclpy.logging.get_logger(name).fatal(" ".join(str(error).split()))
+        rclpy.try_shutdown()
+        return 1
+    log = node.get_logger()
+    warnings.showwarning = lambda message, *_: log.warning(" ".join(str(message).split()))
+    try:
+        code = _start(node, stop) or spin(node, lambda: stop.requested)
+    except ExternalShutdownException:
+        code = 0
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    if not wait_for_workers(_LAST_FRAME_TIMEOUT):
+        # The interpreter's own end would stop a thread inside compiled code, which may crash.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _start(node: Any, stop: StopRequest) -> int:
+    """Configure and activate the node if it is to do so itself; the exit code if that failed."""
+    if stop.requested:
+        return 0
+    if node.autostart:
+        prepared = node.prepare()
+        spin(node, lambda: stop.requested or prepared.done())
+        if stop.requested:
+            return 0
+        if not node.configure(prepared.result()):
+            return 1
+    # What has been compiled stays; to look through it for garbage takes some tenths of a second,
+    # and must not come between frames.
+    gc.collect()
+    gc.freeze()
+    waits = node.autostart and node.state == "inactive"  # a client may have been faster
+    if waits and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+        return 1
+    # Other threads than the worker have little to do and give the GIL back soon.
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+    return 0
+
+
+def spin(node: Any, stopped: Callable[[], bool]) -> int:
+    """Run the callbacks of the node's executor, which no error of theirs ends; the exit code."""
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    while not stopped():
+        try:
+            executor.spin_once(timeout_sec=_SIGNAL_LATENCY)
+        except ExternalShutdownException:
+            raise
+        except Exception as error:  # one callback's: the others go on
+            node.refusals.add("internal_error", describe(error))
+    executor.remove_node(node)
+    return 0

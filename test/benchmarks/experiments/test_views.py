@@ -1,15 +1,10 @@
 """Errors in sigmas against independent truth, and the scenes that they are measured on."""
 
-import dataclasses
-
 import numpy as np
-import pytest
 
-from benchmarks.experiments import bound
 from benchmarks.experiments.trials import Setting
-from benchmarks.experiments.views import Outcome, View, outcome, synthetic_views
+from benchmarks.experiments.views import View, synthetic_views
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.refine import apply_step
 
 MOVING = Setting(angular=15.0, linear=0.15, noise=1.0)
@@ -24,14 +19,6 @@ def moved(motion: Motion, step: np.ndarray) -> Motion:
     state = apply_step(state, step)
     return Motion(state[:9].reshape(3, 3), state[9:12], state[12:15], state[15:18],
                   angular_acceleration=state[18:21], linear_acceleration=state[21:])  # fmt: skip
-
-
-def estimate(motion: Motion, covariance: np.ndarray) -> Estimate:
-    fields = {field.name: getattr(motion, field.name) for field in dataclasses.fields(Motion)}
-    nothing, joint = np.zeros(0), np.eye(18)
-    joint[:12, :12] = covariance
-    return Estimate(**fields, inliers=nothing > 0, residuals=nothing, joint_covariance=joint,
-                    global_shutter_inliers=0, iterations=0)  # fmt: skip
 
 
 def view() -> View:
@@ -61,22 +48,3 @@ def test_the_bound_is_that_of_finite_differences():
     jacobian = np.column_stack(columns)
     expected = jacobian.T @ jacobian
     np.testing.assert_allclose(one.information(), expected, rtol=1e-4, atol=1e-5 * expected.max())
-
-
-def test_errors_are_steps_from_the_estimate_to_the_truth():
-    one = view()
-    step = 1e-3 * np.arange(1.0, 13.0)
-    covariance = np.diag(np.arange(1.0, 13.0)) * 1e-6
-    # Taken from where it leads to, the opposite step leads back, to first order.
-    found = outcome(one, estimate(moved(one.motion, -step), covariance))
-    assert found.reported == pytest.approx(np.sum(step**2 / np.diag(covariance)), rel=0.02)
-    assert found.reported_pose + found.reported_velocities == pytest.approx(found.reported)
-    assert found.bound == pytest.approx(step @ one.information() @ step, rel=0.02)
-    assert found.gross
-
-
-def found(bounds: np.ndarray, reported: np.ndarray, at_most: float = 1.05) -> bound.Found:
-    case = dataclasses.replace(bound._CASES[0], at_most=at_most)
-    return bound.Found(
-        case, [Outcome(b, b, r, r, r) for b, r in zip(bounds, reported, strict=True)]
-    )

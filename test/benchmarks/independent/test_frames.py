@@ -8,39 +8,9 @@ import pytest
 from benchmarks.honesty.estimating import believed, frames_of, scored
 from benchmarks.independent.cameras import Camera, Scan
 from benchmarks.independent.frames import simulate
-from benchmarks.independent.motions import hand, rest, steady
-from benchmarks.independent.scenes import Board, Rich, SmallPlane, Wall
+from benchmarks.independent.motions import rest, steady
+from benchmarks.independent.scenes import Board, Rich
 from rs_localizer.localizer import Localizer
-
-
-def depths(frames) -> np.ndarray:
-    """Of the visible points, along the middle row's optical axis."""
-    away = frames.points - frames.middle.position[:, None]
-    return np.einsum("fni,fi->fn", away, frames.middle.rotation[:, :, 2])[frames.visible]
-
-
-@pytest.mark.parametrize("scene", [Rich(), Wall(), SmallPlane(), Board(), Board(markers=True)])
-def test_nearly_all_points_are_seen(scene):
-    frames = simulate(Camera(), hand, scene, 10, 8, 0)
-    assert len(frames) == 80
-    assert np.mean(frames.visible) > 0.97
-    assert np.isfinite(frames.exact[frames.visible]).all()
-
-
-def test_scenes_have_their_shapes():
-    rich = depths(simulate(Camera(), rest, Rich(), 10, 1, 0))
-    assert rich.min() > 0.99
-    assert rich.max() < 5.01
-    assert np.ptp(rich) > 3.0
-    plane = simulate(Camera(), rest, SmallPlane(size=0.4, distance=2.0, tilt=60.0), 10, 1, 0)
-    for points in plane.points:
-        values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        assert values[2] < 1e-9
-        assert np.abs(points - points.mean(axis=0)).max() < 0.4
-    slant = np.ptp(depths(plane))
-    assert 0.4 * np.sin(np.radians(60.0)) * 0.7 < slant < 0.8
-    assert Board(markers=True).bend == 0.0
-    assert simulate(Camera(), rest, Board(markers=True), 2, 1, 0).points.shape == (2, 12, 3)
 
 
 def test_a_bent_board_is_flat_in_its_map_only():

@@ -69,34 +69,6 @@ def test_twists_are_the_change_of_the_poses(name):
     assert np.any(turn != 0.0) == (name != "rest")
 
 
-def test_a_hand_is_as_fast_as_a_hand():
-    rng = np.random.default_rng(2)
-    moving = motions.hand(2000, rng)
-    which, time = np.arange(2000), rng.uniform(-1.0, 1.0, 2000)
-    before, after = (moving.states(which, time + step) for step in (-STEP, STEP))
-    rate = np.degrees(np.linalg.norm(before.angular, axis=1))
-    bend = np.linalg.norm((after.angular - before.angular) / (2 * STEP), axis=1)
-    assert np.median(rate) == pytest.approx(67.0, rel=0.1)
-    assert np.sqrt(np.mean(bend**2)) == pytest.approx(9.0, rel=0.1)
-    assert np.quantile(np.linalg.norm(before.linear, axis=1), 0.99) == pytest.approx(1.0, rel=0.2)
-
-
-def test_a_vibration_has_its_amplitude_and_a_stop_ends():
-    rng = np.random.default_rng(3)
-    time = np.linspace(-0.05, 0.05, 2001)
-    shaken = motions.vibration(1, rng, degrees=1.0, hertz=50.0)
-    turned = shaken.poses(np.zeros(2001, int), time)[0]
-    away = np.degrees(np.linalg.norm(rotations.logarithm(turned @ turned[1000].T), axis=1))
-    period = turned[1000 + 400]  # 1/50 s later only the slow drift is left
-    assert 1.0 < away.max() < 3.0
-    assert np.degrees(np.linalg.norm(rotations.logarithm(period @ turned[1000].T))) < 0.5
-    stopped = motions.sudden_stop(30, rng, -0.01, 0.01)
-    which = np.arange(30)
-    late, early = (stopped.states(which, np.full(30, t)) for t in (0.06, -0.02))
-    assert np.all(np.linalg.norm(late.angular, axis=1) < 1e-12)
-    assert np.linalg.norm(early.angular, axis=1) == pytest.approx(np.radians(60.0))
-
-
 @pytest.mark.parametrize("scan", list(Scan))
 def test_every_point_is_seen_when_its_row_is_exposed(scan):
     camera = Camera(scan=scan)

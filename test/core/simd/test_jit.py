@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib
-import os
 import resource
 import sys
 import tempfile
@@ -169,17 +168,6 @@ def check_shared(load: Load, cache: Path, shared: str) -> None:
     again = load()
     assert again(1.5) == 3.0
     assert hits(again) == 1
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
-def test_a_cache_of_another_user_is_not_used(load, cache):
-    load()(1.5)
-    os.chown(cache / "rs_localizer", 65534, 65534)
-    jit.open_to_others.cache_clear()
-    compiled = load()
-    with pytest.warns(RuntimeWarning, match="not used"):
-        assert compiled(1.5) == 3.0
-    assert hits(compiled) == 0
 
 
 def test_a_kernel_is_compiled_anew_when_one_that_it_calls_changes(tmp_path, monkeypatch, cache):

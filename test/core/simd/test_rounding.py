@@ -67,33 +67,6 @@ def two_ways(loop: ast.For) -> Iterator[ast.stmt]:
             yield step  # a division that another loop would multiply
 
 
-def test_the_rule_sees_what_it_is_for():
-    bad = """
-@kernel
-def f(a, b, c):
-    for i in range(3):
-        for k in range(9):
-            a[i] += b[k] * c[k]
-        for k in range(9):
-            a[k] /= b[i]
-        for k in range(9):
-            a[k] = b[k]
-            total += b[k] * c[k]
-"""
-    assert len([found for loop in innermost_loops(bad) for found in two_ways(loop)]) == 3
-    good = """
-@kernel
-def f(a, b, c):
-    for i in range(3):
-        total, inverse = 0.0, 1.0 / b[i]
-        for k in range(9):
-            total += b[k] * c[k]
-        for k in range(9):
-            a[k] *= inverse
-"""
-    assert not [found for loop in innermost_loops(good) for found in two_ways(loop)]
-
-
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_kernels_round_in_one_way(folder):
     found = [

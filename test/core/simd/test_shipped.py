@@ -137,15 +137,6 @@ def test_damaged_code_of_the_package_is_not_run(load, made, tmp_path):
     file.write_bytes(whole)
 
 
-def test_levels_are_what_a_cpu_can_do():
-    avx2 = ",".join(f"+{name}" for name in shipped.LEVELS["x86-64-v3"])
-    avx512 = ",".join(f"+{name}" for name in shipped.LEVELS["x86-64-v4"])
-    assert shipped.levels(avx2) == ("x86-64-v3",)
-    assert shipped.levels(avx512) == ("x86-64-v4", "x86-64-v3")
-    assert shipped.levels(avx512.replace("+avx512vl", "-avx512vl")) == ("x86-64-v3",)
-    assert shipped.levels("") == shipped.levels("+64bit,+sse2,+avx") == ()
-
-
 def test_caches_of_two_cpus_share_a_folder_and_not_their_code(made, tmp_path):
     cache = tmp_path / "both"
     assert "cache_hits=Counter()" in compile_for("nehalem", made, cache)

@@ -131,22 +131,6 @@ def test_one_of_several_cameras(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "model", "D"),
-    [
-        (ROS, "rational_polynomial", [1, 2, 3, 4, 5, 6, 7, 8]),
-        # OpenCV's order: two radial, two tangential, the third radial.
-        (BOOFCV, "plumb_bob", [0.05, -0.16, 0.001, 0.002, 0.0]),
-    ],
-)
-def test_both_kinds(tmp_path, text, model, D):
-    (tmp_path / "camera.yaml").write_text(text)
-    camera = read_calibration(tmp_path / "camera.yaml")
-    assert (camera.width, camera.height, camera.distortion_model) == (640, 480, model)
-    np.testing.assert_array_equal(camera.K, [[500, 0, 320.5], [0, 510, 240.5], [0, 0, 1]])
-    np.testing.assert_array_equal(camera.D, D)
-
-
-@pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("a: [", r"camera.yaml is not a YAML, JSON or XML file"),
@@ -178,8 +162,3 @@ def test_faults_are_named(tmp_path, text, expected):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(CalibrationError, match=expected):
         read_calibration(tmp_path / "camera.yaml")
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(CalibrationError, match=r"absent.yaml cannot be read: No such file"):
-        read_calibration(tmp_path / "absent.yaml")

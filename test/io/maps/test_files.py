@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rs_localizer.io.maps.files import read_map_file, write_map_file
+from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
-from rs_localizer.io.maps.ply import write_ply
 
 COLMAP = Path(__file__).parent / "colmap"
 
@@ -40,43 +39,6 @@ def landmarks(ids: str | None, descriptors: str | None, count: int = 7) -> Map:
         "float": rng.normal(size=(count, 5)).astype(np.float32),
     }[descriptors]
     return Map(rng.normal(size=(count, 3)) * 1e5, numbers, rows, "hall")
-
-
-def assert_same(one: Map, other: Map) -> None:
-    for name in ("points", "ids", "descriptors"):
-        a, b = getattr(one, name), getattr(other, name)
-        assert (a is None) == (b is None)
-        if a is not None:
-            assert a.dtype == b.dtype
-            assert a.tolist() == b.tolist()
-    assert one.frame == other.frame
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".ply", "text.ply"])
-@pytest.mark.parametrize("ids", [None, "unsigned", "signed"])
-@pytest.mark.parametrize("descriptors", [None, "binary", "float"])
-def test_round_trip(tmp_path, suffix, ids, descriptors):
-    written = landmarks(ids, descriptors)
-    path = tmp_path / f"map{suffix}"
-    if suffix == "text.ply":
-        write_ply(path, written, binary=False)
-    else:
-        write_map_file(path, written)
-    assert_same(read_map_file(path, "hall"), written)
-
-
-def test_archives_of_numpy_in_other_types(tmp_path):
-    path = tmp_path / "map.npz"
-    points = np.asfortranarray(np.arange(12).reshape(4, 3).astype(">f4"))
-    np.savez_compressed(
-        path, points=points, ids=np.arange(4, dtype=np.uint8), descriptors=np.eye(4), more=points
-    )
-    found = read_map_file(path, "map")
-    assert found.points.tolist() == points.tolist()
-    assert found.ids is not None
-    assert found.ids.tolist() == [0, 1, 2, 3]
-    assert found.descriptors is not None
-    assert found.descriptors.dtype == np.float32
 
 
 VERTICES = [(i, 9, -i, 7 + i, 2.5 * i, 3, i, 1, 2, -1) for i in range(4)]
@@ -139,14 +101,6 @@ def database(path: Path, *changes: str) -> Path:
             tables.execute(change)
     tables.close()
     return path / "database.db"
-
-
-def test_points_that_no_described_image_sees_are_left_out(tmp_path):
-    truth = json.loads((COLMAP / "truth.json").read_text())
-    file = database(tmp_path, "DELETE FROM descriptors WHERE image_id > 2")
-    left = [n for n, point in truth.items() if any(image <= 2 for image, _ in point["track"])]
-    found = read_map_file(COLMAP / "binary", "map", file)
-    assert (len(found), found.dropped) == (len(left), 14 - len(left))
 
 
 def test_descriptors_of_other_extractors(tmp_path):
@@ -382,19 +336,3 @@ def test_hostile_sizes_allocate_nothing(tmp_path):
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 2**20, name
-
-
-def test_other_files(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_map_file(tmp_path / "nothing.npz", "map")
-    (tmp_path / "map.obj").touch()
-    with pytest.raises(MapError, match=r"expected a folder of COLMAP or a file ending in .npz"):
-        read_map_file(tmp_path / "map.obj", "map")
-    (tmp_path / "map.npz").touch()
-    with pytest.raises(MapError, match="alone has a database"):
-        read_map_file(tmp_path / "map.npz", "map", tmp_path / "database.db")
-    with pytest.raises(MapError, match=r"maps are written to files ending in .npz, .ply"):
-        write_map_file(tmp_path / "map.pcd", landmarks(None, None))
-    write_map_file(tmp_path / "map.npz", landmarks("signed", None))
-    with pytest.raises(MapError, match="has no name"):
-        read_map_file(tmp_path / "map.npz", "")

@@ -96,17 +96,6 @@ def test_between_two_samples(tree):
     assert np.allclose(found.translation, [1.0 + 0.1 * share, 2.0 + 0.1 * share, 0.1], atol=1e-12)
 
 
-def test_there_and_back(tree):
-    there = tree.lookup("lidar", "camera", 1_020_000_000)
-    back = tree.lookup("camera", "lidar", 1_020_000_000)
-    assert np.allclose((there @ back).rotation, np.eye(3), atol=1e-12)
-    assert np.allclose((there @ back).translation, 0.0, atol=1e-12)
-    with_slashes = tree.lookup("/lidar", "/camera", 1_020_000_000)
-    assert np.array_equal(with_slashes.rotation, there.rotation)
-    nothing = tree.lookup("camera", "/camera", 7)
-    assert np.array_equal(nothing.rotation, np.eye(3))
-
-
 def test_what_moves(tree):
     assert not tree.moves("base", "camera")
     assert not tree.moves("lidar", "camera")  # through the base, which moves with both

@@ -149,12 +149,6 @@ def _wait_for(port: int) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.parametrize("address", ["nonsense", "tcp://host", "foo://host:1", ""])
-def test_what_is_no_address_is_refused_at_once(tmp_path, address):
-    with pytest.raises(ClusterError, match="--scheduler needs an address such as tcp://"):
-        list(perform_all(tasks(tmp_path, one=""), Where(scheduler=address)))
-
-
 def test_an_address_without_a_scheduler_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "_CONNECT_TIMEOUT", 0.5)
     with pytest.raises(ClusterError, match="no Dask scheduler answers at tcp://"):

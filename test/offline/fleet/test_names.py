@@ -22,12 +22,6 @@ def test_parents_tell_those_of_one_name_apart(paths, names):
     assert folder_names([Path(path) for path in paths]) == names
 
 
-def test_what_is_there_besides_is_not_overwritten(tmp_path):
-    (tmp_path / "summary.csv").mkdir()
-    name = f"{tmp_path.name}_summary.csv"
-    assert folder_names([tmp_path / "summary.csv"], {"summary.csv"}) == [name]
-
-
 def test_all_names_differ_and_are_names():
     rng = random.Random(0)
     parts = ["a", "b", "a_b", "b.x"]

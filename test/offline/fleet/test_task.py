@@ -86,13 +86,6 @@ def test_a_fault_is_a_reason_and_leaves_nothing(tmp_path, fault, reason):
     assert list((given.out / PARTIAL).iterdir()) == []
 
 
-def test_what_is_done_is_not_done_again(tmp_path):
-    perform(task(tmp_path))
-    again = perform(task(tmp_path, fault=ValueError("nobody calls it")))
-    assert again.figures is not None
-    assert again.figures["letters"] == 5
-
-
 def test_another_recording_is_another_result(tmp_path):
     old = task(tmp_path)
     perform(old)
@@ -121,12 +114,6 @@ def test_identity_is_of_settings_files_and_times(tmp_path):
     os.utime(recording / "data", ns=(10**18, 10**18 + 1))
     others.add(identity("replay", {"a": 1}, [recording]))
     assert len(others | {first_one}) == 5
-
-
-def test_a_worker_of_another_version_refuses(tmp_path):
-    outcome = perform(replace(task(tmp_path), program="beef"))
-    assert outcome.figures is None
-    assert outcome.reason.endswith("here beef): install the same on both")
 
 
 def test_the_first_one_compiles_alone(tmp_path, cache):

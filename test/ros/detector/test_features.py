@@ -139,10 +139,3 @@ def test_images_become_keypoints(start_node, peer, recording, tmp_path):
     assert camera.listeners(0)
     assert node.stop(signal.SIGINT) == 0
     assert "Traceback" not in node.log
-
-
-def test_features_that_there_are_not_end_it(start_node):
-    node = start_node("-p", "features:=surf", run=RUN)
-    assert node.process.wait(60) == 1
-    assert "features must be one of sift, orb, akaze; got 'surf'" in node.log
-    assert "Traceback" not in node.log

@@ -225,10 +225,3 @@ def test_compressed_images_and_the_debug_picture(start_node, peer, map_file):
 
     assert peer.spin_until(reported)
     assert node.stop(signal.SIGTERM) == 0
-
-
-def test_without_a_map_it_ends(start_node):
-    node = start_node("-p", "marker_map:=/nowhere.yaml", run=RUN)
-    assert node.process.wait(60) == 1
-    assert "not configured: /nowhere.yaml cannot be read: No such file or directory" in node.log
-    assert "Traceback" not in node.log

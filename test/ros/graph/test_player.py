@@ -1,6 +1,5 @@
 """``rs_localizer replay --ros``: the recording's messages in the graph, paced, with /clock."""
 
-import os
 import re
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.recording import make_camera_info, write_frame, write_image
 
 FRAMES = 8
@@ -136,27 +135,3 @@ def test_images_are_played_for_a_detector(tmp_path, peer):
     peer.spin_until(lambda: len(images) == FRAMES, 1.0)
     assert [bytes(image.data) for image in images] == [bytes([k]) * 100 for k in range(FRAMES)]
     assert len(infos) == FRAMES
-
-
-def test_transforms_are_left_out_where_their_type_is_missing(recording, tmp_path, peer):
-    with open_bag(recording) as bag, BagWriter(tmp_path / "with_tf") as copy:
-        copy.write("/tf", make_message("tf2_msgs/msg/TFMessage", transforms=[]), START_NS)
-        for topic, stamp_ns, message in bag.messages(tuple(bag.topics)):
-            copy.write(topic, message, stamp_ns)
-    (tmp_path / "tf2_msgs.py").write_text("raise ImportError")
-    clouds: list[PointCloud2] = []
-    subscribe = peer.node.create_subscription
-    subscribe(PointCloud2, "/correspondences", clouds.append, qos_profile_sensor_data)
-    subscribe(CameraInfo, "/camera_info", lambda _: None, qos_profile_sensor_data)
-    arguments = ["replay", str(tmp_path / "with_tf"), "--ros", "--rate", "2"]
-    player = subprocess.Popen(
-        [sys.executable, "-m", "rs_localizer", *arguments],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert peer.spin_until(lambda: player.poll() is not None)
-    output, _ = player.communicate()
-    assert output.startswith("not played: /tf, tf2_msgs is not installed (ros-jazzy-tf2-msgs)\n")
-    assert player.returncode == 0
-    assert clouds

@@ -1,8 +1,5 @@
 """``rs_localizer watch``: what a node publishes, as text; clean ends."""
 
-import contextlib
-import os
-import pty
 import re
 import signal
 import subprocess
@@ -16,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.ros.graph.watch import Status, Values, Watched, euler, line, table
+from rs_localizer.ros.graph.watch import Status, Values, Watched, euler, table
 
 WATCH = [sys.executable, "-m", "rs_localizer", "watch"]
 
@@ -28,13 +25,6 @@ def seen() -> Watched:
     for k in range(11):
         watched.arrived(pose, 100.0 + 0.05 * k)
     return watched
-
-
-def test_a_pose_in_one_line():
-    text = line(seen(), 100.6)
-    assert text.startswith("localized, 20.0 Hz | ")
-    assert re.search(r"xyz +\+1\.000 +-2\.000 +\+0\.500 m \+-5\.0 mm", text)
-    assert re.search(r"rpy +\+10\.00 +\+20\.00 +\+30\.00 \+-0\.30 deg", text)
 
 
 def test_a_table_has_a_line_for_each_quantity():
@@ -100,35 +90,6 @@ def test_a_live_node_in_lines(peer, tmp_path):
     _, errors = watching.communicate(timeout=30)
     assert (watching.returncode, errors) == (130, b"rs_localizer watch: interrupted\n")
     assert "\x1b" not in file.read_text()
-
-
-def test_in_place_on_a_terminal(peer, tmp_path):
-    node, ours_theirs, errors = Node(peer), pty.openpty(), tmp_path / "errors"
-    with errors.open("w") as file:
-        watching = subprocess.Popen(
-            [*WATCH, "front/rs_localizer", "--every", "0.1"],
-            stdout=ours_theirs[1],
-            stderr=file,
-            env={**os.environ, "COLUMNS": "60"},
-        )
-    os.set_blocking(ours_theirs[0], False)
-    text, again = b"", re.compile(rb"\x1b\[\dF\x1b\[J/front/rs_localizer: tracking")
-
-    def heard() -> bool:
-        nonlocal text
-        node.publish()
-        with contextlib.suppress(BlockingIOError):
-            text += os.read(ours_theirs[0], 65536)
-        whole = b"position (m)" in text.rpartition(b"\x1b[J")[0]
-        return whole and again.search(text) is not None
-
-    assert peer.spin_until(heard), text
-    watching.send_signal(signal.SIGTERM)
-    assert watching.wait(30) == 143
-    for end in ours_theirs:
-        os.close(end)
-    assert errors.read_text() == "rs_localizer watch: interrupted\n"
-    assert all(len(row) < 60 for row in re.sub(rb"\x1b\[\w+", b"", text).splitlines())
 
 
 @pytest.mark.usefixtures("domain")

@@ -9,7 +9,7 @@ from sensor_msgs.msg import CameraInfo
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.ros.localizer.feed import Feed
+from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.refusals import Refusals
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, TransformStamped
-from rcl_interfaces.srv import GetParameters, SetParameters
+from geometry_msgs.msg import TransformStamped
+from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.time import Time
@@ -42,10 +42,6 @@ ODOMETRY = [
     ("odom", "base_link", (0.1 * i, 0.3, 0.0), (0.0, 0.0, 0.6, 0.8), START_NS + i * 20_000_000)
     for i in range(12)
 ]
-BLOCKED = (
-    "import sys; sys.modules['tf2_ros'] = None; "
-    "from rs_localizer.ros.main import main; sys.exit(main())"
-)
 Sample = tuple[str, str, tuple[float, ...], tuple[float, ...], int]
 
 
@@ -273,49 +269,3 @@ def test_a_mounting_that_comes_and_changes_and_moves(recording, start_node, robo
     started = time.monotonic()
     assert node.stop(signal.SIGTERM) == 0
     assert time.monotonic() - started < 5.0
-
-
-def test_publish_tf_changes_while_it_runs(recording, start_node, robot):
-    start_node(*SHUTTER, **ENVIRONMENT)
-    assert robot.peer.spin_until(lambda: robot.peer.node.count_publishers("/rs_localizer/pose"))
-    assert change(robot.peer, "publish_tf", "map_to_camera") == (True, "")
-    assert change(robot.peer, "base_frame", "base_link")[0] is False
-    robot.connect()
-    robot.localize(inputs(recording)[0])
-    assert robot.peer.spin_until(lambda: robot.sent)
-    assert (robot.sent[0].header.frame_id, robot.sent[0].child_frame_id) == ("map", CAMERA)
-    translation = robot.sent[0].transform.translation
-    assert robot.position() == [translation.x, translation.y, translation.z]
-    assert change(robot.peer, "publish_tf", "none") == (True, "")
-    robot.sent.clear()
-    robot.localize(inputs(recording)[1])
-    robot.peer.spin_until(lambda: False, 0.2)
-    assert not robot.sent
-
-
-def test_without_tf2_ros(recording, start_node, peer):
-    node = start_node("-p", "base_frame:=base_link", run=BLOCKED)
-    assert node.process.wait(60) == 1
-    assert "base_frame 'base_link' needs the Python package tf2_ros" in node.log
-    assert "sudo apt install ros-jazzy-tf2-ros-py" in node.log
-    assert "Traceback" not in node.log
-    node = start_node(*SHUTTER, run=BLOCKED)
-    node.wait_for_log("active with solver")
-    successful, reason = change(peer, "publish_tf", "map_to_odom")
-    assert not successful
-    assert reason.startswith("publish_tf map_to_odom needs the Python package tf2_ros")
-    request = GetParameters.Request(names=["publish_tf"])
-    values = peer.call(GetParameters, "/rs_localizer/get_parameters", request).values
-    assert values[0].string_value == "none"
-    # All else works.
-    poses: list[PoseStamped] = []
-    peer.node.create_subscription(PoseStamped, "/rs_localizer/pose", poses.append, 10)
-    infos = peer.node.create_publisher(CameraInfo, "/camera_info", 1)
-    clouds = peer.node.create_publisher(PointCloud2, "/correspondences", 1)
-    info, cloud = inputs(recording)[0]
-    for _ in range(50):
-        infos.publish(info)
-        clouds.publish(cloud)
-        if peer.spin_until(lambda: poses, 0.2):
-            break
-    assert poses

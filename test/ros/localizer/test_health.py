@@ -156,17 +156,6 @@ def test_what_is_odd_is_a_warning(world):
     assert health.message.endswith("for too_few_inliers; pixels_outside: 7 of 100 pixels")
 
 
-def test_what_was_odd_is_forgotten():
-    now = [0.0]
-    refusals = Refusals(lambda text: None, lambda: now[0])
-    refusals.notice("map_is_camera", "first")
-    refusals.notice("map_is_camera", "second")
-    refusals.notice("another", "text")
-    assert refusals.recent(("map_is_camera", "nothing"), 5.0) == {"map_is_camera": "second"}
-    now[0] = 5.1
-    assert refusals.recent(("map_is_camera",), 5.0) == {}
-
-
 def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) -> Silence:
     return Silence(topic, 7.0, heard, cause, mismatch)
 

@@ -30,10 +30,6 @@ RELIABLE = [
     for topic in ("/imu", "/camera_info", "/correspondences")
     for word in ("-p", f"qos_overrides.{topic}.subscription.reliability:=reliable")
 ]
-BLOCKED = (
-    "import sys; sys.modules['tf2_ros'] = None; "
-    "from rs_localizer.ros.main import main; sys.exit(main())"
-)
 FRAMES = 30
 Item = tuple[str, int, Any]
 
@@ -214,26 +210,3 @@ def test_an_imu_that_is_late_is_not_waited_for(recording, items, tmp_path, start
     assert robot.peer.spin_until(lambda: "IMU not used: imu_late" in robot.values)
     assert "older than the last row" in robot.values["IMU"]
     assert "imu.wait" in robot.values["Odd: imu"]
-
-
-def test_without_tf2_ros_the_camera_goes_alone(recording, items, start_node, robot):
-    node = start_node(*SHUTTER, run=BLOCKED)
-    robot.connect()
-    robot.greet(items, listens=False)
-    robot.play(items)
-    node.wait_for_log("the IMU needs the Python package tf2_ros")
-    assert robot.peer.spin_until(lambda: "IMU not used: imu_no_transform" in robot.values)
-
-
-def test_messages_that_no_imu_sends_are_counted(items, start_node, robot):
-    node = start_node(*SHUTTER, *RELIABLE, **ENVIRONMENT)
-    robot.connect()
-    robot.greet(items)
-    wrong = Imu()
-    wrong.header.frame_id = "imu_link"
-    wrong.angular_velocity.x = 250.0
-    robot.send(("/imu", 0, wrong))
-    node.wait_for_log("bad_imu: angular_velocity is (250.0, 0.0, 0.0) rad/s, more than any IMU")
-    assert robot.peer.spin_until(lambda: "Odd: bad_imu" in robot.values)
-    robot.play(items)
-    assert robot.peer.spin_until(lambda: robot.values.get("Refused: bad_imu") == "1")

@@ -21,9 +21,8 @@ from rs_localizer.io.messages import stamp_ns
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.ros.node.conversion import copy_message, make_message
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.landmarks import keypoint_rows, map_rows, random_descriptors
 from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
@@ -113,43 +112,6 @@ class Talk:
         found = [getattr(pose.pose.position, name) for name in "xyz"]
         assert np.allclose(found, frame.first_row.positions[0], atol=0.02)
         return pose
-
-
-def test_maps_that_are_late_replaced_and_bad(start_node, peer, flight):
-    info, frames = flight
-    node = start_node("-p", f"readout_time:={READOUT_TIME}")
-    talk = Talk(peer, info)
-    talk.connect()
-    # Without a map.
-    assert not talk.send(talk.keypoints(frames[0]), 0.3)
-    assert peer.spin_until(lambda: talk.status.get("State") == "waiting for a map")
-    assert peer.spin_until(lambda: "/map_points: it has 1 publisher" in talk.status["message"])
-    node.wait_for_log("no_map: no usable map has come yet, on map_points or as map_file")
-    # It comes.
-    talk.send_map(LANDMARKS)
-    assert talk.localize(frames[1]).header.frame_id == "map"
-    node.wait_for_log("the map has 8000 landmarks in frame 'map'")
-    # Bad ones leave it in place.
-    bad = talk.send_map(LANDMARKS)  # the same again is no news
-    bad.width = 2**31
-    talk.send_raw_map(bad)
-    node.wait_for_log("bad_map: the data are truncated")
-    talk.localize(frames[2])
-    # Descriptors of another width, and then unknown ids only.
-    wide = Map(POINTS, None, random_descriptors(8000, np.random.default_rng(0), 64), "map")
-    assert not talk.send(talk.keypoints(frames[3], wide), 0.3)
-    node.wait_for_log("bad_keypoints: the keypoints have descriptors of 64 x uint8, the map has")
-    strangers = Map(POINTS, LANDMARKS.ids + 10**6, None, "map")
-    assert not talk.send(talk.keypoints(frames[3], strangers), 0.3)
-    node.wait_for_log("no_matches: none of")
-    # Another map while frames come.
-    talk.send_map(Map(POINTS[:6000], LANDMARKS.ids[:6000], LANDMARKS.descriptors[:6000], "hall"))
-    assert talk.send(talk.keypoints(frames[4]), 5.0) or talk.localize(frames[4])
-    assert peer.spin_until(lambda: talk.localize(frames[5]).header.frame_id == "hall")
-    node.wait_for_log("map_replaced: a map of 6000 landmarks in frame 'hall' replaces the one of")
-    node.wait_for_log("map_changed")
-    assert "internal_error" not in node.log
-    assert node.stop() == 0
 
 
 def test_a_map_that_is_not_latched(start_node, peer, flight):

@@ -31,7 +31,6 @@ from rs_localizer.simulation.true_motion import ConstantVelocity
 READOUT_TIME = 0.03
 SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-Start = Callable[..., Any]
 
 
 def record(path: Path, known: float = 1.0) -> Path:
@@ -250,24 +249,6 @@ def test_what_is_fixed_can_be_set_while_it_is_unconfigured(start_node, peer, tmp
     assert change_state(peer, Transition.TRANSITION_CLEANUP)
     assert set_one("map_frame", "cellar").successful
     assert node.stop() == 0
-
-
-def test_impossible_transitions_are_refused(recording, start_node, peer):
-    node = start_node(*SHUTTER)
-    talk = Talk(peer)
-    talk.connect()
-    for transition in (
-        Transition.TRANSITION_ACTIVATE,
-        Transition.TRANSITION_CONFIGURE,
-        Transition.TRANSITION_ACTIVATE,
-        99,
-    ):
-        assert not change_state(peer, transition)
-    node.wait_for_log("transition 99 is refused: the node is active")
-    assert state(peer) == State.PRIMARY_STATE_ACTIVE
-    talk.localize(*inputs(recording)[0])
-    assert node.stop() == 0
-    assert "Traceback" not in node.log
 
 
 def test_a_failing_callback_does_not_end_the_node(recording, start_node, peer):

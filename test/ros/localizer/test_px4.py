@@ -75,19 +75,9 @@ def test_frames_go_out_in_px4s_types():
     np.testing.assert_allclose(first.position, [0.0, 3.0, 0.0], atol=1e-6)
 
 
-@pytest.mark.usefixtures("px4_msgs")
-def test_what_is_installed_may_be_asked_for():
-    check(WANTED)
-
-
 def test_without_px4_msgs_only_what_needs_it_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "px4_msgs", None)
     message_class.cache_clear()
     check(NodeConfig())
     with pytest.raises(ValueError, match="px4_odometry ned needs the package px4_msgs"):
         check(WANTED)
-
-
-def test_the_camera_is_no_body():
-    with pytest.raises(ValueError, match="px4_odometry frd needs base_frame"):
-        NodeConfig(px4_odometry="frd")

@@ -15,7 +15,7 @@ from geometry_msgs.msg import TransformStamped
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.io.transforms import NotYetError, TransformError
+from rs_localizer.io.transforms import TransformError
 from rs_localizer.ros.localizer.transforms import Broadcaster, check
 
 STAND_IN = Path(__file__).parents[1] / "stand_in"
@@ -101,44 +101,6 @@ def known(made: Any, peer: Any, target: str, source: str, stamp_ns: int | None) 
 
     assert peer.spin_until(there), f"no transform from {source} to {target}"
     return made.tf.lookup(target, source, stamp_ns)
-
-
-def test_static_transforms_hold_for_all_times(made, robot, peer):
-    node = made(base_frame="base_link")
-    with pytest.raises(TransformError, match=r'"?camera"?.* does not exist'):
-        node.tf.lookup("camera", "base_link", 5)
-    robot.send("base_link", "camera", 2.0)
-    for stamp_ns in (None, 5, 10**18):
-        found = known(node, peer, "base_link", "camera", stamp_ns)
-        assert found.translation.tolist() == [2.0, 0.0, 0.0]
-        assert np.array_equal(found.rotation, np.diag([-1.0, -1.0, 1.0]))
-    assert not node.tf.moves("camera", "base_link")
-    # Calibrated anew.
-    robot.send("base_link", "camera", 3.0)
-    assert peer.spin_until(lambda: node.tf.lookup("base_link", "camera", 5).translation[0] == 3.0)
-    with pytest.raises(TransformError, match=r"no transforms of the time -0\.010 s"):
-        node.tf.lookup("base_link", "camera", -10_000_000)
-
-
-def test_what_is_not_known_yet_is_said_at_once(made, robot, peer):
-    node = made(base_frame="base_link", transform_tolerance=10.0)
-    second = 10**9
-    robot.send("base_link", "camera", 1.0, 5 * second)
-    robot.send("base_link", "camera", 2.0, 6 * second)
-    assert known(node, peer, "base_link", "camera", 5_500_000_000).translation[0] == 1.5
-    assert node.tf.moves("camera", "base_link")
-    started = time.monotonic()
-    with pytest.raises(NotYetError, match="extrapolation into the future"):
-        node.tf.lookup("base_link", "camera", 7 * second)
-    assert time.monotonic() - started < 1.0
-    robot.send("base_link", "camera", 6.0, 8 * second)
-    assert known(node, peer, "base_link", "camera", 7 * second).translation[0] == 4.0
-    with pytest.raises(TransformError, match="extrapolation into the past") as caught:
-        node.tf.lookup("base_link", "camera", 4 * second)
-    assert not isinstance(caught.value, NotYetError)
-    node.broadcaster.close()
-    with pytest.raises(TransformError, match="TF is not listened to"):
-        node.tf.lookup("base_link", "camera", 7 * second)
 
 
 def heard(robot: Any, peer: Any, parent: str, child: str, stamp_ns: int | None) -> Any:
@@ -229,21 +191,6 @@ def test_map_to_camera(made, robot, peer):
     assert node.broadcaster.fault() == {}  # one has been sent just now
     node.publish(frame(6 * 10**9), NodeConfig())  # switched off meanwhile
     assert len(node.notes) == 1
-
-
-def test_a_frame_has_one_parent(made, robot, peer):
-    node = made(publish_tf="map_to_camera")
-    robot.send("odom", "base_link", 1.0)
-    known(node, peer, "odom", "base_link", None)
-    node.publish(frame(5 * 10**9), node.config)
-    reason, text = node.notes[0]
-    assert reason == "not_broadcast"
-    assert text.startswith(
-        "publish_tf map_to_camera: TF frame 'base_link' already has parent 'odom'"
-    )
-    assert node.broadcaster.fault() == {"not_broadcast": text}  # for the diagnostics
-    peer.spin_until(lambda: False, 0.1)
-    assert not robot_knows(robot, "map")
 
 
 def test_without_tf2_ros_only_what_needs_it_is_refused(monkeypatch):

@@ -80,15 +80,6 @@ def test_another_state_is_told_afresh(bench):
     assert bench.lines == ["no_pose: because lost", "no_pose: because waiting for"]
 
 
-def test_a_warning_after_a_long_good_time(bench):
-    for _ in range(1000):
-        bench.tick()
-    bench.health = Health(Level.WARN, State.TRACKING, "frames were refused", {})
-    for _ in range(5):
-        bench.tick()
-    assert bench.lines == ["tracking: frames were refused"]
-
-
 @pytest.mark.parametrize(("level", "state"), [(Level.OK, "tracking"), (Level.OK, "inactive")])
 def test_what_is_meant_so_is_not_logged(bench, level, state):
     bench.health = Health(level, state, "as it should be", {})

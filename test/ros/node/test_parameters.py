@@ -109,13 +109,6 @@ def test_what_is_refused_stays_as_it_was(recorder, change, reason):
     assert parameters.read(recorder.node, NodeConfig) == NodeConfig()
 
 
-def test_values_at_start(context):
-    recorder = Recorder(context, "-p", "readout_time:=0.02", "-p", "velocity_prior.angular:=0.0")
-    assert recorder.config.readout_time == 0.02
-    assert recorder.config.velocity_prior.angular == 0.0
-    recorder.node.destroy_node()
-
-
 @pytest.mark.parametrize(
     ("assignment", "text"),
     [
@@ -140,21 +133,3 @@ def test_numbers_in_a_row(context):
     assert recorder.applied[-1].gravity_in_map == (0.0, -9.81, 0.0)
     assert recorder.set_all(gravity_in_map=[0.0, 1.0])[1].startswith("gravity_in_map must be 3")
     recorder.node.destroy_node()
-
-
-def test_names_that_no_parameter_has(context):
-    assignments = (
-        "readout_tim:=0.1",
-        "colour:=red",
-        "velocity_prior.angulr:=0.5",
-        "use_sim_time:=true",
-        "qos_overrides./camera_info.subscription.depth:=3",
-        "seed:=3",
-    )
-    recorder = Recorder(context, *(word for text in assignments for word in ("-p", text)))
-    texts = parameters.unknown_names(recorder.node, NodeConfig)
-    recorder.node.destroy_node()
-    colour, readout_time, angular = texts
-    assert colour.startswith("'colour' is not a setting; there are solver, ")
-    assert readout_time == "'readout_tim' is not a setting; did you mean 'readout_time'?"
-    assert angular.endswith("did you mean 'velocity_prior.angular'?")

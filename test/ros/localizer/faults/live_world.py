@@ -26,11 +26,10 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.ros.localizer.node import LocalizerNode
 from rs_localizer.ros.node.conversion import copy_message
-from rs_localizer.ros.node.run import spin
+from rs_localizer.ros.node.managed import spin
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
-from rs_localizer.simulation.landmarks import random_descriptors
 from rs_localizer.simulation.recording import write_simulated
-from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.scene import random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
 READOUT_TIME = 0.03
