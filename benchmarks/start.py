@@ -1,6 +1,6 @@
 """``python -m benchmarks.start``: what a start of the node costs, beside a plain rclpy node.
 
-Resident memory and time until the node is active, with an empty cache of kernels and with a warm one.
+Resident memory and time until the node is active, with an empty cache of kernels and a warm one.
 """
 
 from __future__ import annotations
