@@ -1,7 +1,9 @@
 # make demo   the whole thing on the bundled recording: a table on the screen, pictures in out/
 # make test   lint, types and tests
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
-# make coverage  the tests once more, and which lines they run (compiled kernels are not seen)
+# make coverage  the tests once more, and which lines they run: without what Numba compiles, and
+#                without what runs in processes of its own (nodes, some commands)
+# make docs   the pages as a site, in out/docs; a link that leads nowhere is an error
 # make clean  removes everything that make has made
 #
 # Both prepare a virtual environment first (once). PYTHON chooses the interpreter, VENV the place.
@@ -30,7 +32,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ready := $(VENV)/.ready-$(subst /,_,$(PYTHON))
 python := $(VENV)/bin/python
 
-.PHONY: demo test bench coverage collect warm lint clean
+.PHONY: demo test bench coverage docs collect warm lint clean
 .DELETE_ON_ERROR:
 
 demo: $(ready)
@@ -47,8 +49,14 @@ bench: $(ready) warm
 	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile -m bench --timeout 1800
 
 coverage: $(ready) warm
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input pytest-cov
-	@OPENBLAS_NUM_THREADS=1 $(python) -m pytest -q -n 2 --dist loadfile --cov rs_localizer --cov-report term:skip-covered
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --upgrade --no-deps --target $(VENV)/coverage coverage pytest-cov
+	@PYTHONPATH="$$(cd $(VENV) && pwd)/coverage" OPENBLAS_NUM_THREADS=1 \
+	    $(python) -m pytest -q -n 2 --dist loadfile --timeout 900 --cov --cov-report term:skip-covered
+
+docs: $(ready)
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --editable '.[docs]'
+	@$(python) -m sphinx -q -W --keep-going -c docs . $(OUT)/docs
+	@echo $(OUT)/docs/README.html
 
 # Leaves the tests with their assertions rewritten, which each of the processes would do.
 collect: $(ready)
@@ -73,7 +81,7 @@ $(ready): setup.py pyproject.toml Makefile
 	        "On Debian and Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
 	@echo "Preparing $(VENV) (once, takes a few minutes)"
 	@[ -e $@ ] || $(PYTHON) -m venv --clear $(VENV)
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,hloc,mapping,view,test]'
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,hloc,mapping,table,view,test]'
 	@# Which pip does one file after the other, and the tests of other packages with them.
 	@$(python) -m compileall -qq -j 0 -x '/(tests|pip)/' $(VENV)/lib || true
 	@touch $@

@@ -72,16 +72,19 @@ setup(
         ],
         "colcon": ["colcon-common-extensions", "ros-jazzy-ament-package"],
         "completion": ["argcomplete"],
+        "docs": ["sphinx", "myst-parser", "sphinxcontrib-mermaid"],
         "evo": ["evo"],
         "fleet": ["dask", "distributed"],
         "hloc": ["h5py"],
         "mapping": ["pycolmap"],
+        "table": ["fsspec", "pyarrow"],
         "view": ["rerun-sdk"],
         "test": [
             "build",
             "catkin_pkg",
             "codespell==2.4.*",
             "hypothesis",
+            "pupil-apriltags",  # the detector of AprilRobotics, for what it publishes
             "mypy==2.4.*",  # pinned, as is Ruff: what passes today passes with the next release
             "pytest",
             "pytest-timeout",

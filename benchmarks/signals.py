@@ -23,13 +23,18 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PROGRAM = (sys.executable, "-m", "rs_localizer")
 # Commands by name, and their inputs; each writes to out, or to files that begin so.
 _FLIGHT = "simulate flight --duration 4 --points 60 --rate 20".split()
-_FILM = "simulate film --images --duration 1 --rate 10 --width 320 --height 240".split()
+_FILM = (
+    "simulate film --images --walls marked_room --duration 1 --rate 6 --width 320 --height 240 "
+    "--focal 250 --angular-velocity 0 0.1 0 --linear-velocity 0.5 0 0"
+).split()
 COMMANDS = {
     "replay": "replay flight --params flight/parameters.yaml --out out",
     "detect": "detect film --map film/marker_map.yaml --out out",
     "simulate": "simulate out --duration 4",
     "markers": "markers make out --grid 6x4",
     "calibrate": "calibrate flight --out out.yaml",
+    "map build": "map build film --markers film/marker_map.yaml --params film/parameters.yaml "
+    "--out out --max-keypoints 500 --threads 1",
 }
 
 

@@ -35,7 +35,7 @@ same in the library (`Failure.reason`), in what `replay` prints, in the log and 
 _IMU_INTRODUCTION = """
 ## Why the IMU is not used for an image
 
-The camera goes on alone, and the image has its pose all the same: [imu.md](imu.md).
+The camera continues alone, and the image still has its pose: [imu.md](imu.md).
 
 | reason | means | look at |
 |---|---|---|

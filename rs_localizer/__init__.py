@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rs_localizer.estimation.prior import Prior
     from rs_localizer.io.calibration import read_calibration
     from rs_localizer.localizer import Localizer
+    from rs_localizer.offline.table import localize_recording
     from rs_localizer.solvers.minimal import solve_minimal
     from rs_localizer.tracking import Tracker
 
@@ -37,6 +38,7 @@ __all__ = [
     "Tracker",
     "VelocityPrior",
     "camera_state",
+    "localize_recording",
     "read_calibration",
     "rectify",
     "solve_minimal",
@@ -57,6 +59,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "estimation.prior": ("Prior",),
         "io.calibration": ("read_calibration",),
         "localizer": ("Localizer",),
+        "offline.table": ("localize_recording",),
         "solvers.minimal": ("solve_minimal",),
         "tracking": ("Tracker",),
     }

@@ -379,8 +379,8 @@ class Imu:
     )
     wait: float = setting(
         0.02,
-        "How long a frame waits for the messages of its exposure before the camera goes on alone, "
-        "in s",
+        "How long a frame waits for the messages of its exposure before it is localized without "
+        "them, in s",
         minimum=0.0,
         maximum=1.0,
     )
@@ -486,6 +486,11 @@ class NodeConfig(LocalizerConfig):
         fixed=True,
     )
     map_frame: str = setting("map", "Frame of the points in map_file", fixed=True)
+    marker_map: str = setting(
+        "",
+        "Map file of the markers on the topic detections, as of the marker detector; empty: none",
+        fixed=True,
+    )
     matching: Matching = field(default_factory=Matching)
     imu: Imu = field(default_factory=Imu)
     gravity_in_map: tuple[float, ...] = setting(

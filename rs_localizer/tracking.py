@@ -13,6 +13,7 @@ iterated update). A gyroscope takes the place of the motion model's rotation whe
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +41,17 @@ from rs_localizer.inertial.status import InertialStatus
 from rs_localizer.localizer import Localizer
 from rs_localizer.solvers.table import find_solver
 
+
+class Memory(Enum):
+    """What frames tell the next ones."""
+
+    NOTHING = auto()
+    # A slightly wrong map looks like motion within a frame, now and then like much; many frames
+    # tell which it is.
+    MAP_AND_LENS = auto()
+    MOTION = auto()  # with it, map and lens
+
+
 # A prediction over a longer gap (s) says less than a fresh search costs.
 _LONGEST_GAP = 0.5
 # Frames in a row without a pose after which the track is given up.
@@ -48,11 +60,11 @@ _MOST_FAILURES = 5
 _LEAST_STEP_NS, _MOST_TOO_CLOSE = 1000, 3
 # Share of inliers of the last frames: weight of the newest.
 _NEWEST = 0.3
-# How fast surprises change the accelerations that are expected (exponent), and how much at most.
+# How fast innovations change the expected accelerations (exponent), and how much at most.
 _LEARNING = 0.5
 # The least: with a tenth predictions hold 88 % of a webcam's frames, with this 93 and more.
-_LEAST_JOLTS, _MOST_JOLTS = 0.3, 1e4
-# What a gyroscope knows.
+_LEAST_SCALE, _MOST_SCALE = 0.3, 1e4
+# What a gyroscope measures.
 _TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 # Of a motion that is but a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
@@ -68,7 +80,8 @@ class _Track:
     time_ns: int
     share: float  # of inliers among the points
     experience: Experience  # with shaking, map and lens
-    jolts: Array  # (2,) how many times the configured accelerations, squared: angular, linear
+    # (2,) how many times the configured accelerations, squared: angular, linear
+    process_noise_scale: Array
     failures: int = 0  # frames without a pose since then
 
 
@@ -76,25 +89,31 @@ class Tracker:
     """Localizes the frames of one camera in their order.
 
     Args:
-        localizer: its camera must have a readout time, because the velocities of one image are
-            per readout, and its solver must be one for rolling shutters, because a global shutter
-            knows no velocities.
-        inertial: of the gyroscope whose samples come with the frames; None: there is none.
+        localizer: to remember the motion, its camera must have a readout time, because the
+            velocities of one image are per readout, and its solver must be one for rolling
+            shutters, because a global shutter has no velocities.
+        inertial: of the gyroscope whose samples come with the frames; None: there is none. Needs a
+            readout time. Unless the motion is remembered, its bias is any that a gyroscope may
+            have, and the offset of its stamps the given one.
+        memory: what frames tell the next ones.
 
     Raises:
         ValueError: without a readout time, with a global-shutter solver, or with something else
             than a localizer.
     """
 
-    def __init__(self, localizer: Localizer, inertial: InertialSettings | None = None) -> None:
+    def __init__(
+        self,
+        localizer: Localizer,
+        inertial: InertialSettings | None = None,
+        memory: Memory = Memory.MOTION,
+    ) -> None:
         instance("localizer", localizer, Localizer)
-        if not localizer.camera.readout_time > 0.0:
-            raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
-        if not find_solver(localizer.config.solver).rolling_shutter:
-            raise ValueError(
-                f"tracking needs velocities, which solver {localizer.config.solver} does not find"
-            )
-        self.localizer = localizer
+        if memory is Memory.MOTION:
+            _check_motion(localizer)
+        elif inertial is not None:
+            inertial = replace(inertial, estimate_time_offset=False)
+        self.localizer, self._memory = localizer, memory
         # A readout time that is far off makes wrong velocities per readout of those from frame to
         # frame: then each image speaks for itself, and the frames before give a first guess.
         self.trusts_readout_time = True
@@ -122,8 +141,10 @@ class Tracker:
         return None if self._aid is None else self._aid.status
 
     def _follows(self, time_ns: int) -> bool:
-        """Whether a time follows that of the last frame with a pose."""
+        """Whether the motion of the last frame with a pose predicts that at a time."""
         track = self._track
+        if self._memory is not Memory.MOTION:
+            return False
         return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
 
     def _check_time(self, time_ns: int) -> None:
@@ -153,12 +174,15 @@ class Tracker:
         if track.estimate.turn is not None:
             motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
-        covariance += acceleration_covariance(_jolted(acceleration, track.jolts), dt, readout_time)
+        covariance += acceleration_covariance(
+            _scaled(acceleration, track.process_noise_scale), dt, readout_time
+        )
         covariance += swing
         if self.readout_time_deviation > 0.0:
             share = self.readout_time_deviation / readout_time
-            way = share * dt / readout_time * np.r_[motion.angular_velocity, motion.linear_velocity]
-            covariance[:6, :6] += np.outer(way, way)
+            velocity = np.r_[motion.angular_velocity, motion.linear_velocity]
+            displacement = share * dt / readout_time * velocity
+            covariance[:6, :6] += np.outer(displacement, displacement)
         try:
             return Prior(
                 motion=motion,
@@ -185,20 +209,21 @@ class Tracker:
             imu: samples from before the last frame with a pose, if there are any, until after the
                 exposure of this one; None: the camera goes alone.
         """
-        self._check_time(time_ns)
-        if not self._follows(time_ns):
-            self._track = None
+        if self._memory is Memory.MOTION:
+            self._check_time(time_ns)
+            if not self._follows(time_ns):
+                self._track = None
+        elif self._aid is not None:
+            self._aid.reset()
         share = 0.0 if self._track is None else self._track.share
 
-        def localized(foreseen: GyroPrediction | None) -> tuple[Estimate | Failure, Prior | None]:
-            turn = None if foreseen is None else foreseen.turn
-            prior = None if foreseen is None else foreseen.prior
+        def localized(
+            predicted: GyroPrediction | None,
+        ) -> tuple[Estimate | Failure, Prior | None]:
+            turn = None if predicted is None else predicted.turn
+            prior = None if predicted is None else predicted.prior
             if prior is None:
-                prior = self.prediction(time_ns)
-                if prior is not None and not self.trusts_readout_time:
-                    rest = self.of_rest if turn is None else 0.0
-                    prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
-                prior = prior if turn is None else _beside(prior, turn)
+                prior = self._prior(time_ns, turn)
             if self._track is not None:
                 prior = self._track.experience.with_lens(prior)
             return self.localizer.find(points, pixels, scores, prior, share, turn), prior
@@ -209,18 +234,44 @@ class Tracker:
             result, prior = self._aid.localize(
                 imu, time_ns, lambda: self._before(time_ns), localized
             )
-        if not result:
-            if self._track is not None:
-                self._track.failures += 1
-                if self._track.failures >= _MOST_FAILURES:
-                    self._track = None
-            return result
-        self._track = _followed(self._track, prior, result, time_ns)
-        if self._aid is not None and imu is not None and self._aid.wants_sight():
-            lens, camera = result.lens, self.localizer.camera
-            camera = camera if lens is None else lens.mended(camera)
-            self._aid.seek(row_offset_likelihood(camera, points, pixels, result, time_ns))
+        if result:
+            self._remember(time_ns, prior, result)
+            if self._aid is not None and imu is not None and self._aid.wants_sight():
+                lens, camera = result.lens, self.localizer.camera
+                camera = camera if lens is None else lens.mended(camera)
+                self._aid.seek(row_offset_likelihood(camera, points, pixels, result, time_ns))
+        elif self._track is not None and self._memory is Memory.MOTION:
+            self._track.failures += 1
+            if self._track.failures >= _MOST_FAILURES:
+                self._track = None
         return self.localizer.accepted(result)
+
+    def _prior(self, time_ns: int, turn: KnownTurn | None) -> Prior | None:
+        """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
+        if self._memory is Memory.NOTHING:
+            return Prior(of_rest=self.of_rest) if turn is None else None
+        if self._memory is Memory.MAP_AND_LENS:
+            return None if self._track is None else Prior(scales=self._track.experience.scales)
+        prior = self.prediction(time_ns)
+        if prior is not None and not self.trusts_readout_time:
+            rest = self.of_rest if turn is None else 0.0
+            prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
+        return prior if turn is None else _beside(prior, turn)
+
+    def _remember(self, time_ns: int, prior: Prior | None, result: Estimate) -> None:
+        """Keep what the next frames are to know of this one."""
+        track = self._track
+        if self._memory is Memory.MOTION:
+            self._track = _followed(track, prior, result, time_ns)
+        elif self._memory is Memory.MAP_AND_LENS:
+            experience = Experience.of(result) if track is None else track.experience.and_of(result)
+            if track is not None:
+                seconds, typical = 1e-9 * (time_ns - track.time_ns), self.localizer.config
+                experience = experience.moving(
+                    track.experience.scales.speeds, track.estimate, result, seconds,
+                    typical.velocity_prior,
+                )  # fmt: skip
+            self._track = _Track(result, time_ns, 0.0, experience, np.ones(2))
 
     def _before(self, time_ns: int) -> Before | None:
         """What the last frame says of the motion beside what a gyroscope sees."""
@@ -230,8 +281,9 @@ class Tracker:
         readout_time = self.localizer.camera.readout_time
         motion, covariance, added = unshaken(track.estimate)
         dt = 1e-9 * (time_ns - track.time_ns)
-        jolted = replace(self._beside_turn, linear=_jolted(self._beside_turn, track.jolts).linear)
-        added += acceleration_covariance(jolted, dt, readout_time)
+        scaled = _scaled(self._beside_turn, track.process_noise_scale)
+        expected = replace(self._beside_turn, linear=scaled.linear)
+        added += acceleration_covariance(expected, dt, readout_time)
         return Before(
             track.time_ns,
             motion,
@@ -239,6 +291,16 @@ class Tracker:
             added,
             FADING / readout_time,
             track.experience.scales,
+        )
+
+
+def _check_motion(localizer: Localizer) -> None:
+    """Raise ``ValueError`` where frames do not say how the camera moves."""
+    if not localizer.camera.readout_time > 0.0:
+        raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
+    if not find_solver(localizer.config.solver).rolling_shutter:
+        raise ValueError(
+            f"tracking needs velocities, which solver {localizer.config.solver} does not find"
         )
 
 
@@ -256,38 +318,38 @@ def _beside(prior: Prior | None, turn: KnownTurn) -> Prior | None:
     return replace(prior, motion=still, covariance=covariance)
 
 
-def _followed(track: _Track | None, prior: Prior | None, found: Estimate, time_ns: int) -> _Track:
+def _followed(track: _Track | None, prior: Prior | None, newest: Estimate, time_ns: int) -> _Track:
     """The track and its newest frame."""
-    share = float(np.mean(found.inliers))
+    share = float(np.mean(newest.inliers))
     if track is None or prior is None or prior.motion is None:
-        return _Track(found, time_ns, share, Experience.of(found), np.ones(2))
-    if found.tracked:
+        return _Track(newest, time_ns, share, Experience.of(newest), np.ones(2))
+    if newest.tracked:
         share = (1.0 - _NEWEST) * track.share + _NEWEST * share
-    surprise = _surprise(prior, found)
+    innovation = _innovation(prior, newest)
     return _Track(
-        found,
+        newest,
         time_ns,
         share,
-        track.experience.and_of(found),
-        np.clip(track.jolts * surprise**_LEARNING, _LEAST_JOLTS, _MOST_JOLTS),
+        track.experience.and_of(newest),
+        np.clip(track.process_noise_scale * innovation**_LEARNING, _LEAST_SCALE, _MOST_SCALE),
     )
 
 
-def _surprise(prior: Prior, found: Estimate) -> Array:
-    """How many times farther than predicted the motion has changed, squared: turn and way (2,)."""
+def _innovation(prior: Prior, newest: Estimate) -> Array:
+    """Squared innovation over its expectation (2,): of the turn and of the displacement."""
     assert prior.motion is not None
     assert prior.covariance is not None
     if np.isinf(prior.covariance.diagonal()).any():
-        return np.ones(2)  # a first guess surprises nobody
-    motion, origin = found.beside_turn(), np.zeros(3)
+        return np.ones(2)  # a first guess predicts nothing
+    motion, origin = newest.beside_turn(), np.zeros(3)
     step = step_between(state_in(prior.motion, origin), state_in(motion, origin))
-    joint = np.ascontiguousarray(found.joint_covariance)
-    surprises: Array = surprises_of(step, np.ascontiguousarray(prior.covariance), joint)
-    return surprises
+    joint = np.ascontiguousarray(newest.joint_covariance)
+    innovation: Array = surprises_of(step, np.ascontiguousarray(prior.covariance), joint)
+    return innovation
 
 
-def _jolted(acceleration: Acceleration, jolts: Array) -> Acceleration:
-    angular, linear = np.sqrt(jolts).tolist()
+def _scaled(acceleration: Acceleration, variance_scale: Array) -> Acceleration:
+    angular, linear = np.sqrt(variance_scale).tolist()
     return Acceleration(
         max(angular * acceleration.angular, _LEAST_ACCELERATION),
         max(linear * acceleration.linear, _LEAST_ACCELERATION),

@@ -41,7 +41,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 EVERYTHING = {*MAY_IMPORT, "__init__"}
 MAY_IMPORT |= {
-    "__init__": {*METHOD, "io"},
+    "__init__": {*METHOD, "io", "offline"},
     "ros": EVERYTHING,
     "cli": {*EVERYTHING, "ros"},
     "__main__": {"process", "cli"},

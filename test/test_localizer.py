@@ -234,26 +234,6 @@ def test_random_matches_have_no_pose():
         assert "12 are needed" in result.detail
 
 
-@pytest.mark.parametrize("count", [0, 1, 11])
-def test_too_few_points_are_a_failure_and_no_error(count):
-    points = np.arange(3.0 * count).reshape(count, 3)
-    result = rsl.Localizer(camera()).localize(points, np.arange(2.0 * count).reshape(count, 2))
-    assert not result
-    assert result.reason == rsl.Reason.TOO_FEW_POINTS
-    assert f"{count} usable points of {count}, 12 are needed" in str(result)
-
-
-def test_pixels_beyond_the_lens_are_left_out_and_marked():
-    cam = camera(D=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
-    points, pixels, _ = frame(camera(D=np.zeros(0)), Path(0, 0, 0), 40)
-    pixels[0] = (3000.0, 239.5)
-    result = rsl.Localizer(cam, inlier_threshold=500.0).localize(points, pixels)
-    assert result
-    assert not result.inliers[0]
-    assert np.isnan(result.residuals[0])
-    assert np.isfinite(result.residuals[1:]).all()
-
-
 def adversarial():
     rng = np.random.default_rng(0)
     n = 30
@@ -279,21 +259,6 @@ def test_no_input_crashes_or_warns(solver, points, pixels):
     if result:
         assert np.isfinite(result.covariance).all()
         assert np.isfinite(result.rotation).all()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ((np.zeros((4, 2)), np.zeros((4, 2))), r"points must be \(n,3\)"),
-        ((np.zeros((4, 3)), np.zeros((5, 2))), r"got \(4, 3\) and \(5, 2\)"),
-        ((np.zeros((4, 3)), np.full((4, 2), np.nan)), "pixels must be finite"),
-        ((np.full((4, 3), np.inf), np.zeros((4, 2))), "points must be finite"),
-        ((np.zeros((4, 3)), np.zeros((4, 2)), np.zeros(3)), r"scores must be \(4,\), got \(3,\)"),
-    ],
-)
-def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
-    with pytest.raises(ValueError, match=said):
-        rsl.Localizer(camera()).localize(*arguments)
 
 
 @pytest.mark.bench

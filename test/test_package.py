@@ -33,13 +33,6 @@ def test_package_xml_is_valid_and_of_the_right_kind():
     assert package.licenses == ["Apache-2.0", "CC-BY-4.0"]  # code, and bundled recordings
 
 
-def test_ros_and_pip_name_the_same_maintainers(wheel):
-    (maintainer,) = parse_package(str(ROOT / "package.xml")).maintainers
-    for_pip = message_from_string(metadata(wheel, "METADATA"))
-    assert maintainer.name == for_pip["Maintainer"] == "rs_localizer maintainers"
-    assert maintainer.email == for_pip["Maintainer-email"]
-
-
 def test_versions_agree():
     version = parse_package(str(ROOT / "package.xml")).version
     # The one form that catkin_prepare_release finds and raises.

@@ -60,7 +60,14 @@ def exact_minimum(points, pixels, posterior, terms):
     return np.sum(residuals(np.zeros(18)) ** 2), 2.0 * fit.cost
 
 
-@pytest.mark.parametrize(("tilt", "turn", "travel"), [(30, 1.5, 0.015), (0, 6.0, 0.06), (45, 3, 0)])
+@pytest.mark.parametrize(
+    ("tilt", "turn", "travel"),
+    [
+        (30, 1.5, 0.015),
+        pytest.param(0, 6.0, 0.06, marks=pytest.mark.bench),
+        pytest.param(45, 3, 0, marks=pytest.mark.bench),
+    ],
+)
 def test_the_best_motion_is_the_minimum_of_the_exact_problem(tilt, turn, travel):
     # All points are inliers here, and nothing is averaged yet.
     localizer = rsl.Localizer(CAMERA, inlier_threshold=4.0)

@@ -79,17 +79,6 @@ def test_accelerations_fade_and_leave_their_velocity_and_way(readouts):
 
 
 @pytest.mark.parametrize("readouts", [0.7, 1.1, 15.0])
-def test_the_body_rate_of_later_is_how_the_pose_goes_on(readouts):
-    fading, h = FADING / READOUT, 1e-4
-    first = motion_of(start(ACCELERATIONS))
-    now, ahead, behind = (
-        predict(first, np.eye(18), readouts + shift, fading)[0] for shift in (0.0, h, -h)
-    )
-    rate = Rotation.from_matrix(behind.rotation @ ahead.rotation.T).as_rotvec() / (2 * h)
-    np.testing.assert_allclose(now.angular_velocity, rate, atol=1e-7)
-
-
-@pytest.mark.parametrize("readouts", [0.7, 1.1, 15.0])
 def test_errors_are_carried_along_to_first_order(readouts):
     fading = FADING / READOUT
     factor = 0.1 * np.random.default_rng(3).normal(size=(18, 18))
@@ -213,16 +202,3 @@ def test_without_its_shaking_the_covariance_knows_of_it():
     np.testing.assert_allclose(
         covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.005
     )
-
-
-def test_what_did_not_shake_stays_what_it_is():
-    estimate = shaking()
-    still = rsl.Estimate(
-        estimate.rotation, estimate.translation, estimate.angular_velocity,
-        estimate.linear_velocity, inliers=estimate.inliers, residuals=estimate.residuals,
-        joint_covariance=np.eye(18), global_shutter_inliers=0, iterations=0,
-    )  # fmt: skip
-    motion, covariance, swing = unshaken(still)
-    np.testing.assert_allclose(state(motion), state(still), atol=1e-15)
-    np.testing.assert_array_equal(covariance, np.eye(18))
-    assert not swing.any()

@@ -20,7 +20,7 @@ from rs_localizer.io.maps.files import read_map_file, write_map_file
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.maps.ply import write_ply
 from rs_localizer.io.messages import MessageError
-from rs_localizer.settings import SettingsError, build, parse_assignment
+from rs_localizer.settings import build
 from rs_localizer.settings import settings as all_settings
 from rs_localizer.simulation.scene import map_rows
 
@@ -166,16 +166,3 @@ def test_any_parameters_are_settings_or_refused(values):
     except ValueError as error:
         said = str(error)
     assert not said or any(name.split(".")[-1] in said for name in values)
-
-
-@quick
-@given(
-    text=st.text(max_size=30)
-    | st.builds("{}:={}".format, st.sampled_from(sorted(all_settings())), st.text(max_size=12))
-)
-def test_any_assignment_is_one_or_refused(text):
-    try:
-        name, _ = parse_assignment(text)
-    except SettingsError:
-        return
-    assert name in all_settings()

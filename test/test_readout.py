@@ -28,11 +28,6 @@ def test_a_camera_is_found_by_words_and_all_of_its_modes_are_told():
     assert one.median == pytest.approx(from_line_time(3448 / 182.4e6, 1080), rel=2e-3)
 
 
-def test_values_of_the_whole_interval_are_marked():
-    assert all(known.upper_bound for known in find_readout("Canon R10", "30 Hz"))
-    assert not any(known.upper_bound for known in find_readout("Sony a7sIII"))
-
-
 def test_an_unknown_camera_or_mode_is_said_with_what_there_is():
     with pytest.raises(ValueError, match="Sony a7sIII"):
         find_readout("Sonny a7sIII")

@@ -61,7 +61,7 @@ def test_the_detectors_files_hold_exactly_their_defaults_and_choices(file, kind)
 
 @pytest.mark.parametrize(
     "heading",
-    ["/**", "rs_localizer", "/rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*"],
+    ["rs_localizer", "/robot/rs_localizer", "/**/rs_localizer", "/*"],
 )
 def test_headings_that_mean_the_node(tmp_path, heading):
     path = params(tmp_path, f"{heading}:\n  ros__parameters:\n    seed: 5\n")
@@ -109,14 +109,6 @@ def test_files_that_cannot_be_used(tmp_path, text, fault):
         load_params_file(params(tmp_path, text))
 
 
-def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(SettingsError, match=r"none\.yaml cannot be read: No such file"):
-        load_params_file(tmp_path / "none.yaml")
-    (tmp_path / "binary").write_bytes(b"\xff\xfe\xfa")
-    with pytest.raises(SettingsError, match="is not a YAML file"):
-        load_params_file(tmp_path / "binary")
-
-
 @pytest.mark.parametrize(
     ("text", "name", "value"),
     [
@@ -130,12 +122,6 @@ def test_files_that_cannot_be_read(tmp_path):
 )
 def test_assignments(text, name, value):
     assert parse_assignment(text) == (name, value)
-
-
-@pytest.mark.parametrize("text", ["solver", "solver=p3p", ":=3", "sead:=3", "seed:=[", ""])
-def test_assignments_that_are_none(text):
-    with pytest.raises(SettingsError):
-        parse_assignment(text)
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ class Report:
             f"slowest input took {1e3 * seconds:.0f} ms ({target}, number {number})"
         )
         for failure in self.failures[:20]:
-            lines.append(f"\n{failure.target}, number {failure.number}: {failure.what}")
+            lines.append(f"\n{failure.target}, number {failure.number}: {failure.what:.300}")
             lines.append(f"  {failure.case!r:.2000}")
         return "\n".join(lines)
 

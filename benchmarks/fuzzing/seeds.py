@@ -13,11 +13,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_typestore
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import make_message
+from rs_localizer.io.bags import BagWriter, make_message
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.maps.npz import write_npz
@@ -250,4 +253,65 @@ def database() -> bytes:
             tables.execute("INSERT INTO descriptors VALUES (?, 0, 3, 128, ?)", (image_id, data))
         tables.commit()
         tables.close()
+        return path.read_bytes()
+
+
+def recordings() -> dict[str, list[bytes]]:
+    """Files of recordings by their suffixes: two readings of an IMU each."""
+    found: dict[str, list[bytes]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for storage, suffix in (("mcap", ".mcap"), ("sqlite3", ".db3")):
+            path = Path(folder) / storage
+            with BagWriter(path, storage) as bag:
+                for stamp_ns in (5_000_000_007, 6_000_000_007):
+                    bag.write("/imu", _imu_message(), stamp_ns)
+            found[suffix] = [next(path.glob(f"*{suffix}")).read_bytes()]
+            found.setdefault("metadata.yaml", [(path / "metadata.yaml").read_bytes()])
+        path = Path(folder) / "a.bag"
+        store = get_typestore(Stores.ROS1_NOETIC)
+        with Ros1Writer(path) as writer:
+            connection = writer.add_connection("/t", "std_msgs/msg/Float64", typestore=store)
+            message = store.types["std_msgs/msg/Float64"](1.5)
+            writer.write(connection, 5, store.serialize_ros1(message, "std_msgs/msg/Float64"))
+        found[".bag"] = [path.read_bytes()]
+    return found
+
+
+def _imu_message() -> Any:
+    def vector(x: float, y: float, z: float) -> Any:
+        return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    turned = make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    stamp = make_message("builtin_interfaces/msg/Time", sec=5, nanosec=7)
+    return make_message(
+        "sensor_msgs/msg/Imu",
+        header=make_message("std_msgs/msg/Header", stamp=stamp, frame_id="imu"),
+        orientation=turned,
+        orientation_covariance=np.zeros(9),
+        angular_velocity=vector(0.1, -0.2, 0.3),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=vector(0.2, -9.7, 0.4),
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def model_images() -> tuple[bytes, bytes]:
+    """Images of COLMAP, binary and as text: two with two features each."""
+    binary, text = struct.pack("<Q", 2), "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+    for number in (1, 2):
+        binary += struct.pack("<I7dI", number, 1, 0, 0, 0, 0, 0, number, 1)
+        binary += f"{number}.jpg".encode() + b"\0" + struct.pack("<Q", 2)
+        binary += struct.pack("<ddqddq", 3, 4, 4, 5, 6, -1)
+        text += f"{number} 1 0 0 0 0 0 {number} 1 {number}.jpg\n3 4 4 5 6 -1\n"
+    return binary, text.encode()
+
+
+def features_h5() -> bytes:
+    """Features and matches of two images as hloc writes them, in one file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "features.h5"
+        with h5py.File(path, "w") as file:
+            for name in ("a.jpg", "b.jpg"):
+                file[f"{name}/keypoints"] = np.arange(8, dtype=np.float32).reshape(4, 2)
+            file["a.jpg/b.jpg/matches0"] = np.array([1, -1, 0, 2], np.int16)
         return path.read_bytes()

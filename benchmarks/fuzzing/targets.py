@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import zipfile
 from collections.abc import Callable, Sequence
@@ -14,16 +15,22 @@ from typing import Any
 from benchmarks.fuzzing import calibrations, seeds
 from benchmarks.fuzzing.mutations import damaged, damaged_message
 from rs_localizer.config import NodeConfig
+from rs_localizer.io.bags import BagError, open_bag
 from rs_localizer.io.calibration import CalibrationError, read_calibration
 from rs_localizer.io.camera_info import read_camera_info
 from rs_localizer.io.clouds import read_correspondences
+from rs_localizer.io.hloc import HlocError, open_h5, read_pairs, read_queries
 from rs_localizer.io.images import read_compressed_image, read_image
-from rs_localizer.io.imu import read_imu
+from rs_localizer.io.imu import ImuFileError, read_imu, read_imu_csv
 from rs_localizer.io.keypoints import read_keypoints, read_map
+from rs_localizer.io.maps.colmap import read_images
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import MapError
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.trajectories import TrajectoryError, read_tum
+from rs_localizer.io.trajectories import TrajectoryError, read_tum, read_twists
+from rs_localizer.io.video import VideoError, read_video
+from rs_localizer.markers.formats.common import Unsaid
+from rs_localizer.markers.formats.files import read_any
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
 from rs_localizer.pipeline.frames import FrameLocalizer
@@ -48,7 +55,15 @@ rs_localizer:
 """
 _ASSIGNMENTS = (b"readout_time:=0.03", b"matching.by:=id", b"tracking:=false", b"map_file:=''")
 _TUM = b"# t x y z qx qy qz qw\n1.5 0 0 1 0 0 0 1\n2.5 1 0 1 0 0 0.6 0.8\n"
-_MARKERS = b"""
+_TWISTS = b"# t wx wy wz vx vy vz\n1.5 0 0 1 0 0 0\n2.5 1 0 1 0 0 0.6\n"
+_IMU = b"#timestamp [ns],wx,wy,wz,ax,ay,az\n1000,0.1,0.2,0.3,0,9.8,0\n2000,0.1,0.2,0.3,0,9.8,0\n"
+_QUERIES = (
+    b"q/1.jpg OPENCV 640 480 500 500 320 240 0.1 0 0 0\n2.jpg PINHOLE 640 480 500 500 320 240\n"
+)
+_WPILIB = b"""{"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 0.0, "z": 1.5},
+"rotation": {"quaternion": {"W": 0.5, "X": 0.5, "Y": 0.5, "Z": 0.5}}}}],
+"field": {"length": 16.5, "width": 8.1}}"""
+_MARKERS = b"""# markers of a room, surveyed with a tape measure; lengths in metres, poses of each
 map_frame: map
 markers:
   - family: 4x4_50
@@ -138,7 +153,93 @@ def targets(folder: Path) -> dict[str, Target]:
         "marker map": Target(
             _bytes((_MARKERS,)), _file(folder / "markers.yaml", read_marker_map), (MarkerMapError,)
         ),
+    } | _more_files(folder)
+
+
+def _more_files(folder: Path) -> dict[str, Target]:
+    """Recordings, tables, and what COLMAP and hloc write."""
+    bags, (binary, text), error = seeds.recordings(), seeds.model_images(), (MapError,)
+    broken = folder / "broken"
+    broken.mkdir()
+    (broken / "mcap.mcap").write_bytes(bags[".mcap"][0])
+    found = {
+        f"bag {suffix}": Target(
+            _bytes(bags[suffix]), _file(folder / f"a{suffix}", _read_bag), (BagError,), every=4
+        )
+        for suffix in (".mcap", ".db3", ".bag")
     }
+    return found | {
+        "metadata.yaml": Target(
+            _bytes(bags["metadata.yaml"]),
+            _file(broken / "metadata.yaml", lambda path: _read_bag(path.parent)),
+            (BagError,),
+            every=4,
+        ),
+        "trajectory .gz": Target(
+            _packed((_TUM,)), _file(folder / "poses.txt.gz", read_tum), (TrajectoryError,)
+        ),
+        "twists": Target(
+            _bytes((_TWISTS,)), _file(folder / "twists.txt", read_twists), (TrajectoryError,)
+        ),
+        "imu .csv": Target(
+            _bytes((_IMU,)), _file(folder / "imu.csv", read_imu_csv), (ImuFileError,)
+        ),
+        "images.bin": Target(_bytes([binary]), _images(folder / "ib", "images.bin"), error),
+        "images.txt": Target(_bytes([text]), _images(folder / "it", "images.txt"), error),
+        "queries": Target(
+            _bytes((_QUERIES,)), _file(folder / "queries.txt", read_queries), (HlocError,)
+        ),
+        "pairs": Target(
+            _bytes((b"q.jpg a.jpg\nq.jpg b.jpg\n",)),
+            _file(folder / "p.txt", read_pairs),
+            (HlocError,),
+        ),
+        "features.h5": Target(
+            _bytes([seeds.features_h5()]), _file(folder / "f.h5", _read_h5), (HlocError,)
+        ),
+        "video .mjpeg": Target(
+            _bytes([2 * seeds.compressed(".jpg")]),
+            _file(folder / "v.mjpeg", _read_film),
+            (VideoError,),
+        ),
+        "markers .json": Target(
+            _bytes((_WPILIB,)), _file(folder / "field.json", _read_field), (MarkerMapError,)
+        ),
+    }
+
+
+def _packed(good: Sequence[bytes]) -> Callable[[Random], bytes]:
+    """Damaged text, packed with a right check sum, and packed text that is damaged."""
+
+    def make(random: Random) -> bytes:
+        if random.random() < 0.6:
+            return gzip.compress(damaged(random.choice(good), good, random), mtime=0)
+        return damaged(gzip.compress(random.choice(good), mtime=0), good, random)
+
+    return make
+
+
+def _images(folder: Path, name: str) -> Callable[[bytes], object]:
+    folder.mkdir()
+    return _file(folder / name, lambda path: read_images(path.parent))
+
+
+def _read_bag(path: Path) -> object:
+    with open_bag(path) as bag:
+        return sum(1 for _ in bag.messages(list(bag.topics)))
+
+
+def _read_h5(path: Path) -> object:
+    with open_h5(path) as file:
+        return file.keypoints("a.jpg"), file.matches("b.jpg", "a.jpg")
+
+
+def _read_field(path: Path) -> object:
+    return read_any(path, Unsaid(size=0.165))
+
+
+def _read_film(path: Path) -> object:
+    return sum(1 for _ in read_video(path))
 
 
 class _Localizer:

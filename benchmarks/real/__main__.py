@@ -16,6 +16,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
+from benchmarks.real.calibrations import report
 from benchmarks.real.clips import clips_of, opencv_lens, shutter_of
 from benchmarks.real.judging import METHODS, judged
 from rs_localizer.cli.settings_args import add_settings, given_settings
@@ -59,10 +60,19 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="corners, calibrations (default: OUT/cache)")
     parser.add_argument("--images", type=int, default=300, help="most of each video")
     parser.add_argument("--only", nargs="*", default=[], help="names of videos without suffix")
+    parser.add_argument(
+        "--calibrations", action="store_true", help="calibrate's halves and thirds instead"
+    )
     add_settings(parser)
     args = parser.parse_args()
     cache = args.cache or args.out / "cache"
     config = given_settings(args)
+    if args.calibrations:
+        text = report(clips_of(args.folder, cache, args.images, args.only), cache)
+        args.out.mkdir(parents=True, exist_ok=True)
+        print(text)
+        (args.out / "calibrations.txt").write_text(text + "\n", encoding="utf-8")
+        return
     rows: dict[str, Row] = {}
     for clip in clips_of(args.folder, cache, args.images, args.only):
         shutter = shutter_of(clip, cache)

@@ -20,8 +20,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
-from rs_localizer.pipeline.single_frames import SingleFrames
-from rs_localizer.tracking import Tracker
+from rs_localizer.tracking import Memory, Tracker
 from rs_localizer.trajectory.observe import Observed
 from rs_localizer.trajectory.online_readout import REVERSED
 
@@ -72,7 +71,7 @@ def localized(
     """
     if name == "default":
         localizer = Localizer(replace(camera, readout_time=0.0), config)
-        remembering = SingleFrames(localizer, remembers=True)
+        remembering = Tracker(localizer, memory=Memory.MAP_AND_LENS)
         return [
             remembering.localize(image.stamp_ns, image.points, image.pixels) for image in images
         ]

@@ -1,4 +1,4 @@
-# The nodes in a workspace of ROS 2, as docs/ros_workspace.md says.
+# The nodes in a workspace of ROS 2, as docs/install.md says.
 #   docker build --file packaging/docker/ros.Dockerfile --tag rs_localizer:jazzy .
 #   docker build --file packaging/docker/ros.Dockerfile --build-arg ROS_DISTRO=lyrical --tag rs_localizer:lyrical .
 #   docker run --rm --network host rs_localizer:jazzy ros2 launch rs_localizer localizer.launch.py

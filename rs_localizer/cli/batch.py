@@ -13,11 +13,13 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError
 from rs_localizer.io.atomic_files import write_errors
+from rs_localizer.io.remote import Location, is_url
 from rs_localizer.offline.fleet.cluster import Where, perform_all
 from rs_localizer.offline.fleet.identity import folder_names, identity, program, read_marker
 from rs_localizer.offline.fleet.summary import (
@@ -76,9 +78,11 @@ class Plan:
 
     kind: Kind
     # What a result depends on beside the recording and the settings.
-    inputs: Callable[[Path], Sequence[Path]]
+    inputs: Callable[[Any], Sequence[Location]]
     # Whether results of other settings are replaced; None: the command has no such option.
     overwrite: bool | None = None
+    # What is made of all complete results, in the order of the recordings.
+    gather: Callable[[Sequence[Path]], object] | None = None
 
 
 def run_batch(args: Namespace, plan: Plan) -> None:
@@ -106,6 +110,8 @@ def run_batch(args: Namespace, plan: Plan) -> None:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
             _find_finished(tasks, rows)
             write_summary(out, plan.kind.command, list(rows.values()))
+        if plan.gather is not None:
+            plan.gather([task.folder for task in tasks if rows[task.name].state == DONE])
     print(f"written to {args.out}: {CSV}, {MARKDOWN}, {PICTURE}")
     if failed := sum(row.state == FAILED for row in rows.values()):
         raise ValueError(f"{failed} of {len(rows)} recordings failed; {args.out / CSV} says why")
@@ -140,9 +146,9 @@ def _tasks(args: Namespace, plan: Plan, out: Path) -> list[Task]:
     ]
 
 
-def _absolute(path: Path) -> Path:
-    """Without "..", and with links as they are called."""
-    return Path(os.path.abspath(path))
+def _absolute(place: Location) -> Location:
+    """Without "..", and with links as they are called; URLs as they are."""
+    return place if is_url(place) else Path(os.path.abspath(place))
 
 
 def _check(tasks: list[Task], plan: Plan) -> None:
@@ -207,7 +213,7 @@ def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
     return left
 
 
-def _row(recording: Path, outcome: Outcome) -> Row:
+def _row(recording: Location, outcome: Outcome) -> Row:
     state = FAILED if outcome.figures is None else DONE
     return Row(recording, outcome.name, state, outcome.figures or {}, outcome.reason)
 
@@ -236,5 +242,5 @@ def folder_name(option: str, folder: Path | None) -> str | None:
     return folder.name
 
 
-def inputs(*files: Path | str | None) -> list[Path]:
-    return [Path(file) for file in files if file]
+def inputs(*files: Location | None) -> list[Location]:
+    return [file if is_url(file) else Path(file) for file in files if file]

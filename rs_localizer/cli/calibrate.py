@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -268,8 +269,12 @@ def _write(
         writers[lens] = lambda part: write_calibration(part, found.fit.camera)
     if marker_map is not None and verdict.shape_is_free(found):
         shape = path.with_name(f"{path.stem}_map.yaml")
-        bent = marker_map.with_points(verdict.moved(found, marker_map.points))
-        writers[shape] = lambda part: write_marker_map(part, bent)
+        places = verdict.moved(found, marker_map.points)
+        marker_map = marker_map.with_points(places, found.shape_deviation)
+        writers[shape] = partial(write_marker_map, marker_map=marker_map)
+    if marker_map is not None:
+        declared = config.map_deviation or marker_map.settings.get("map_deviation", 0.0)
+        text += f"    map_deviation: {declared:.3g}\n" if declared else ""
     writers[path] = lambda part: part.write_text(text, encoding="utf-8")
     with atomic_files(*writers) as parts:
         for part, write in zip(parts, writers.values(), strict=True):

@@ -99,7 +99,7 @@ def detect_one(args: argparse.Namespace) -> Recorded:
         atomic_directory(args.out, replaced(args, "metadata.yaml")) as out,
     ):
         recorded = _record(args, source, detector, out)
-        write_shutter(args, out)
+        write_shutter(args, out, marker_map.settings)
     _tell(args, recorded, notices)
     for fault in (*recorded.faults, *time_faults(args, source.clock, recorded.period)):
         print(f"warning: {fault}")
@@ -206,7 +206,7 @@ def _tell_features(args: argparse.Namespace, extraction: Extraction) -> None:
 def _detect_batch(args: argparse.Namespace) -> None:
     """``detect`` in many recordings."""
     if args.timing:
-        raise UsageError("--timing is of one recording: beside others it would tell little")
+        raise UsageError("--timing is for one recording: beside others it means little")
     files = inputs(args.map, args.calibration, args.params)
     kind = Kind("detect", _detect_of_many, "detect", _detect_warm)
     run_batch(args, Plan(kind, lambda _: files, args.overwrite))

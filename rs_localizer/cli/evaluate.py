@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_offset_argument,
         metavar=f"S|{_AUTO}",
         help="add this to the times of EST, and interpolate TRUTH; "
-        f"{_AUTO}: by how much the clocks differ, which is told in any case",
+        f"{_AUTO}: the offset between the clocks, which is printed in any case",
     )
     parser.add_argument(
         "--ate",
@@ -153,8 +153,8 @@ def _offset(given: str, found: TimeOffset | None) -> float:
         return float(number()(given))
     if found is None:
         raise ValueError(
-            "the motion does not tell a time offset: too short, too little turning, or not the "
-            "same motion; give it with --offset SECONDS"
+            "the motion does not determine a time offset: too short, too little turning, or not "
+            "the same motion; give it with --offset SECONDS"
         )
     return found.seconds
 
@@ -182,7 +182,7 @@ def _hint(found: TimeOffset | None) -> str:
 def _print_offset(found: TimeOffset | None) -> None:
     """What the time offset is; a warning where it matters."""
     if found is None:
-        print("time offset: not to be told from this motion")
+        print("time offset: not determined by this motion")
         return
     before, after = found.before, found.after
     print(

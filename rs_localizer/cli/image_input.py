@@ -94,9 +94,11 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
     return given_values(args, also)
 
 
-def write_shutter(args: argparse.Namespace, out: Path) -> None:
-    """What is known of the shutter, into the directory of a recording."""
-    if values := shutter_values(args):
+def write_shutter(
+    args: argparse.Namespace, out: Path, of_map: Mapping[str, float] | None = None
+) -> None:
+    """What is known of the shutter and of the map, into the directory of a recording."""
+    if values := {**(of_map or {}), **shutter_values(args)}:
         write_parameters(out / PARAMETERS, values)
 
 
@@ -126,10 +128,11 @@ def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: floa
 def tell_next(args: argparse.Namespace, more: str = "") -> None:
     """The command that makes poses of the recording, with further options."""
     out = shlex.quote(str(args.out))
-    with_parameters = (args.out / PARAMETERS).exists()
-    shutter = f"--params {out}/{PARAMETERS}" if with_parameters else "-p readout_time:=SECONDS"
+    settings = f" --params {out}/{PARAMETERS}" if (args.out / PARAMETERS).exists() else ""
+    if "readout_time" not in shutter_values(args):
+        settings += " -p readout_time:=SECONDS"
     poses = shlex.quote(f"{args.out}_poses")
-    print(f"next: rs_localizer replay {out} {shutter}{more} --out {poses}")
+    print(f"next: rs_localizer replay {out}{settings}{more} --out {poses}")
 
 
 @dataclass(frozen=True, slots=True)

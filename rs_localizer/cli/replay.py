@@ -8,7 +8,10 @@ import importlib.util
 import json
 import shlex
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 from tqdm import tqdm
 
@@ -34,27 +37,32 @@ from rs_localizer.config import ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagError, BagReader, BagWriter, is_bag, open_bag
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.remote import Location, is_url, location, url_name
 from rs_localizer.io.topics import IMU
 from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.offline.image_sources import INFO_TYPE, holds_images, image_topics
 from rs_localizer.offline.replay import (
     NO_FRAMES,
     TF_TYPE,
+    Answer,
     Topics,
     find_topics,
-    find_transforms,
     has_frames,
     imu_topics,
+    prepare,
     replay,
     tf_topics,
 )
 from rs_localizer.offline.smoothed import smooth_frames
+from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
 from rs_localizer.offline.viewing.stream import check_screen, write_view
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.trajectory.warm_up import warm_up
 
 _SUFFIX = ".rrd"
+# The table of one recording of many, in its folder.
+TABLE = "frames.parquet"
 # Known by being this very object: a user's view.rrd is in the current directory, as any other name.
 _BESIDE_POSES = Path(VIEW)
 
@@ -62,10 +70,11 @@ _BESIDE_POSES = Path(VIEW)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
-        type=Path,
+        type=location,
         nargs="+",
         metavar="RECORDING",
-        help="rosbag2 (MCAP, sqlite3) or ROS 1 bag; several: see many recordings",
+        help="rosbag2 (MCAP, sqlite3) or ROS 1 bag, or its URL (s3://, gs://, ...; needs "
+        "'rs_localizer[table]'); several: see many recordings",
     )
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
     add_topics(topics)
@@ -86,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(offline)
     offline.add_argument(
         "--map",
-        type=Path,
+        type=location,
         metavar="FILE",
         help="the map of the keypoints: as -p map_file:=FILE",
     )
@@ -121,7 +130,7 @@ def run(args: argparse.Namespace) -> Figures | None:
     if is_batch(args):
         _replay_batch(args, _settings(args))
         return None
-    recording: Path = args.recordings[0]
+    recording: Location = args.recordings[0]
     if args.ros:
         _refuse_images(recording)
         with open_bag(recording) as bag:
@@ -129,8 +138,14 @@ def run(args: argparse.Namespace) -> Figures | None:
             topics = None if only_images else find_topics(bag, given_topics(args))
             _play(bag, topics, args.rate or 1.0, _played_imus(bag, args))
         return None
-    out = args.out or Path(f"{recording.resolve().with_suffix('').name}_replay")
+    out = args.out or Path(f"{_name(recording)}_replay")
     return {"out": str(out)} | figures(_replay_one(args, recording, out))
+
+
+def _replayed(args: argparse.Namespace) -> NodeConfig:
+    """The settings, with what the topics say of them."""
+    config = _settings(args)
+    return replace(config, imu=replace(config.imu, use=ImuUse.NONE)) if args.no_imu else config
 
 
 def _settings(args: argparse.Namespace) -> NodeConfig:
@@ -139,15 +154,26 @@ def _settings(args: argparse.Namespace) -> NodeConfig:
     return given_settings(args, given, FrameLocalizer)  # refuses what it cannot do
 
 
-def _refuse_images(recording: Path) -> None:
+def _name(recording: Location) -> str:
+    """A recording's own name, for what is made of it."""
+    path = Path(url_name(recording)) if is_url(recording) else Path(recording).resolve()
+    return path.with_suffix("").name
+
+
+def _refuse_images(recording: Location) -> None:
+    if is_url(recording):
+        return
+    recording = Path(recording)
     if not is_bag(recording) and (pictures := holds_images(recording)):
         raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
 
 
-def _replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: bool = True) -> Tally:
+def _replay_one(
+    args: argparse.Namespace, recording: Location, out: Path, timed: bool = True
+) -> Tally:
     """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
     _refuse_images(recording)
-    config = _settings(args)
+    config = _replayed(args)
     notices: dict[str, tuple[int, str]] = {}
 
     def notice(name: str, text: str) -> None:
@@ -158,20 +184,15 @@ def _replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: boo
             raise ValueError(
                 f"{recording} holds images, not matches: first {_detect_command(recording)}"
             )
-        topics = find_topics(bag, given_topics(args))
-        if args.no_imu or config.imu.use == ImuUse.NONE:
-            topics = topics.without(IMU)
-        elif IMU not in topics.of and (several := imu_topics(bag)):
+        topics, localizer = prepare(bag, config, given_topics(args), notice)
+        unused = IMU not in topics.of and config.imu.use != ImuUse.NONE
+        if unused and (several := imu_topics(bag)):
             print(f"no IMU is used: choose {' or '.join(several)} with --imu")
-        if topics.lacks_map and not config.map_file:
-            raise ValueError(f"{recording} has {topics.frames} and no map; give one with --map")
-        transforms = find_transforms(bag, topics, config)
-        localizer = FrameLocalizer(config, notice, transforms)
-        localizer.load_map()
         if args.smooth and config.readout_time == 0.0:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         localizer.warm_up()
-        tally = Tally(bag.count([topics.frames]), notices)
+        table = None if args.parquet is None else FrameTable(recording)
+        tally = Tally(bag.count([topics.frames]), notices, table)
         with fresh(out, args.overwrite) as built:
             _hint(recording, args.params)
             frames = _replay(bag, topics, localizer, tally, built, args)
@@ -179,6 +200,9 @@ def _replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: boo
         if view is not None:
             print(f"to look at: rerun {out / view.name if view.parent == built else view}")
         _tell(tally, config, out, timed)
+        if table is not None:
+            rows = write_parquet([table.table()], args.parquet)
+            print(f"written to {args.parquet}: {rows} rows, one a frame")
         # The result is there, whether the viewer starts or not.
         if args.view and frames:
             write_view(bag, topics, localizer, frames, None)
@@ -189,11 +213,11 @@ def _replay_one(args: argparse.Namespace, recording: Path, out: Path, timed: boo
     return tally
 
 
-def _detect_command(path: Path) -> str:
+def _detect_command(path: Location) -> str:
     """What finds the matches in images."""
     source = shlex.quote(str(path))
-    calibration = "" if is_bag(path) else " --calibration camera.yaml"
-    seen = shlex.quote(f"{path.resolve().with_suffix('').name}_seen")
+    calibration = "" if is_url(path) or is_bag(Path(path)) else " --calibration camera.yaml"
+    seen = shlex.quote(f"{_name(path)}_seen")
     return (
         f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {seen} (or --board "
         "6x4 --square 0.03, or --features sift, instead of --map), then: rs_localizer replay "
@@ -216,10 +240,12 @@ def _check_usage(args: argparse.Namespace) -> None:
     if args.rate is not None and not 0.0 < args.rate < float("inf"):
         raise UsageError(f"--rate must be positive, got {args.rate}")
     if not args.ros:
-        if args.rate is not None and (args.nerfstudio or args.gsplat):
-            raise UsageError("--nerfstudio and --gsplat are of images, --rate of samples between")
-        if args.gsplat is not None and is_batch(args):
-            raise UsageError("--gsplat is of one recording")
+        if args.rate is not None and (args.nerfstudio or args.gsplat or args.ncore):
+            raise UsageError(
+                "--nerfstudio, --gsplat and --ncore are of images, --rate of samples between"
+            )
+        if (args.gsplat or args.ncore) and is_batch(args):
+            raise UsageError("--gsplat and --ncore are of one recording")
         if args.rate is not None and not args.smooth:
             raise UsageError(
                 "--rate goes with --ros or --smooth; offline replay runs at full speed"
@@ -228,17 +254,44 @@ def _check_usage(args: argparse.Namespace) -> None:
     if is_batch(args):
         raise UsageError("--ros plays one recording, and needs no workers")
     given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
-    if any((*given, args.rows, args.nerfstudio, args.gsplat)):
+    if any((*given, args.rows, args.nerfstudio, args.gsplat, args.ncore, args.parquet)):
         raise UsageError(
-            "--out, --overwrite, --params, --map, --row, --nerfstudio, --gsplat, --smooth, -p are "
-            "for offline replay; with --ros the node has the settings and publishes the result"
+            "--out, --overwrite, --params, --map, --row, --nerfstudio, --gsplat, --ncore, "
+            "--parquet, --smooth, -p are for offline replay; with --ros the node has the settings "
+            "and publishes the result"
         )
 
 
-def _hint(bag: Path, params: Path | None) -> None:
+def _hint(recording: Location, params: Path | None) -> None:
+    if is_url(recording):
+        return
+    bag = Path(recording)
     file = (bag if bag.is_dir() else bag.parent) / "parameters.yaml"
     if params is None and file.is_file():
         print(f"the recording has settings of its own: --params {shlex.quote(str(file))}")
+
+
+def _localized(
+    bag: BagReader,
+    topics: Topics,
+    localizer: FrameLocalizer,
+    tally: Tally,
+    refused: list[Answer],
+    bar: tqdm[NoReturn],
+) -> Iterator[tuple[int, Localized]]:
+    """The frames with a pose, and when they were recorded; the others are counted and kept."""
+    for answer in replay(bag, topics, localizer):
+        result = answer.result
+        if result:
+            tally.add(result)
+            yield answer.recorded_ns, result
+        else:
+            tally.refuse(result)
+            if result.reason in NO_FRAMES:
+                continue
+            if tally.table is not None:
+                refused.append(answer)
+        bar.update()
 
 
 def _replay(
@@ -252,36 +305,38 @@ def _replay(
     """Replay into ``out``; the frames of the result, where something needs all of them at once."""
     exports = Exports(args, localizer, out)
     whole: list[Localized] = []
-    keep = args.smooth or args.rerun is not None or args.view
+    refused: list[Answer] = []
+    smoothed: set[int] = set()  # stamps of images
+    keep = args.rerun is not None or args.view
     start = time.perf_counter()
     # The bar is for a person who waits: none in a log file.
     with (
         BagWriter(out / RESULT, args.storage) as writer,
         tqdm(total=tally.total, unit="frame", desc="replay", disable=None) as bar,
     ):
-
-        def write(frame: Localized, recorded_ns: int) -> None:
+        frames = _localized(bag, topics, localizer, tally, refused, bar)
+        if args.smooth:
+            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
+            parts = smooth_frames(localizer, (frame for _, frame in frames), stamps, args.rate)
+            frames = (
+                (frame.input_stamp_ns, frame) for part in parts for frame in tally.smooth(part)
+            )
+        for recorded_ns, frame in frames:
             tally.not_sent += not write_frame(writer, frame, localizer, recorded_ns)
             tally.track.add(frame)
             exports.add(frame)
-
-        for recorded_ns, result in replay(bag, topics, localizer):
-            if result:
-                tally.add(result)
-                if keep:
-                    whole.append(result)
-                if not args.smooth:
-                    write(result, recorded_ns)
-            else:
-                tally.refuse(result)
-            bar.update(1 if result or result.reason not in NO_FRAMES else 0)
-        if args.smooth and whole:
-            stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
-            tally.smoothed = smooth_frames(localizer, whole, stamps, args.rate)
-            whole = tally.smoothed.frames
-            for frame in whole:
-                write(frame, frame.input_stamp_ns)
-            write_bridged(out, tally.smoothed.bridged)
+            if tally.table is not None:
+                tally.table.add(frame.input_stamp_ns, frame)
+                if args.smooth:
+                    smoothed.add(frame.input_stamp_ns)
+            if keep:
+                whole.append(frame)
+    if tally.smoothed is not None:
+        write_bridged(out, tally.smoothed.bridged)
+    if tally.table is not None:
+        for answer in refused:
+            if answer.stamp_ns not in smoothed:
+                tally.table.add(answer.stamp_ns, answer.result)
     tally.seconds = time.perf_counter() - start
     tally.imu = localizer.imu.state
     if (measured := localizer.readout_watch.measured) is not None:
@@ -399,7 +454,7 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
     if images:
         print(f"{bag.count(images)} images published in {played.seconds:.1f} s")
     for topic, count in played.poses.items():
-        print(f"{count} poses heard on {topic}")
+        print(f"{count} poses received on {topic}")
     if not played.poses:
         print(f"no node {NODE_NAME} was there to publish poses")
 
@@ -424,10 +479,19 @@ def _replay_batch(args: argparse.Namespace, config: NodeConfig) -> None:
     """``replay`` of many recordings."""
     kernels = f"replay {config.solver}{' smooth' if args.smooth else ''}"
     if config.map_file:  # where it is from here, whatever directory a worker is in
-        args = argparse.Namespace(**vars(args) | {"map": Path(config.map_file)})
+        args = argparse.Namespace(**vars(args) | {"map": location(config.map_file)})
     files = inputs(args.params, args.map)
     kind = Kind("replay", _replay_of_many, kernels, _replay_warm)
-    run_batch(args, Plan(kind, lambda _: files, args.overwrite))
+    place = args.parquet
+    if place is not None:
+        schema()  # what is not installed is said before hours of work
+    args = argparse.Namespace(**vars(args) | {"parquet": place is not None})
+
+    def gather(folders: Sequence[Path]) -> None:
+        rows = write_parquet((read_parquet(folder / TABLE) for folder in folders), place)
+        print(f"written to {place}: {rows} rows, one a frame")
+
+    run_batch(args, Plan(kind, lambda _: files, args.overwrite, gather if place else None))
 
 
 def _replay_warm(args: argparse.Namespace) -> None:
@@ -437,7 +501,8 @@ def _replay_warm(args: argparse.Namespace) -> None:
         warm_up()
 
 
-def _replay_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Figures:
+def _replay_of_many(args: argparse.Namespace, recording: Location, out: Path) -> Figures:
     """One of them: its result in ``out``, and figures for the summary."""
-    alone = argparse.Namespace(**vars(args), overwrite=False)
+    own = {"overwrite": False, "parquet": out / TABLE if args.parquet else None}
+    alone = argparse.Namespace(**vars(args) | own)
     return figures(_replay_one(alone, recording, out, timed=False))

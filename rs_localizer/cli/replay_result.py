@@ -12,7 +12,7 @@ import shutil
 import textwrap
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -28,8 +28,10 @@ from rs_localizer.io.bags import BagReader, BagWriter
 from rs_localizer.io.gsplat import exposed_rows, write_gsplat
 from rs_localizer.io.image_clock import readout_fault
 from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.ncore import sequence
 from rs_localizer.io.nerfstudio import View, middle_of_image, transforms
-from rs_localizer.io.outputs import Localized, messages
+from rs_localizer.io.outputs import Localized, Pose, messages
+from rs_localizer.io.remote import location
 from rs_localizer.io.topics import TF
 from rs_localizer.io.trajectories import Trajectory, Twists, write_tum, write_twists
 from rs_localizer.io.transforms import TransformError, make_transform
@@ -38,6 +40,7 @@ from rs_localizer.offline.fleet.task import LOG, Figures
 from rs_localizer.offline.image_sources import IMAGE_TYPES
 from rs_localizer.offline.replay import TF_TYPE
 from rs_localizer.offline.smoothed import SmoothedFrames
+from rs_localizer.offline.table import FrameTable
 from rs_localizer.pipeline.broadcasts import broadcast
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.imu import ImuState
@@ -47,7 +50,7 @@ from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.solvers.table import find_solver
 
-TRANSFORMS, IMAGES = "transforms.json", "images"
+TRANSFORMS, IMAGES, NCORE = "transforms.json", "images", "ncore.json"
 _ROW_FILES = "poses_{}.txt"
 _PNG = b"\x89PNG"
 POSES, TWISTS = "poses.txt", "twists.txt"
@@ -79,6 +82,20 @@ def add_export_arguments(parser: argparse._ActionsContainer) -> None:
         metavar="DIR",
         help="also make a directory for gsplat: poses at the first and the last row as viewmats, "
         "intrinsics, a text model of COLMAP, and the compressed images of the recording",
+    )
+    parser.add_argument(
+        "--ncore",
+        type=Path,
+        metavar="DIR",
+        help=f"also make a directory with {NCORE}, as NCore has cameras and frames: "
+        "T_sensor_world when the first and the last row are exposed, and the images",
+    )
+    parser.add_argument(
+        "--parquet",
+        type=location,
+        metavar="FILE",
+        help="also write one table, a row a frame, of all recordings: poses, twists, covariances, "
+        "why frames were refused; a path or a URL (pip install 'rs_localizer[table]')",
     )
 
 
@@ -156,22 +173,20 @@ class Exports:
         self._named: dict[str, float] = dict(args.rows)
         self._wants_views: bool = args.nerfstudio
         self._gsplat: Path | None = args.gsplat
+        self._ncore: Path | None = args.ncore
         self._smoothed: bool = args.smooth
         self._rows = {name: Track() for name in self._named}
         self._views: dict[int, View] = {}
         self._rolling: dict[int, Array] = {}  # (3,4,4) at the first, middle and last row
+        self._exposed: dict[int, tuple[int, int]] = {}  # ns, the first and the last row
 
     def add(self, frame: Localized) -> None:
         """Take a frame."""
-        if self._gsplat is not None:
+        if self._gsplat is not None or self._ncore is not None:
             first, last = exposed_rows(self._camera)
-            poses = [self._of_camera(frame, tau).pose for tau in (first, 0.0, last)]
-            self._rolling[frame.input_stamp_ns] = np.stack(
-                [
-                    np.block([[pose.rotation, pose.position[:, None]], [np.eye(4)[3:]]])
-                    for pose in poses
-                ]
-            )
+            rows = [self._of_camera(frame, tau) for tau in (first, 0.0, last)]
+            self._rolling[frame.input_stamp_ns] = np.stack([_matrix(row.pose) for row in rows])
+            self._exposed[frame.input_stamp_ns] = rows[0].stamp_ns, rows[2].stamp_ns
         for name, tau in self._named.items():
             then = self._localizer.mounted(self._of_camera(frame, tau))
             if isinstance(then, Localized):
@@ -198,19 +213,30 @@ class Exports:
                 )
         if self._views:
             self._write_transforms(bag)
-        if self._gsplat is not None and self._rolling:
-            images, landmarks = sorted(self._rolling), self._localizer.map
-            with atomic_directory(self._gsplat) as folder:
-                folder.mkdir()
-                files = _write_images(bag, set(images), folder)
-                write_gsplat(
-                    folder,
-                    self._camera,
-                    [files.get(stamp, f"{IMAGES}/{stamp}.jpg") for stamp in images],
-                    np.stack([self._rolling[stamp] for stamp in images]),
-                    np.zeros((0, 3)) if landmarks is None else landmarks.points,
-                )
-            print(f"written to {self._gsplat}: poses of {len(images)} images for gsplat")
+        if not self._rolling:
+            return
+        images, landmarks = sorted(self._rolling), self._localizer.map
+        poses = np.stack([self._rolling[stamp] for stamp in images])
+        if self._gsplat is not None:
+            points = np.zeros((0, 3)) if landmarks is None else landmarks.points
+            with self._folder(self._gsplat, bag, images) as (folder, names):
+                write_gsplat(folder, self._camera, names, poses, points)
+        if self._ncore is not None:
+            exposed = np.array([self._exposed[stamp] for stamp in images], np.int64)
+            with self._folder(self._ncore, bag, images) as (folder, names):
+                found = sequence(self._camera, names, exposed, poses[:, [0, 2]])
+                (folder / NCORE).write_text(json.dumps(found, indent=1), encoding="utf-8")
+
+    @contextlib.contextmanager
+    def _folder(
+        self, folder: Path, bag: BagReader, stamps: list[int]
+    ) -> Iterator[tuple[Path, list[str]]]:
+        """Within ``with``, a new folder with the images of these stamps, and their names."""
+        with atomic_directory(folder) as built:
+            built.mkdir()
+            files = _write_images(bag, set(stamps), built)
+            yield built, [files.get(stamp, f"{IMAGES}/{stamp}.jpg") for stamp in stamps]
+        print(f"written to {folder}: poses of {len(stamps)} images at the first and the last row")
 
     @property
     def _camera(self) -> Camera:
@@ -250,6 +276,11 @@ class Exports:
                 f"{missing} images of {TRANSFORMS} are not in the recording (detect --images keeps "
                 f"them): put them to {IMAGES}/STAMP_IN_NS.jpg"
             )
+
+
+def _matrix(pose: Pose) -> Array:
+    """(4,4) map_from_camera."""
+    return np.block([[pose.rotation, pose.position[:, None]], [np.eye(4)[3:]]])
 
 
 def _named_row(text: str) -> tuple[str, float]:
@@ -336,9 +367,9 @@ def _write_transform(
     return True
 
 
-def write_bridged(out: Path, stamps_ns: IntArray) -> None:
+def write_bridged(out: Path, stamps_ns: Iterable[int]) -> None:
     """Write the stamps (b,) of poses without an image of their own, in s, one a line."""
-    text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps_ns.tolist())
+    text = "".join(f"{stamp // 10**9}.{stamp % 10**9:09}\n" for stamp in stamps_ns)
     (out / BRIDGED).write_text(text, encoding="utf-8")
 
 
@@ -350,11 +381,22 @@ _COLUMNS = (
 
 
 @dataclass(slots=True)
+class Smoothed:
+    """What became of the moments of a recording that was smoothed."""
+
+    samples: int = 0
+    bridged: array[int] = field(default_factory=lambda: array("q"))  # stamps, ns
+    undetermined: int = 0
+    shaken: int = 0
+
+
+@dataclass(slots=True)
 class Tally:
     """What became of the frames of a recording."""
 
     total: int
     notices: dict[str, tuple[int, str]]  # by name: how often, and the latest sentence
+    table: FrameTable | None = None  # of the frames, where one is wanted
     track: Track = field(default_factory=Track)
     refused: Counter[str] = field(default_factory=Counter)
     last_refusal: str = "nothing came"
@@ -362,7 +404,7 @@ class Tally:
     repeated: int = 0
     seconds: float = 0.0
     moving: bool = False  # whether there are twists
-    smoothed: SmoothedFrames | None = None
+    smoothed: Smoothed | None = None
     imu: ImuState | None = None
     readout: tuple[float, float] | None = None  # s, as the motion shows it, and its deviation
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of the images
@@ -377,6 +419,15 @@ class Tally:
             estimate.global_shutter_inliers, len(estimate.inliers), estimate.tracked,
             frame.dropped, frame.twist is not None,
         ))  # fmt: skip
+
+    def smooth(self, part: SmoothedFrames) -> list[Localized]:
+        """Count the frames of a window that was smoothed, and give them."""
+        self.smoothed = self.smoothed or Smoothed()
+        self.smoothed.samples += len(part.frames)
+        self.smoothed.bridged.extend(part.bridged.tolist())
+        self.smoothed.undetermined += part.undetermined
+        self.smoothed.shaken += part.shaken
+        return part.frames
 
     def refuse(self, refusal: Refusal) -> None:
         """Count a message without one."""
@@ -471,9 +522,9 @@ def _inertial(imu: ImuState | None) -> list[tuple[str, str]]:
     return rows
 
 
-def _smoothing(smoothed: SmoothedFrames) -> list[tuple[str, str]]:
+def _smoothing(smoothed: Smoothed) -> list[tuple[str, str]]:
     return [
-        ("samples of the smoothed motion", str(len(smoothed.frames))),
+        ("samples of the smoothed motion", str(smoothed.samples)),
         (f"  bridged, listed in {BRIDGED}", str(len(smoothed.bridged))),
         ("  left out, not determined", str(smoothed.undetermined)),
         ("  shaken faster than it follows, left as they were", str(smoothed.shaken)),

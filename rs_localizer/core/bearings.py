@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray
-from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.camera import Camera
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, traced
 
@@ -22,14 +22,14 @@ _SAME = 1e-24
 # Of a step: where the pixel is to be seen, and the bearing.
 _PLACE = 4
 # What a step gives: a better bearing, the derivatives there and the squared distance before it.
-_FOUND = 7
+_RESULTS = 7
 
 
 def bearings(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     """As :meth:`Camera.rays_and_jacobian` of raw pixels (n,2), to rounding errors."""
     D = camera.D
-    fisheye = camera.distortion_model == DistortionModel.EQUIDISTANT
-    if len(pixels) == 0 or (fisheye and len(D) > 0) or np.any(D[_COEFFICIENTS:]):
+    other = len(D) > 0 and not camera.law.is_polynomial
+    if len(pixels) == 0 or other or np.any(D[_COEFFICIENTS:]):
         return camera.rays_and_jacobian(pixels)
     lens = np.zeros(_COEFFICIENTS)
     lens[: len(D)] = D[:_COEFFICIENTS]
@@ -66,13 +66,13 @@ def _step(values: list[Lanes]) -> Vector:
     xy = beside + 2.0 * (y * prism[0])
     yx = beside + 2.0 * (x * prism[1])
     yy = radial + rate * (y * y) + 6.0 * (p1 * y) + 2.0 * (p2 * x) + 2.0 * (y * prism[1])
-    left = u - (x * radial + 2.0 * (p1 * both) + p2 * (square + 2.0 * (x * x)))
-    left = left - square * (s1 + square * s2)
-    low = v - (y * radial + p1 * (square + 2.0 * (y * y)) + 2.0 * (p2 * both))
-    low = low - square * (s3 + square * s4)
+    across = u - (x * radial + 2.0 * (p1 * both) + p2 * (square + 2.0 * (x * x)))
+    across = across - square * (s1 + square * s2)
+    down = v - (y * radial + p1 * (square + 2.0 * (y * y)) + 2.0 * (p2 * both))
+    down = down - square * (s3 + square * s4)
     scale = 1.0 / (xx * yy - xy * yx)
-    nearer = [x + (yy * left - xy * low) * scale, y + (xx * low - yx * left) * scale]
-    return [*nearer, xx, xy, yx, yy, left * left + low * low]
+    nearer = [x + (yy * across - xy * down) * scale, y + (xx * down - yx * across) * scale]
+    return [*nearer, xx, xy, yx, yy, across * across + down * down]
 
 
 _step_lanes = traced(_step, _PLACE, _COEFFICIENTS)
@@ -90,7 +90,7 @@ def _bearings(
     rays, by_ray = np.empty((count, 2)), np.empty((count, 2, 2))
     lost = np.empty(count, dtype=np.bool_)
     uniform, place = np.empty(_COEFFICIENTS * LANES), np.empty(_PLACE * LANES)
-    found = np.empty(_FOUND * LANES)
+    steps = np.empty(_RESULTS * LANES)
     for k in range(_COEFFICIENTS):
         for lane in range(LANES):
             uniform[k * LANES + lane] = lens[k]
@@ -98,28 +98,28 @@ def _bearings(
         for lane in range(LANES):
             i = min(first + lane, count - 1)
             for axis in range(2):
-                seen = (pixels[i, axis] - centre[axis]) / focal[axis]
-                place[axis * LANES + lane] = seen
-                place[(2 + axis) * LANES + lane] = seen
+                start = (pixels[i, axis] - centre[axis]) / focal[axis]
+                place[axis * LANES + lane] = start
+                place[(2 + axis) * LANES + lane] = start
         for _ in range(_STEPS):
-            _step_lanes(place, uniform, found)
+            _step_lanes(place, uniform, steps)
             farthest = 0.0
             for lane in range(LANES):
-                farthest = max(farthest, found[6 * LANES + lane])
+                farthest = max(farthest, steps[6 * LANES + lane])
             if farthest < _SAME:
                 break
             for lane in range(LANES):
                 # No bearing depends on how long its neighbours take.
-                if not found[6 * LANES + lane] < _SAME:
-                    place[2 * LANES + lane] = found[lane]
-                    place[3 * LANES + lane] = found[LANES + lane]
+                if not steps[6 * LANES + lane] < _SAME:
+                    place[2 * LANES + lane] = steps[lane]
+                    place[3 * LANES + lane] = steps[LANES + lane]
         for lane in range(min(LANES, count - first)):
             i = first + lane
             for axis in range(2):
                 rays[i, axis] = place[(2 + axis) * LANES + lane]
                 for by in range(2):
-                    slope = found[(2 + 2 * axis + by) * LANES + lane]
+                    slope = steps[(2 + 2 * axis + by) * LANES + lane]
                     by_ray[i, axis, by] = focal[axis] * slope
             xx, xy, yx, yy = by_ray[i, 0, 0], by_ray[i, 0, 1], by_ray[i, 1, 0], by_ray[i, 1, 1]
-            lost[i] = not (found[6 * LANES + lane] < _SAME and xx > 0.0 and xx * yy > xy * yx)
+            lost[i] = not (steps[6 * LANES + lane] < _SAME and xx > 0.0 and xx * yy > xy * yx)
     return rays, by_ray, lost

@@ -12,13 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rs_localizer.core import lens_laws
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.lens_laws import LensLaw
 from rs_localizer.core.scanning import ScanDirection
 
 # NumPy's ArrayLike is so wide that type checkers take [[500, 0], [0, 500]] for a list of objects.
@@ -54,21 +55,22 @@ def choice(name: str, kind: type[E], value: Any) -> E:
 
 
 class DistortionModel(StrEnum):
-    """Distortion models of sensor_msgs/CameraInfo that are supported."""
+    """THE list of lenses: names in sensor_msgs/CameraInfo, and their laws."""
 
-    PLUMB_BOB = "plumb_bob"
-    RATIONAL_POLYNOMIAL = "rational_polynomial"
-    EQUIDISTANT = "equidistant"
+    law: LensLaw
+
+    # The default is for type checkers, which take a look-up by name for a call of this.
+    def __new__(cls, name: str, law: LensLaw = lens_laws.PLUMB_BOB) -> Self:
+        member = str.__new__(cls, name)
+        member._value_ = name
+        member.law = law
+        return member
+
+    PLUMB_BOB = "plumb_bob", lens_laws.PLUMB_BOB
+    RATIONAL_POLYNOMIAL = "rational_polynomial", lens_laws.RATIONAL_POLYNOMIAL
+    EQUIDISTANT = "equidistant", lens_laws.EQUIDISTANT
 
 
-# How many coefficients each model may have (OpenCV's orders).
-_COEFFICIENTS = {
-    DistortionModel.PLUMB_BOB: (0, 4, 5),
-    DistortionModel.RATIONAL_POLYNOMIAL: (0, 8, 12, 14),
-    DistortionModel.EQUIDISTANT: (0, 4),
-}
-# OpenCV's own default of five iterations leaves errors of pixels at the rim of wide lenses.
-_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
 _LONGEST_READOUT = 1.0  # s: more than any camera takes for a picture of a moving world
 # Pixels; a lens is neither a needle's eye nor a telescope of the next galaxy.
 _LEAST_FOCAL, _MOST_FOCAL = 1e-3, 1e9
@@ -94,7 +96,8 @@ class Camera:
         width, height: size of the full sensor image to which K belongs, pixels.
         K: (3,3) intrinsic matrix without skew.
         D: distortion coefficients in OpenCV's order (empty or None: none).
-        distortion_model: ``plumb_bob``, ``rational_polynomial`` or ``equidistant``.
+        distortion_model: ``plumb_bob``, ``rational_polynomial`` or ``equidistant``; see
+            :class:`DistortionModel`.
         readout_time: s from the first to the last row of the full sensor; 0 = unknown.
         scan_direction: see :class:`ScanDirection`.
         binning: sensor pixels per delivered pixel, (x, y).
@@ -147,9 +150,9 @@ class Camera:
         if K[0, 1] != 0.0 or K[1, 0] != 0.0 or np.any(K[2] != (0.0, 0.0, 1.0)):
             raise ValueError(f"K must have no skew and a last row 0 0 1, got {K.tolist()}")
         model = choice("distortion_model", DistortionModel, self.distortion_model)
-        if len(D) not in _COEFFICIENTS[model]:
+        if len(D) not in model.law.counts:
             raise ValueError(
-                f"{model} takes {' or '.join(map(str, _COEFFICIENTS[model]))} coefficients, "
+                f"{model} takes {' or '.join(map(str, model.law.counts))} coefficients, "
                 f"got {len(D)}"
             )
         if not np.all(np.isfinite(D)):
@@ -263,11 +266,11 @@ class Camera:
             return plain, self.pixel_jacobian(plain)
         usable = np.isfinite(sensor[:, 0]) & np.isfinite(sensor[:, 1])
         if usable.all():
-            rays = self._undistort(sensor)
+            rays = self.law.undistort(sensor, self.K, self.D)
         else:
             rays = np.full(sensor.shape, np.nan)
             if usable.any():
-                rays[usable] = self._undistort(sensor[usable])
+                rays[usable] = self.law.undistort(sensor[usable], self.K, self.D)
         back, jacobian = self.distort(rays)
         near = np.abs(back - pixels) < _ROUND_TRIP_TOLERANCE
         rays[~(near[:, 0] & near[:, 1])] = np.nan
@@ -289,15 +292,10 @@ class Camera:
         inside: NDArray[np.bool_] = np.all((pixels > -0.5) & (pixels < limit), axis=1)
         return inside  # NaN compares false
 
-    def _undistort(self, sensor: Array) -> Array:
-        points, K, D = sensor[:, None], self.K, self.D
-        if self.distortion_model == DistortionModel.EQUIDISTANT:
-            rays: Any = cv2.fisheye.undistortPoints(points, K, D, criteria=_UNDISTORT_CRITERIA)
-        elif hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
-            rays = cv2.undistortPointsIter(points, K, D, None, None, _UNDISTORT_CRITERIA)
-        else:
-            rays = cv2.undistortPoints(points, K, D, criteria=_UNDISTORT_CRITERIA)
-        return np.asarray(rays[:, 0], np.float64)
+    @property
+    def law(self) -> LensLaw:
+        """How the lens bends bearings."""
+        return DistortionModel(self.distortion_model).law
 
     def distort(self, rays: Array) -> tuple[Array, Array]:
         """Raw pixels (n,2) of rays (n,2), and their derivatives (n,2,2) by the ray."""
@@ -307,15 +305,6 @@ class Camera:
             sensor = rays * focal + self.K[:2, 2]
             jacobian = np.broadcast_to(np.diag(focal), (count, 2, 2))
         else:
-            # Of a point at depth 1 the derivative by its place is that by the ray.
-            bearings, zero = np.column_stack([rays, np.ones(count)])[:, None], np.zeros(3)
-            if self.distortion_model == DistortionModel.EQUIDISTANT:
-                first = 11  # behind focal lengths, centre, distortion and rotation
-                found = cv2.fisheye.projectPoints(bearings, zero, zero, self.K, self.D)
-            else:
-                first = 3  # behind the rotation
-                found = cv2.projectPoints(bearings, zero, zero, self.K, self.D)
-            sensor = found[0][:, 0]
-            jacobian = found[1].reshape(count, 2, -1)[:, :, first : first + 2]
+            sensor, jacobian, *_ = self.law.project(rays, self.K, self.D)
         pixels: Array = (sensor - self._offset()) / self.binning
         return pixels, np.ascontiguousarray(jacobian / np.array(self.binning)[:, None])

@@ -37,8 +37,8 @@ def gyro_compensated(
         by_ray: (n,2,2) derivatives of the raw pixels by the rays.
         gradient: (2,) of the row time by the pixel.
     """
-    found: tuple[Array, Array] = _gyro_compensated(rays, tau, by_ray, gradient, *turn.spline)
-    return found
+    compensated: tuple[Array, Array] = _gyro_compensated(rays, tau, by_ray, gradient, *turn.spline)
+    return compensated
 
 
 @kernel

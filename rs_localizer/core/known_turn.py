@@ -84,8 +84,8 @@ class KnownTurn:
         Beyond the samples, where cubics would run away, the camera turns on at the mean rate.
         """
         times = np.ascontiguousarray(tau, dtype=np.float64)
-        found: tuple[Array, Array] = _turn_at_rows(times, *self.spline)
-        return found
+        turns: tuple[Array, Array] = _turn_at_rows(times, *self.spline)
+        return turns
 
     @property
     def spline(self) -> tuple[Array, Array, Array, Array]:
@@ -126,16 +126,16 @@ def find_turn(
     rotation: Array, rate: Array,
 ) -> None:  # fmt: skip
     """Fill in rotation and rate of a :class:`KnownTurn` at a row time."""
-    known = min(max(wanted, times[0]), times[-1])
-    place = place_of(known, times)
-    since = known - times[place]
+    inside = min(max(wanted, times[0]), times[-1])
+    place = place_of(inside, times)
+    since = inside - times[place]
     turn_on(turn_in(cubics[place], since), rotations[place], rotation)
-    if known == wanted:
+    if inside == wanted:
         rate_in(cubics[place], since, rate)
         return
     for axis in range(3):
         rate[axis] = parabola[0, axis] + parabola[2, axis] / 12.0
-    on = wanted - known
+    on = wanted - inside
     turn_on((on * rate[0], on * rate[1], on * rate[2]), rotation.copy(), rotation)
 
 
@@ -143,10 +143,10 @@ def find_turn(
 def _turn_at_rows(
     wanted: Array, times: Array, cubics: Array, rotations: Array, parabola: Array
 ) -> tuple[Array, Array]:
-    found, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
+    turns, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
     for i in range(len(wanted)):
-        find_turn(wanted[i], times, cubics, rotations, parabola, found[i], rates[i])
-    return found, rates
+        find_turn(wanted[i], times, cubics, rotations, parabola, turns[i], rates[i])
+    return turns, rates
 
 
 @kernel
@@ -169,7 +169,7 @@ def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array
     """What a :class:`KnownTurn` holds of rates (k,3) at row times (k,)."""
     cubics = spline(tau, rates)
     rotations = rotations_at_knots(tau, cubics)
-    found, squares = np.zeros((3, 3)), np.zeros(3)
+    moments, squares = np.zeros((3, 3)), np.zeros(3)
     # Projections on Legendre polynomials by Gauss' rule of five nodes, exact up to degree 9.
     for node in range(5):
         x = 2.0 * _NODES[node]
@@ -178,18 +178,18 @@ def turn_of(tau: Array, rates: Array) -> tuple[Array, Array, Array, Array, Array
         for degree in range(3):
             for axis in range(3):
                 part = (2 * degree + 1) * _WEIGHTS[node] * legendre[degree] * here[axis]
-                found[degree, axis] += part
+                moments[degree, axis] += part
         for axis in range(3):
             squares[axis] += _WEIGHTS[node] * here[axis] * here[axis]
     parabola = np.empty((3, 3))
     for axis in range(3):
-        parabola[0, axis] = found[0, axis] - 0.5 * found[2, axis]
-        parabola[1, axis] = 2.0 * found[1, axis]
-        parabola[2, axis] = 6.0 * found[2, axis]
-    left = 0.0  # by Parseval
+        parabola[0, axis] = moments[0, axis] - 0.5 * moments[2, axis]
+        parabola[1, axis] = 2.0 * moments[1, axis]
+        parabola[2, axis] = 6.0 * moments[2, axis]
+    rest = 0.0  # by Parseval
     for axis in range(3):
-        left += squares[axis]
+        rest += squares[axis]
         for degree in range(3):
-            left -= found[degree, axis] ** 2 / (2 * degree + 1)
+            rest -= moments[degree, axis] ** 2 / (2 * degree + 1)
     middle, change = rate_at(0.0, tau, cubics), change_at(0.0, tau, cubics)
-    return cubics, rotations, middle, change, parabola, np.sqrt(max(left, 0.0) / 3.0)
+    return cubics, rotations, middle, change, parabola, np.sqrt(max(rest, 0.0) / 3.0)

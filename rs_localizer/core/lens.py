@@ -2,21 +2,21 @@
 
 Most of what a calibration may have wrong is radial: an image point at ``r`` from the axis moves
 along the radius by ``r (a r^2 + b r^4)``; a little is tangential, ``c`` and ``d`` (Brown,
-"Close-range camera calibration", 1971). ``equidistant`` lenses have powers of the angle, and
-nothing tangential. Distances are in parts of that of the image's corner, also those of the centre,
-and focal lengths are off by parts of themselves, so that the coefficients of all cameras are of one
-size.
+"Close-range camera calibration", 1971); lenses with powers of the angle have nothing tangential.
+Which coefficients these are, the lens law says. Distances are in parts of that of the image's
+corner, also those of the centre, and focal lengths are off by parts of themselves, so that the
+coefficients of all cameras are of one size.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.lens_laws import LensLaw
 
 # No model has fewer coefficients; k1, k2 stand first in all, and p1, p2 behind them.
 _FEWEST = 4
@@ -84,26 +84,19 @@ def with_lens(camera: Camera, coefficients: Array) -> Camera:
 
 def by_lens(camera: Camera, rays: Array) -> Array:
     """Derivatives (n,2,k) of the pixels of rays (n,2) by all coefficients."""
-    zero, found = np.zeros(3), _distortion_of(camera)
-    bearings = np.column_stack([rays, np.ones(len(rays))])[:, None]
-    if _model_of(camera) == DistortionModel.EQUIDISTANT:
-        first = 0
-        jacobian = cv2.fisheye.projectPoints(bearings, zero, zero, camera.K, found)[1]
-    else:
-        first = 6  # behind the pose
-        jacobian = cv2.projectPoints(bearings, zero, zero, camera.K, found)[1]
-    jacobian = jacobian.reshape(len(rays), 2, -1)
-    behind = first + _OF_MATRIX
-    columns = np.concatenate(
-        [jacobian[:, :, behind : behind + _distorting(camera)], jacobian[:, :, first:behind]],
-        axis=2,
-    )
+    projected = _law_of(camera).project(rays, camera.K, _distortion_of(camera))
+    correctable = projected.by_coefficients[:, :, : _distorting(camera)]
+    columns = np.concatenate([correctable, projected.by_matrix], axis=2)
     scaled: Array = columns * _scales_of(camera) / np.array(camera.binning)[:, None]
     return scaled
 
 
 def _distorting(camera: Camera) -> int:
-    return 2 if _model_of(camera) == DistortionModel.EQUIDISTANT else 4
+    return len(_law_of(camera).correctable)
+
+
+def _law_of(camera: Camera) -> LensLaw:
+    return DistortionModel(_model_of(camera)).law
 
 
 def _model_of(camera: Camera) -> str:
@@ -117,7 +110,7 @@ def _distortion_of(camera: Camera) -> Array:
 
 def _scales_of(camera: Camera) -> Array:
     """What OpenCV's parameters change by one of the coefficients (k,)."""
-    corner, count = corner_of(camera), _distorting(camera)
+    corner = corner_of(camera)
     focal = np.diag(camera.K)[:2]
-    distorting = corner ** -np.array([2.0, 4.0, 1.0, 1.0])[:count]
-    return np.concatenate([distorting, focal, corner * focal])
+    powers = [1.0 if order is None else 2.0 * (order + 1) for order in _law_of(camera).correctable]
+    return np.concatenate([corner ** -np.array(powers), focal, corner * focal])

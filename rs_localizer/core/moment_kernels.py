@@ -32,16 +32,16 @@ def pose_of(
     """
     rotation, translation, angular, linear, change, acceleration = motion
     angle = tau * (angular - turn.rate) + 0.5 * tau * tau * (change - turn.change)
-    way = tau * linear + 0.5 * tau * tau * acceleration
+    displacement = tau * linear + 0.5 * tau * tau * acceleration
     map_from_middle = np.ascontiguousarray(rotation.T)
     values, _, turned, _ = _shaken(shake, tau, max(_columns(joint), len(shake)))
-    known, rate = np.empty((3, 3)), np.empty(3)
-    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, known, rate)
+    gyro_turn, rate = np.empty((3, 3)), np.empty(3)
+    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, gyro_turn, rate)
     map_from_swing = map_from_middle @ so3.exp(angle) @ so3.exp(turned)  # as if not turned beside
-    map_from_then = map_from_swing @ np.ascontiguousarray(known.T)
+    map_from_then = map_from_swing @ np.ascontiguousarray(gyro_turn.T)
     by_angle = map_from_middle @ so3.right_jacobian_of(-angle)
     jacobian = np.zeros((6, len(joint)))
-    add_block(jacobian, 0, 0, -1.0, map_from_middle @ so3.hat_of(way))
+    add_block(jacobian, 0, 0, -1.0, map_from_middle @ so3.hat_of(displacement))
     add_block(jacobian, 0, 3, 1.0, map_from_middle)
     add_block(jacobian, 0, 9, tau, map_from_middle)
     add_block(jacobian, 0, 15, 0.5 * tau * tau, map_from_middle)
@@ -56,7 +56,7 @@ def pose_of(
         for j in range(3):
             covariance[3 + i, 3 + j] += late[i] * late[j]
         covariance[3 + i, 3 + i] += beyond
-    return map_from_middle @ (way - translation), map_from_then, covariance
+    return map_from_middle @ (displacement - translation), map_from_then, covariance
 
 
 @kernel
@@ -74,14 +74,16 @@ def twist_of(
     rate, change = angular_velocity - turn.rate, change - turn.change
     angle = tau * rate + 0.5 * tau * tau * change
     values, rates, turned, swing = _shaken(shake, tau, max(_columns(joint), len(shake)))
-    known, known_rate = np.empty((3, 3)), np.empty(3)
-    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, known, known_rate)
+    gyro_turn, gyro_rate = np.empty((3, 3)), np.empty(3)
+    find_turn(tau, turn.tau, turn.rates, turn.rotations, turn.parabola, gyro_turn, gyro_rate)
     unshaken = so3.exp(-turned)
-    beside = known @ unshaken
+    beside = gyro_turn @ unshaken
     back, by_angle = so3.exp(-angle), so3.right_jacobian_of(angle)
     linear = beside @ (back @ (linear_velocity + tau * acceleration))
     body_rate = unshaken @ (by_angle @ (rate + tau * change))
-    swinging = known @ (body_rate + so3.right_jacobian_of(turned) @ swing)  # without the known rate
+    swinging = gyro_turn @ (
+        body_rate + so3.right_jacobian_of(turned) @ swing
+    )  # without the known rate
     by_turn = beside @ back
     by_rate = so3.hat_of(linear) @ (beside @ by_angle)
     by_acceleration = 0.5 * tau * (beside @ (np.eye(3) + by_angle))
@@ -92,12 +94,12 @@ def twist_of(
     add_block(jacobian, 0, 15, tau, by_turn)
     add_block(jacobian, 3, 6, 1.0, beside)
     add_block(jacobian, 3, 12, 1.0, by_acceleration)
-    linear_by_shake = so3.hat_of(linear) @ known
-    angular_by_shake = so3.hat_of(swinging) @ known
+    linear_by_shake = so3.hat_of(linear) @ gyro_turn
+    angular_by_shake = so3.hat_of(swinging) @ gyro_turn
     for k in range(_columns(joint)):
         place = PARAMETERS + 3 * k
         add_block(jacobian, 0, place, values[k], linear_by_shake)
-        add_block(jacobian, 3, place, rates[k], known)
+        add_block(jacobian, 3, place, rates[k], gyro_turn)
         add_block(jacobian, 3, place, values[k], angular_by_shake)
     covariance = _propagated(jacobian, joint)
     late = turn.delay * late_at(tau, turn.tau, turn.rates, turn.parabola)[1]
@@ -108,9 +110,9 @@ def twist_of(
             for k in range(3):
                 covariance[i, j] += beyond[0] * across[i, k] * across[j, k]
         covariance[3 + i, 3 + i] += turn.rate_noise * turn.rate_noise + beyond[1]
-    angular = swinging + known_rate
+    angular = swinging + gyro_rate
     if _better_known(turn, tau, covariance):
-        angular = known_rate
+        angular = gyro_rate
     return linear, angular, covariance
 
 
@@ -164,9 +166,9 @@ def _columns(joint: Array) -> int:
 @kernel
 def _propagated(jacobian: Array, covariance: Array) -> Array:
     """Symmetric to the bit."""
-    found = jacobian @ covariance @ jacobian.T
-    for i in range(len(found)):
+    propagated = jacobian @ covariance @ jacobian.T
+    for i in range(len(propagated)):
         for j in range(i):
-            found[i, j] = 0.5 * (found[i, j] + found[j, i])
-            found[j, i] = found[i, j]
-    return found
+            propagated[i, j] = 0.5 * (propagated[i, j] + propagated[j, i])
+            propagated[j, i] = propagated[i, j]
+    return propagated

@@ -145,13 +145,13 @@ def rotations_at_knots(times: Array, cubics: Array) -> Array:
 @kernel
 def turns_at(wanted: Array, times: Array, cubics: Array, rotations: Array) -> tuple[Array, Array]:
     """Rotations (n,3,3) and rates (n,3) at times (n,) of a spline of rates; see `KnownTurn`."""
-    found, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
+    turns, rates = np.empty((len(wanted), 3, 3)), np.empty((len(wanted), 3))
     for i in range(len(wanted)):
         place = place_of(wanted[i], times)
         since = wanted[i] - times[place]
-        turn_on(turn_in(cubics[place], since), rotations[place], found[i])
+        turn_on(turn_in(cubics[place], since), rotations[place], turns[i])
         rate_in(cubics[place], since, rates[i])
-    return found, rates
+    return turns, rates
 
 
 @kernel

@@ -28,6 +28,7 @@ class Reason(StrEnum):
     NO_MAP = "no_map"
     BAD_MAP = "bad_map"
     BAD_KEYPOINTS = "bad_keypoints"
+    BAD_DETECTIONS = "bad_detections"
     NO_MATCHES = "no_matches"
     BAD_IMU = "bad_imu"
     NO_TRANSFORM = "no_transform"

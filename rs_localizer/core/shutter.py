@@ -59,9 +59,11 @@ class Motion:
         return angle
 
     def way_at(self, tau: Any) -> Array:
-        """Way (3,) of the centre from the middle row to ``tau``, in camera axes at tau = 0."""
-        way: Array = tau * self.linear_velocity + 0.5 * tau * tau * self.linear_acceleration
-        return way
+        """Displacement (3,) of the centre since the middle row, in camera axes at tau = 0."""
+        displacement: Array = (
+            tau * self.linear_velocity + 0.5 * tau * tau * self.linear_acceleration
+        )
+        return displacement
 
     def angular_velocity_at(self, tau: float) -> Array:
         """Body rate (3,) at ``tau``, rad per readout, in the camera axes of that moment."""

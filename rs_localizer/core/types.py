@@ -27,7 +27,8 @@ class Estimate(Motion):
     camera position in camera axes, angular velocity, linear velocity; units as the fields.
     Accelerations and shaking are averaged out of it; ``joint_covariance`` has them behind, in the
     order of ``rs_localizer.core.state`` and of ``shake``. The former has the errors of the
-    calibration, which are the same in all frames; the latter is what the frames tell.
+    calibration, which are the same in all frames, and of vibration that hides in the noise; the
+    latter is what goes on to the next frame.
     """
 
     inliers: BoolArray  # (n,)
@@ -37,6 +38,10 @@ class Estimate(Motion):
     iterations: int  # minimal samples drawn
     # (12,12) of what calibration and declared map may be off, a part of ``covariance``
     calibration_covariance: Array = field(
+        default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
+    )
+    # (12,12) of vibration that hides in the noise of this frame, likewise
+    undetected_covariance: Array = field(
         default_factory=lambda: np.zeros((MOTION_PARAMETERS, MOTION_PARAMETERS))
     )
     still_deviation: float = math.inf  # rad, orientation_deviation if the motion were known
@@ -57,7 +62,7 @@ class Estimate(Motion):
     def covariance(self) -> Array:
         """Covariance (12,12) of pose and velocities at tau = 0."""
         own = self.joint_covariance[:MOTION_PARAMETERS, :MOTION_PARAMETERS]
-        return own + self.calibration_covariance
+        return own + self.calibration_covariance + self.undetected_covariance
 
     @property
     def orientation_deviation(self) -> float:
@@ -124,8 +129,8 @@ class Estimate(Motion):
         shaken: Array = body_rate + so3.right_jacobian(turn) @ rate
         if self.turn is None:
             return shaken
-        rotation, known = self.turn.at(tau)
-        turned: Array = rotation @ shaken + known
+        rotation, gyro_rate = self.turn.at(tau)
+        turned: Array = rotation @ shaken + gyro_rate
         return turned
 
     def linear_velocity_at(self, tau: float) -> Array:

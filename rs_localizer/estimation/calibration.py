@@ -1,10 +1,11 @@
-"""What an ordinary calibration and a declared map have wrong, and what that does to a pose.
+"""What errors of the calibration and of the map, the same in all frames, do to a pose.
 
-Centre, focal length and distortion have errors, a map that is bent has them, too, and these are the
-same in all frames: no tracker averages them away. So they join what is published of a frame, and
-not what goes on to the next. To
-first order a calibration that moves the pixels by ``b`` moves the motion by
-``-(J^T J + noise^2 P)^-1 J^T b``, with the prior ``P`` of the motion.
+Centre, focal length and distortion of an ordinary calibration have errors; so has a map that is
+bent, or whatever else a smooth error was fitted for. No tracker averages them away: they join what
+is published of a frame, and not what goes on to the next. To first order a calibration that moves
+the pixels by ``b`` moves motion and smooth error by ``-H^-1 A^T b``, with the derivatives ``A`` of
+the pixels by both and the information ``H = A^T A + noise^2 P`` of points and prior; and a smooth
+error of ``f`` deviations moves them by ``-noise^2 H^-1 f``.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rs_localizer.config import CalibrationErrors
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.lens import by_lens, coefficients_of, corner_of
 from rs_localizer.core.scales import SPEEDS
 from rs_localizer.core.shake import shake_at
-from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, POSE, TURN
+from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN
 from rs_localizer.estimation.frame_fit import SMOOTH_TERMS, smooth_terms
 from rs_localizer.estimation.lens import rays_of_lens
 from rs_localizer.estimation.observing import Observed
@@ -27,7 +28,7 @@ from rs_localizer.estimation.posterior import Posterior
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
 from rs_localizer.estimation.refine import inverted
-from rs_localizer.estimation.residuals import linearized
+from rs_localizer.estimation.residuals import Lines, linearized
 
 # Of a combination of typical speeds, the part of one that does not count.
 _NO_PART = 0.02
@@ -61,44 +62,56 @@ def calibration_effect(
     )  # fmt: skip
     rays = rays_of_lens(observed.sighted, observations.tau[chosen], lines.image[chosen])
     columns = _columns(observed.sighted.camera, rays, deviation)
-    if posterior.declared > 0.0:
-        # Poses absorb most of what a bent map is off: what they leave does not tell how much.
-        bent = posterior.declared * _smooth(lines.image[chosen])
-        columns = np.concatenate([columns, bent], axis=2)
+    smooth = _smooth_columns(posterior, lines, chosen)
     pixels = columns.reshape(-1, columns.shape[2])
     by_motion = np.ascontiguousarray(lines.by_motion[chosen].reshape(-1, PARAMETERS))
-    products, crossed = by_motion.T @ by_motion, by_motion.T @ pixels
+    by_all = np.hstack([by_motion, smooth.reshape(len(by_motion), -1)])
+    products, crossed = by_all.T @ by_all, by_all.T @ pixels
     variance = posterior.noise**2
     of_pose = posterior.inflation * variance * inverted(np.ascontiguousarray(products[POSE, POSE]))
     determined = bool(np.all(np.isfinite(of_pose)))
     still = np.sqrt(np.linalg.eigvalsh(of_pose[TURN, TURN])[-1]) if determined else np.inf
-    pull = np.zeros(crossed.shape)
+    count = len(products) - PARAMETERS
+    pull = np.zeros((len(products), crossed.shape[1] + count))
     parts = posterior.speeds if len(posterior.speeds) else _CONFIGURED
     for speed, part in zip(SPEEDS, parts, strict=True):
         if part < _NO_PART:
             continue
-        information, slope = products.copy(), np.zeros(PARAMETERS)
+        information, slope = products + variance * np.diag(_unit_of(count)), np.zeros(PARAMETERS)
+        of_motion = products[:PARAMETERS, :PARAMETERS].copy()
         of_speed = terms_at(terms, speed, observed.sighted.turn is not None)
-        add_prior(*of_speed, posterior.state, variance, information, slope)
+        add_prior(*of_speed, posterior.state, variance, of_motion, slope)
+        information[:PARAMETERS, :PARAMETERS] = of_motion
         inverse = inverted(information)
         if not np.all(np.isfinite(inverse)):
             return NO_EFFECT._replace(still_deviation=float(still))
-        pull -= part * (inverse @ crossed)
-    left = pixels + by_motion @ pull
+        pull -= part * np.hstack([inverse @ crossed, variance * inverse[:, PARAMETERS:]])
+    left = pixels + by_all @ pull[:, : crossed.shape[1]]
     residual = float(np.sqrt(np.square(left).sum() / max(len(pixels), 1)))
     pulled = pull[:MOTION_PARAMETERS]
     return CalibrationEffect(pulled @ pulled.T, residual, float(still))
 
 
-def _smooth(rays: Array) -> Array:
-    """Errors (n,2,20) that are smooth over the image, together of a pixel's root mean square."""
+def _unit_of(count: int) -> Array:
+    """(18 + count,) zeros for the motion, and ones."""
+    return np.concatenate([np.zeros(PARAMETERS), np.ones(count)])
+
+
+def _smooth_columns(posterior: Posterior, lines: Lines, chosen: BoolArray) -> Array:
+    """By how many pixels a deviation of each coefficient of the smooth error moves (n,2,q)."""
+    scale, rays = posterior.smooth_scale, lines.image[chosen]
+    if not scale > 0.0:
+        return np.zeros((len(rays), 2, 0))
+    if posterior.bend.shape[1]:
+        moved = -scale * lines.by_motion[chosen][:, :, MOVE]
+        bent: Array = np.einsum("nka,nb->nkba", moved, posterior.bend[chosen])
+        return bent.reshape(len(rays), 2, -1)
     low, high = rays.min(axis=0), rays.max(axis=0)
-    spread = np.maximum(high - low, 1e-12)
-    terms, each = np.zeros((len(rays), 2, 2 * SMOOTH_TERMS)), np.zeros(SMOOTH_TERMS)
+    columns, each = np.zeros((len(rays), 2, 2 * SMOOTH_TERMS)), np.zeros(SMOOTH_TERMS)
     for k, ray in enumerate(rays):
-        smooth_terms(ray, low, low + spread, each)
-        terms[k, 0, :SMOOTH_TERMS] = terms[k, 1, SMOOTH_TERMS:] = each
-    return terms
+        smooth_terms(ray, low, high, each)
+        columns[k, 0, :SMOOTH_TERMS] = columns[k, 1, SMOOTH_TERMS:] = scale * each
+    return columns
 
 
 def _columns(camera: Camera, rays: Array, deviation: CalibrationErrors) -> Array:

@@ -25,7 +25,7 @@ from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, noise_deviation
 from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import PriorTerms
-from rs_localizer.estimation.refine import apply_step, inverted
+from rs_localizer.estimation.refine import apply_step, half_inverse, inverted, squared
 from rs_localizer.estimation.residual_tests import neighbours_agree
 from rs_localizer.estimation.residuals import Lines, linearized, squared_errors
 from rs_localizer.estimation.view import POINT_SIZE
@@ -35,14 +35,14 @@ SMOOTH_TERMS = (SMOOTH_DEGREE + 1) * (SMOOTH_DEGREE + 2) // 2
 TURNS = 3 * FUNCTIONS
 # Expected size of each degree: printers stretch paper, lenses bend at the rim; the mean square
 # over the image of a field of scale 1 is 1.
-_DEGREE_SIZES = (1.0, 1.0, 0.5, 0.25)
+DEGREE_SIZES = (1.0, 1.0, 0.5, 0.25)
 _TERM_SIZES = np.array(
     [
-        _DEGREE_SIZES[degree] * math.sqrt((2 * i + 1) * (2 * (degree - i) + 1))
+        DEGREE_SIZES[degree] * math.sqrt((2 * i + 1) * (2 * (degree - i) + 1))
         for degree in range(SMOOTH_DEGREE + 1)
         for i in range(degree + 1)
     ]
-) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(_DEGREE_SIZES)))
+) / math.sqrt(sum((d + 1) * size**2 for d, size in enumerate(DEGREE_SIZES)))
 # A column whose scale moves no point by this part of the noise is left out: it changes nothing.
 _NEGLIGIBLE = 0.03
 # Neighbouring frequencies have scales alike to a factor of e (precision of the difference of their
@@ -54,6 +54,11 @@ _LONGEST_SCALE_STEP = 1.0
 _LEAST_LOG_SCALE, _MOST_LOG_SCALE = math.log(1e-6), math.log(30.0)
 # Rounds of scales in the first steps, in which the gate closes, and in those that follow.
 _SCALE_ROUNDS, _LATER_SCALE_ROUNDS = 12, 4
+# Rounds end before that where no scale would change by more than this part: a hundredth of its own
+# deviation, as no frame tells one to better than a fifth.
+_SETTLED = 2e-3
+# Every second step of them goes this many times as far at most, as the last two steps foresee.
+_FARTHEST = 3.0
 # Of the diagonal: what nothing determines has an inverse.
 _RIDGE = 1.0 + 1e-13
 # The gate closes by this factor from step to step (graduated non-convexity).
@@ -63,6 +68,8 @@ _SHORT = 1e-3
 # Fewer inliers determine nothing.
 _FEWEST = 6
 _TINY = 1e-300
+# Products of a turn of three axes with the motion and the errors.
+_OUTER = 3 * PARAMETERS + 3
 
 
 class Products(NamedTuple):
@@ -78,14 +85,15 @@ class FrameFit(NamedTuple):
 
     state: Array  # (24,)
     turns: Array  # (28,3) rad, coefficients of the in-frame turn; zeros without one
-    covariance: Array  # (18 + 84,18 + 84), or (18,18) without an in-frame turn
+    # (18 + 84,18 + 84), or (18,18) without an in-frame turn: by the noise and what the prior allows
+    covariance: Array
     noise: float  # px
     freedom: float
     inliers: BoolArray  # (n,)
     squared_errors: Array  # (n,) px^2, beside the in-frame turn and the smooth error
     log_scales: Array  # (15,)
     decided: Array  # (15,) how many coefficients of each scale the points decide
-    smooth: float  # px, scale of the smooth error: its expected root mean square
+    smooth: float  # scale of the smooth error: its expected root mean square
     agreement: float  # of neighbouring rows (see residual_tests)
     evidence: float  # logarithm, but for a constant of the inliers
     left: float  # squared errors beside all, in variances of the noise
@@ -96,11 +104,14 @@ class FrameFit(NamedTuple):
 
 @kernel
 def products_of(
-    lines: Lines, inliers: BoolArray, errors: Array, turns: bool, smooth: bool
+    lines: Lines, inliers: BoolArray, errors: Array, turns: bool, smooth: bool, bend: Array
 ) -> Products:
-    """Multiply the columns of the inliers with each other and with their errors (n,2)."""
+    """Multiply the columns of the inliers with each other and with their errors (n,2).
+
+    ``bend`` (n,b): see :func:`fit_frame`.
+    """
     first = PARAMETERS + (TURNS if turns else 0)
-    size = first + (2 * SMOOTH_TERMS if smooth else 0)
+    size = first + (smooth_size(bend) if smooth else 0)
     matrix, right, square = np.zeros((size, size)), np.zeros(size), 0.0
     low, high = extent(lines, inliers)
     values, rates, terms = np.empty(FUNCTIONS), np.empty(FUNCTIONS), np.zeros(SMOOTH_TERMS)
@@ -110,12 +121,14 @@ def products_of(
             continue
         if turns:
             shake_basis(lines.tau[i], values, rates)
-        if smooth:
+        if smooth and bend.shape[1] == 0:
             smooth_terms(lines.image[i], low, high, terms)
         for side in range(2):
             _fill(rows[side], lines.by_motion[i, side], lines.by_turn[i, side], values, turns)
-            if smooth:
+            if smooth and bend.shape[1] == 0:
                 rows[side, first + SMOOTH_TERMS * side : first + SMOOTH_TERMS * (side + 1)] = terms
+            elif smooth:
+                _fill_bend(rows[side, first:], lines.by_motion[i, side], bend[i])
         square += errors[i, 0] ** 2 + errors[i, 1] ** 2
         one, other = rows[0], rows[1]
         for k in range(size):
@@ -138,6 +151,20 @@ def _fill(row: Array, by_motion: Array, by_turn: Array, values: Array, turns: bo
         for k in range(FUNCTIONS):
             for axis in range(3):
                 row[PARAMETERS + 3 * k + axis] = values[k] * by_turn[axis]
+
+
+@inlined
+def _fill_bend(row: Array, by_motion: Array, bend: Array) -> None:
+    """A point of the map that moves along an axis of the camera is a camera that moves back."""
+    for k in range(len(bend)):
+        for axis in range(3):
+            row[3 * k + axis] = -by_motion[3 + axis] * bend[k]
+
+
+@inlined
+def smooth_size(bend: Array) -> int:
+    """Number of coefficients of the smooth error."""
+    return 3 * bend.shape[1] if bend.shape[1] > 0 else 2 * SMOOTH_TERMS
 
 
 @kernel
@@ -169,16 +196,23 @@ def smooth_terms(image: Array, low: Array, high: Array, terms: Array) -> None:
 
 
 @kernel
-def smooth_at(lines: Lines, inliers: BoolArray, coefficients: Array) -> Array:
-    """The smooth error (n,2) px at all points, of coefficients (20,)."""
+def smooth_at(lines: Lines, inliers: BoolArray, coefficients: Array, bend: Array) -> Array:
+    """The smooth error (n,2) px at all points, of coefficients (20,), or (3 b,) of a bent map."""
+    row = np.empty(len(coefficients))
     low, high = extent(lines, inliers)
     terms, shown = np.zeros(SMOOTH_TERMS), np.zeros((len(inliers), 2))
     for i in range(len(inliers)):
-        smooth_terms(lines.image[i], low, high, terms)
+        if bend.shape[1] == 0:
+            smooth_terms(lines.image[i], low, high, terms)
         for side in range(2):
             total = 0.0
-            for k in range(SMOOTH_TERMS):
-                total += terms[k] * coefficients[SMOOTH_TERMS * side + k]
+            if bend.shape[1] > 0:
+                _fill_bend(row, lines.by_motion[i, side], bend[i])
+                for k in range(len(row)):
+                    total += row[k] * coefficients[k]
+            else:
+                for k in range(SMOOTH_TERMS):
+                    total += terms[k] * coefficients[SMOOTH_TERMS * side + k]
             shown[i, side] = total
     return shown
 
@@ -237,62 +271,188 @@ def with_scales(
 ) -> _Solved:  # fmt: skip
     """Solve for motion and coefficients, and re-estimate the scales, in turns.
 
+    The motion has no scale: it is taken out first (Schur complement), once for all rounds.
+
     Args:
         normal: of the errors linearized about the coefficients (q,).
         information, slope: of the prior of the motion, for all columns (m,m), (m,).
         log_scales, hyper_mean, hyper_precision: (15,).
         noise: px, which the caller measures.
         equations: number of errors.
-        rounds: of solving; the scales of the last one are those of the covariance.
+        rounds: of solving, at most; the scales of the last one are those of the covariance.
     """
     size, variance = len(normal.with_errors), noise * noise
     q = size - PARAMETERS
     groups = _groups(q)
-    scales, decided = log_scales.copy(), np.zeros(SCALES)
+    matrix = normal.products / variance + information
     # Errors as functions of new values, not of changes.
     right = np.empty(size)
     for i in range(size):
-        total = normal.with_errors[i] / variance - slope[i]
+        matrix[i, i] *= _RIDGE
+        right[i] = normal.with_errors[i] / variance - slope[i]
         for k in range(q):
-            pull = normal.products[i, PARAMETERS + k] / variance + information[i, PARAMETERS + k]
-            total += pull * coefficients[k]
-        right[i] = total
-    values, active, inverse = np.zeros(size), np.zeros(0, np.int64), np.zeros((0, 0))
+            right[i] += matrix[i, PARAMETERS + k] * coefficients[k]
+    of_motion, scale_of_motion, determined = half_inverse(matrix[:PARAMETERS, :PARAMETERS].copy())
+    for i in range(PARAMETERS):
+        for j in range(i + 1):
+            of_motion[i, j] *= scale_of_motion[j]
+    beside, of_coefficients, along = _without_motion(matrix, right, of_motion)
+    scales, decided, uphill = log_scales.copy(), np.zeros(SCALES), np.zeros(SCALES)
+    best, spread = np.zeros(q), np.zeros(q)
+    active, half, unit = np.zeros(0, np.int64), np.zeros((0, 0)), np.zeros(0)
+    positive, before = True, np.zeros(SCALES)
     for turn in range(rounds):
         active = _active(normal.products, scales, groups, variance)
-        inverse = _inverse_of(normal.products, information, scales, groups, active, variance)
-        values[:] = 0.0
-        for a in range(len(active)):
-            total = 0.0
-            for b in range(len(active)):
-                total += inverse[a, b] * right[active[b]]
-            values[active[a]] = total
-        uphill = _slope_of_scales(values, inverse, active, groups, scales, decided)
-        if turn < rounds - 1:
-            _climb(scales, uphill, decided, hyper_mean, hyper_precision)
-    covariance = np.zeros((size, size))
-    volume = log_determinant_of_inverse(inverse)
-    for a in range(len(active)):
-        for b in range(len(active)):
-            covariance[active[a], active[b]] = inverse[a, b]
-        if active[a] >= PARAMETERS:
-            volume -= 2.0 * scales[groups[active[a] - PARAMETERS]]
-    left, used, cost = normal.squared_errors, 0.0, 0.0
-    change, precisions = values.copy(), np.empty(q)
+        half, unit, positive = half_inverse(
+            _with_precisions(of_coefficients, scales, groups, active)
+        )
+        _solve(half, unit, along, active, best, spread)
+        _slope_of_scales(best, spread, active, groups, scales, decided, uphill)
+        if turn == rounds - 1:
+            break
+        step = _climb(scales, uphill, decided, hyper_mean, hyper_precision)
+        if np.max(np.abs(step)) < _SETTLED:
+            break
+        if turn % 2 == 1:
+            _extrapolate(step, before)
+        scales, before = scales + step, step
+    covariance, values = _joint(of_motion, beside, half, unit, active, right, best)
+    volume = _volume(of_motion, half, unit)
+    change, cost = values.copy(), 0.0
     for k in range(q):
         change[PARAMETERS + k] -= coefficients[k]
-        precisions[k] = math.exp(-2.0 * scales[groups[k]])
+        precision = math.exp(-2.0 * scales[groups[k]])
+        cost += values[PARAMETERS + k] ** 2 * precision
         if covariance[PARAMETERS + k, PARAMETERS + k] == 0.0:  # not active: as the prior has it
-            covariance[PARAMETERS + k, PARAMETERS + k] = 1.0 / precisions[k]
-    for k in range(q):
-        cost += values[PARAMETERS + k] ** 2 * precisions[k]
-    for i in range(size):
-        left -= 2.0 * change[i] * normal.with_errors[i]
-        for j in range(size):
-            left += change[i] * normal.products[i, j] * change[j]
-            used += covariance[i, j] * normal.products[j, i] / variance
-    freedom = max(equations - used, 1.0)
+            covariance[PARAMETERS + k, PARAMETERS + k] = 1.0 / precision
+        else:
+            volume -= 2.0 * scales[groups[k]]
+    left, used = _left(normal, change, covariance)
+    freedom = max(equations - used / variance, 1.0)
+    if not (determined and positive):
+        values[:], covariance[:] = np.nan, np.nan
     return _Solved(values, covariance, scales, decided, freedom, max(left, 0.0), cost, volume)
+
+
+@inlined
+def _without_motion(
+    matrix: Array, right: Array, of_motion: Array
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """The information (q,q) and right side (q,) of the coefficients, whatever the motion.
+
+    And first what takes it out: the products (18,q) of the motion with the coefficients, behind
+    ``of_motion``, the half inverse (18,18) of the motion's own.
+    """
+    q = len(right) - PARAMETERS
+    beside, whitened = np.zeros((PARAMETERS, q)), np.zeros(PARAMETERS)
+    information, along = matrix[PARAMETERS:, PARAMETERS:].copy(), right[PARAMETERS:].copy()
+    for a in range(PARAMETERS):
+        own = beside[a]
+        for b in range(a + 1):
+            factor, row = of_motion[a, b], matrix[b]
+            whitened[a] += factor * right[b]
+            for k in range(q):
+                own[k] += factor * row[PARAMETERS + k]
+        for k in range(q):
+            factor, row = own[k], information[k]
+            along[k] -= factor * whitened[a]
+            for j in range(k + 1):
+                row[j] -= factor * own[j]
+    return beside, information, along
+
+
+@inlined
+def _with_precisions(
+    information: Array, scales: Array, groups: IntArray, active: IntArray
+) -> Array:
+    """Information of the active coefficients, the prior's included; the lower triangle."""
+    count = len(active)
+    matrix = np.empty((count, count))
+    for a in range(count):
+        i = active[a]
+        for b in range(a + 1):
+            matrix[a, b] = information[i, active[b]]
+        matrix[a, a] += math.exp(-2.0 * scales[groups[i]])
+    return matrix
+
+
+@inlined
+def _solve(
+    half: Array, unit: Array, along: Array, active: IntArray, best: Array, spread: Array
+) -> None:
+    """Fill in the best coefficients and their variances, (q,) each, of the active ones."""
+    best[:], spread[:] = 0.0, 0.0
+    values, squares = np.zeros(len(active)), np.zeros(len(active))
+    for a in range(len(active)):
+        row, total = half[a], 0.0
+        for b in range(a + 1):
+            total += row[b] * unit[b] * along[active[b]]
+        for b in range(a + 1):
+            values[b] += row[b] * total
+            squares[b] += row[b] * row[b]
+    for a in range(len(active)):
+        best[active[a]] = unit[a] * values[a]
+        spread[active[a]] = unit[a] * unit[a] * squares[a]
+
+
+@inlined
+def _joint(
+    of_motion: Array, beside: Array, half: Array, unit: Array, active: IntArray, right: Array,
+    best: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Covariance (m,m) of motion and coefficients, and their values (m,)."""
+    q, count = len(best), len(active)
+    covariance, values = np.zeros((PARAMETERS + q, PARAMETERS + q)), np.zeros(PARAMETERS + q)
+    inverse, pull = squared(half, unit), np.zeros((PARAMETERS, count))
+    whitened = np.zeros(PARAMETERS)
+    for a in range(PARAMETERS):
+        for b in range(a + 1):
+            whitened[a] += of_motion[a, b] * right[b]
+        for k in range(count):
+            whitened[a] -= beside[a, active[k]] * best[active[k]]
+    for a in range(PARAMETERS):
+        for b in range(a + 1):
+            values[b] += of_motion[a, b] * whitened[a]
+            for k in range(count):  # by how much a coefficient moves the motion
+                pull[b, k] -= of_motion[a, b] * beside[a, active[k]]
+    pulled = _multiplied(pull, inverse)
+    for i in range(PARAMETERS):
+        for j in range(PARAMETERS):
+            for a in range(max(i, j), PARAMETERS):
+                covariance[i, j] += of_motion[a, i] * of_motion[a, j]
+            for k in range(count):
+                covariance[i, j] += pulled[i, k] * pull[j, k]
+        for k in range(count):
+            covariance[i, PARAMETERS + active[k]] = pulled[i, k]
+            covariance[PARAMETERS + active[k], i] = pulled[i, k]
+    for a in range(count):
+        values[PARAMETERS + active[a]] = best[active[a]]
+        for b in range(count):
+            covariance[PARAMETERS + active[a], PARAMETERS + active[b]] = inverse[a, b]
+    return covariance, values
+
+
+@inlined
+def _volume(of_motion: Array, half: Array, unit: Array) -> float:
+    """Logarithm of the determinant of the covariance of motion and coefficients."""
+    volume = 0.0
+    for i in range(PARAMETERS):
+        volume += 2.0 * math.log(of_motion[i, i])
+    for a in range(len(unit)):
+        volume += 2.0 * math.log(half[a, a] * unit[a])
+    return volume
+
+
+@inlined
+def _left(normal: Products, change: Array, covariance: Array) -> tuple[float, float]:
+    """Squared errors (px^2) after a change (m,), and the trace of covariance times products."""
+    left, used = normal.squared_errors, 0.0
+    for i in range(len(change)):
+        left -= 2.0 * change[i] * normal.with_errors[i]
+        for j in range(len(change)):
+            left += change[i] * normal.products[i, j] * change[j]
+            used += covariance[i, j] * normal.products[i, j]
+    return left, used
 
 
 @inlined
@@ -307,72 +467,74 @@ def _groups(coefficients: int) -> IntArray:
 
 @inlined
 def _active(products: Array, scales: Array, groups: IntArray, variance: float) -> IntArray:
-    """Columns that can move a point by more than a small part of the noise."""
-    size = len(products)
-    active, count = np.empty(size, dtype=np.int64), 0
-    for i in range(size):
-        moves = np.inf
-        if i >= PARAMETERS:
-            moves = math.exp(2.0 * scales[groups[i - PARAMETERS]]) * products[i, i]
+    """Coefficients that can move a point by more than a small part of the noise."""
+    active, count = np.empty(len(groups), dtype=np.int64), 0
+    for k in range(len(groups)):
+        i = PARAMETERS + k
+        moves = math.exp(2.0 * scales[groups[k]]) * products[i, i]
         if moves > _NEGLIGIBLE * _NEGLIGIBLE * variance:
-            active[count] = i
+            active[count] = k
             count += 1
-    return active[:count]
-
-
-@inlined
-def _inverse_of(
-    products: Array, information: Array, scales: Array, groups: IntArray, active: IntArray,
-    variance: float,
-) -> Array:  # fmt: skip
-    """Covariance of the active columns."""
-    count = len(active)
-    matrix = np.empty((count, count))
-    for a in range(count):
-        i = active[a]
-        for b in range(count):
-            matrix[a, b] = products[i, active[b]] / variance + information[i, active[b]]
-        if i >= PARAMETERS:
-            matrix[a, a] += math.exp(-2.0 * scales[groups[i - PARAMETERS]])
-        matrix[a, a] *= _RIDGE
-    return inverted(matrix)
+    return active[:count].copy()
 
 
 @inlined
 def _climb(
     scales: Array, uphill: Array, decided: Array, hyper_mean: Array, hyper_precision: Array
-) -> None:
-    """Newton's step of each log-scale (15,), held to be short."""
-    before = scales.copy()
+) -> Array:
+    """Newton's step (15,) of the log-scales, each held to be short."""
+    steps = np.empty(SCALES)
     for g in range(SCALES):
-        climb = uphill[g] - hyper_precision[g] * (before[g] - hyper_mean[g])
+        climb = uphill[g] - hyper_precision[g] * (scales[g] - hyper_mean[g])
         bend = 2.0 * decided[g] + hyper_precision[g]
         for other in (g - 1, g + 1):
             if g < SCALES - 1 and 0 <= other < SCALES - 1:
-                climb -= _SMOOTH_SPECTRUM * (before[g] - before[other])
+                climb -= _SMOOTH_SPECTRUM * (scales[g] - scales[other])
                 bend += _SMOOTH_SPECTRUM
         step = min(max(climb / (bend + _TINY), -_LONGEST_SCALE_STEP), _LONGEST_SCALE_STEP)
-        scales[g] = min(max(before[g] + step, _LEAST_LOG_SCALE), _MOST_LOG_SCALE)
+        steps[g] = min(max(scales[g] + step, _LEAST_LOG_SCALE), _MOST_LOG_SCALE) - scales[g]
+    return steps
+
+
+@inlined
+def _extrapolate(steps: Array, before: Array) -> None:
+    """Lengthen steps (15,) by what the ratios to the steps before foresee (Aitken 1926)."""
+    for g in range(SCALES):
+        ratio = steps[g] / before[g] if before[g] != 0.0 else 0.0
+        if ratio > 0.0:
+            steps[g] *= min(1.0 / max(1.0 - ratio, _TINY), _FARTHEST)
 
 
 @inlined
 def _slope_of_scales(
-    values: Array, inverse: Array, active: IntArray, groups: IntArray, scales: Array, decided: Array
-) -> Array:
-    """Slope (15,) of the log evidence by each log-scale: squares in deviations, less decided.
-
-    Fills in how many coefficients of each scale the points decide (MacKay's gamma).
+    best: Array, spread: Array, active: IntArray, groups: IntArray, scales: Array, decided: Array,
+    uphill: Array,
+) -> None:  # fmt: skip
+    """Fill in the slope (15,) of the log evidence by each log-scale: squares in deviations, less
+    how many coefficients of each scale the points decide (MacKay's gamma), filled in, too.
     """
-    uphill = np.zeros(SCALES)
+    decided[:], uphill[:] = 0.0, 0.0
+    for k in active:
+        g = groups[k]
+        precision = math.exp(-2.0 * scales[g])
+        uphill[g] += best[k] * best[k] * precision
+        decided[g] += 1.0 - spread[k] * precision
     for g in range(SCALES):
-        precision, squares, known = math.exp(-2.0 * scales[g]), 0.0, 0.0
-        for a in range(len(active)):
-            if active[a] >= PARAMETERS and groups[active[a] - PARAMETERS] == g:
-                squares += values[active[a]] * values[active[a]] * precision
-                known += 1.0 - inverse[a, a] * precision
-        decided[g] = max(known, 0.0)
-        uphill[g] = squares - decided[g]
-    return uphill
+        decided[g] = max(decided[g], 0.0)
+        uphill[g] -= decided[g]
+
+
+@inlined
+def _multiplied(left: Array, right: Array) -> Array:
+    """Matrix product, row by row."""
+    product = np.zeros((len(left), right.shape[1]))
+    for i in range(len(left)):
+        row = product[i]
+        for k in range(len(right)):
+            factor, other = left[i, k], right[k]
+            for j in range(len(other)):
+                row[j] += factor * other[j]
+    return product
 
 
 @kernel
@@ -408,7 +570,7 @@ def _row_times(data: Array, count: int) -> Array:
 def fit_frame(
     data: Array, count: int, start: Array, gradient: Array, prior: PriorTerms, threshold: float,
     first_gate: float, first_noise: float, log_scales: Array, hyper_mean: Array,
-    hyper_precision: Array, with_turns: bool, with_smooth: bool, most: int,
+    hyper_precision: Array, with_turns: bool, with_smooth: bool, bend: Array, most: int,
 ) -> FrameFit:  # fmt: skip
     """Fit motion, in-frame turn, smooth error, their scales, the noise and the inliers.
 
@@ -422,9 +584,11 @@ def fit_frame(
         log_scales, hyper_mean, hyper_precision: (15,) where the logarithms of the scales start, and
             what is known of them.
         with_turns, with_smooth: whether there is an in-frame turn, a smooth error.
+        bend: (n,b) functions of the points' places in the map, of which the smooth error is a
+            combination for each axis of the camera (m); (n,0): it is one of the image (px).
         most: steps.
     """
-    q = (TURNS if with_turns else 0) + (2 * SMOOTH_TERMS if with_smooth else 0)
+    q = (TURNS if with_turns else 0) + (smooth_size(bend) if with_smooth else 0)
     size, first = PARAMETERS + q, TURNS if with_turns else 0
     state, coefficients = start.copy(), np.zeros(q)
     gate, noise, scales = first_gate, first_noise, log_scales.copy()
@@ -436,13 +600,13 @@ def fit_frame(
     inliers = squared_errors(data, count, state, gradient) < gate * gate
     prior_cost, finite, done = 0.0, True, False
     lines = linearized(data, count, state, gradient, shake_at(tau, turns))
-    errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:])
+    errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:], bend)
     for turn in range(most):
         kept = int(np.count_nonzero(inliers))
         if kept < _FEWEST:
             finite = False
             break
-        normal = products_of(lines, inliers, errors, with_turns, with_smooth)
+        normal = products_of(lines, inliers, errors, with_turns, with_smooth, bend)
         information, slope, prior_cost = full_prior(prior, state, turns, size)
         solved = with_scales(
             normal, information, slope, coefficients, scales, hyper_mean, hyper_precision, noise,
@@ -459,7 +623,7 @@ def fit_frame(
             for axis in range(3):
                 turns[k, axis] = coefficients[3 * k + axis]
         lines = linearized(data, count, state, gradient, shake_at(tau, turns))
-        errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:])
+        errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:], bend)
         noise = noise_deviation(squared, gate, max(2.0 * kept - solved.freedom, 0.0))
         closed = gate <= WIDEST_GATE * threshold
         gate = max(_CLOSING * gate, min(max(threshold, GATE * noise), WIDEST_GATE * threshold))
@@ -475,21 +639,29 @@ def fit_frame(
     smooth = math.exp(scales[SCALES - 1]) if with_smooth else 0.0
     agreement = neighbours_agree(errors, tau, lines.image, inliers)
     finite = finite and bool(np.all(np.isfinite(solved.covariance)))
+    by_smooth = solved.covariance[:chosen, chosen:] / max(smooth, _TINY)
+    own = solved.covariance[:chosen, :chosen] - by_smooth @ by_smooth.T
     return FrameFit(
-        state, turns, solved.covariance[:chosen, :chosen].copy(), noise, solved.freedom, inliers,
-        squared, scales, solved.decided, smooth, agreement, evidence,
+        state, turns, own, noise, solved.freedom, inliers, squared, scales,
+        solved.decided, smooth, agreement, evidence,
         solved.left / variance, prior_cost + solved.prior_cost, solved.log_determinant, finite,
     )  # fmt: skip
 
 
 @kernel
 def _beside(
-    data: Array, state: Array, gradient: Array, lines: Lines, inliers: BoolArray, smooth: Array
+    data: Array,
+    state: Array,
+    gradient: Array,
+    lines: Lines,
+    inliers: BoolArray,
+    smooth: Array,
+    bend: Array,
 ) -> tuple[Array, Array]:
     """Errors (n,2) beside the smooth one, and their squares (n,); infinite behind the camera."""
     errors = lines.errors.copy()
     if len(smooth) > 0:
-        errors += smooth_at(lines, inliers, smooth)
+        errors += smooth_at(lines, inliers, smooth, bend)
     squared = squared_errors(data, len(errors), state, gradient)
     for i in range(len(errors)):
         if np.isfinite(squared[i]):
@@ -507,6 +679,133 @@ def _largest_move(values: Array, coefficients: Array, covariance: Array) -> floa
         if not part <= longest:
             longest = part
     return longest
+
+
+class ScoreProducts(NamedTuple):
+    """Products of columns at a motion without in-frame turn and smooth error, over the inliers."""
+
+    own: Array  # (14,6,6) of each frequency's columns with themselves
+    by_motion: Array  # (14,6,18) and with the motion's
+    along: Array  # (14,6) and with the negative errors
+    smooth: Array  # (20,20) of the smooth error's
+    smooth_by_motion: Array  # (20,18)
+    smooth_along: Array  # (20,)
+    inverse: Array  # (18,18) of the motion's, with the prior's information
+
+
+@kernel
+def score_products(
+    data: Array, count: int, state: Array, gradient: Array, inliers: BoolArray, prior: PriorTerms,
+    variance: float, turns: bool,
+) -> tuple[ScoreProducts, float]:  # fmt: skip
+    """What tells how much an in-frame turn and a smooth error would explain (Rao 1948).
+
+    A column of the turn is a function of the row time times a derivative: their products are sums
+    of products of the one times products of the other.
+
+    Args:
+        variance: of the noise, px^2.
+        turns: whether products of in-frame turns are wanted; without, they are zero.
+
+    Returns:
+        the products, and how much the errors of neighbouring rows agree.
+    """
+    lines = linearized(data, count, state, gradient, np.zeros((count, 6)))
+    front = squared_errors(data, count, state, gradient)
+    frequencies = SCALES - 1
+    information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    add_prior(
+        prior.informations, prior.references, prior.gravity, state, variance, information, slope
+    )
+    # By the functions of the row time: the derivatives' products with motion and errors, and with
+    # themselves (the functions squared and multiplied).
+    crossed, own = np.zeros((FUNCTIONS, _OUTER)), np.zeros((6, 3 * frequencies))
+    # By the terms of the smooth error: the motion's derivatives and the errors; themselves.
+    beside, within = (
+        np.zeros((SMOOTH_TERMS, 2 * PARAMETERS + 2)),
+        np.zeros((SMOOTH_TERMS, SMOOTH_TERMS)),
+    )
+    values, rates, terms = np.empty(FUNCTIONS), np.empty(FUNCTIONS), np.empty(SMOOTH_TERMS)
+    outer, squares, both = np.empty(_OUTER), np.empty(3 * frequencies), np.empty(2 * PARAMETERS + 2)
+    low, high = extent(lines, inliers)
+    for i in range(count):
+        if not inliers[i] or not np.isfinite(front[i]):
+            continue
+        rows, by_turn, errors = lines.by_motion[i], lines.by_turn[i], lines.errors[i]
+        for a in range(PARAMETERS):
+            for b in range(PARAMETERS):
+                information[a, b] += rows[0, a] * rows[0, b] + rows[1, a] * rows[1, b]
+            both[a], both[PARAMETERS + a] = rows[0, a], rows[1, a]
+        both[2 * PARAMETERS], both[2 * PARAMETERS + 1] = errors[0], errors[1]
+        smooth_terms(lines.image[i], low, high, terms)
+        _add_outer(beside, terms, both)
+        _add_outer(within, terms, terms)
+        if turns:
+            shake_basis(lines.tau[i], values, rates)
+            _turn_products(rows, by_turn, errors, values, outer, squares, own)
+            _add_outer(crossed, values, outer)
+    products = ScoreProducts(
+        np.empty((frequencies, 6, 6)), np.empty((frequencies, 6, PARAMETERS)),
+        np.empty((frequencies, 6)), np.zeros((2 * SMOOTH_TERMS, 2 * SMOOTH_TERMS)),
+        np.empty((2 * SMOOTH_TERMS, PARAMETERS)), np.empty(2 * SMOOTH_TERMS),
+        inverted(information),
+    )  # fmt: skip
+    for f in range(frequencies):
+        for i in range(6):
+            _spread_turn(products, f, i, own, crossed)
+    for i in range(2 * SMOOTH_TERMS):
+        side, k = i // SMOOTH_TERMS, i % SMOOTH_TERMS
+        for j in range(SMOOTH_TERMS):
+            products.smooth[i, SMOOTH_TERMS * side + j] = within[k, j]
+        for a in range(PARAMETERS):
+            products.smooth_by_motion[i, a] = beside[k, PARAMETERS * side + a]
+        products.smooth_along[i] = -beside[k, 2 * PARAMETERS + side]
+    return products, neighbours_agree(lines.errors, lines.tau, lines.image, inliers)
+
+
+@kernel
+def _add_outer(total: Array, left: Array, right: Array) -> None:
+    """Add the products of each number of one vector with each of another."""
+    for i in range(len(left)):
+        row, factor = total[i], left[i]
+        for j in range(len(right)):
+            row[j] += factor * right[j]
+
+
+@inlined
+def _turn_products(
+    rows: Array, by_turn: Array, errors: Array, values: Array, outer: Array, squares: Array,
+    own: Array,
+) -> None:  # fmt: skip
+    """Fill in a point's products of turn and motion, turn and errors; add those of the turn."""
+    for axis in range(3):
+        one, other = by_turn[0, axis], by_turn[1, axis]
+        for a in range(PARAMETERS):
+            outer[PARAMETERS * axis + a] = one * rows[0, a] + other * rows[1, a]
+        outer[3 * PARAMETERS + axis] = one * errors[0] + other * errors[1]
+    for f in range(len(values) // 2):
+        squares[3 * f] = values[2 * f] * values[2 * f]
+        squares[3 * f + 1] = values[2 * f] * values[2 * f + 1]
+        squares[3 * f + 2] = values[2 * f + 1] * values[2 * f + 1]
+    for axis in range(3):
+        for other_axis in range(axis + 1):
+            product = by_turn[0, axis] * by_turn[0, other_axis]
+            product += by_turn[1, axis] * by_turn[1, other_axis]
+            place = axis * (axis + 1) // 2 + other_axis
+            for j in range(len(squares)):
+                own[place, j] += product * squares[j]
+
+
+@inlined
+def _spread_turn(products: ScoreProducts, f: int, i: int, own: Array, crossed: Array) -> None:
+    """Write the products of column i (axes of the cosine, then of the sine) of a frequency."""
+    sine, axis = i // 3, i % 3
+    for j in range(6):
+        first, last = max(axis, j % 3), min(axis, j % 3)
+        products.own[f, i, j] = own[first * (first + 1) // 2 + last, 3 * f + sine + j // 3]
+    for a in range(PARAMETERS):
+        products.by_motion[f, i, a] = crossed[2 * f + sine, PARAMETERS * axis + a]
+    products.along[f, i] = -crossed[2 * f + sine, 3 * PARAMETERS + axis]
 
 
 def warm_up() -> None:

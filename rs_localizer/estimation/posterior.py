@@ -75,6 +75,11 @@ class Posterior:
     speeds: Array = field(default_factory=lambda: np.zeros(0))
     near_outliers: int = 0  # points just beyond the gate, where they are too many to be chance
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
+    # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
+    undetected: Array = field(default_factory=lambda: np.zeros((12, 12)))
+    # Of the smooth error, which other frames share and the covariance does not have, either
+    smooth_scale: float = 0.0  # px, or m of a bent map; 0: none was fitted
+    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n,b), see frame_fit
 
     @property
     def determined(self) -> bool:

@@ -265,11 +265,15 @@ def half_inverse(matrix: Array) -> tuple[Array, Array, bool]:
 @kernel
 def inverted(matrix: Array) -> Array:
     """Inverse of a symmetric positive definite matrix; NaN where it is none."""
-    half, scale, found = half_inverse(matrix)
-    size = len(matrix)
-    inverse = np.zeros((size, size)) if found else np.full((size, size), np.nan)
-    if not found:
-        return inverse
+    half, scale, positive = half_inverse(matrix)
+    return squared(half, scale) if positive else np.full(matrix.shape, np.nan)
+
+
+@kernel
+def squared(half: Array, scale: Array) -> Array:
+    """The inverse of which :func:`half_inverse` is the half."""
+    size = len(scale)
+    inverse = np.zeros((size, size))
     for k in range(size):
         row = half[k]
         for i in range(k + 1):

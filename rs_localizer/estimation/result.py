@@ -50,6 +50,7 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         inliers=inliers,
         residuals=residuals,
         joint_covariance=posterior.covariance,
+        undetected_covariance=posterior.undetected,
         shake=posterior.shake,
         model_error=posterior.model_error,
         scales=posterior.scales,

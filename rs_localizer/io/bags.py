@@ -29,9 +29,11 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from rs_localizer.io.detections import DEFINITIONS
+from rs_localizer.io.remote import Location, is_url, local_copy
 from rs_localizer.io.topics import TF_STATIC
 from rs_localizer.io.yaml_text import load_yaml
 
@@ -121,8 +123,11 @@ with contextlib.suppress(KeyError, AttributeError):  # of versions that are made
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """The message types of ROS 2 Jazzy, and of detections."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
 
 
 def make_message(type_name: str, **fields: Any) -> Any:
@@ -136,7 +141,7 @@ def make_message(type_name: str, **fields: Any) -> Any:
 class BagReader:
     """An open recording (see :func:`open_bag`)."""
 
-    def __init__(self, path: Path, reader: AnyReader) -> None:
+    def __init__(self, path: Location, reader: AnyReader) -> None:
         self._path = path
         self._reader = reader
         self.topics: dict[str, str] = {
@@ -144,7 +149,7 @@ class BagReader:
         }
 
     @property
-    def path(self) -> Path:
+    def path(self) -> Location:
         return self._path
 
     def count(self, topics: Collection[str]) -> int:
@@ -178,22 +183,24 @@ class BagReader:
     def _check_types(self, names: Collection[str]) -> None:
         """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
         own, known = self._reader.typestore.fielddefs, typestore().fielddefs
-        for name in set(names) & set(known) if self._reader.is2 else ():
+        for name in (set(names) & set(known)) - set(DEFINITIONS) if self._reader.is2 else ():
             if _fields_of(name, own) != _fields_of(name, known):
                 raise BagError(f"{self._path} describes {name} otherwise than ROS 2 Jazzy does")
 
 
 @contextlib.contextmanager
-def open_bag(path: Path | str) -> Iterator[BagReader]:
-    """Open a recording: a rosbag2 directory, one of its ``.mcap`` or ``.db3`` files, or a ``.bag``.
+def open_bag(path: Location) -> Iterator[BagReader]:
+    """Open a recording: a rosbag2 directory, one of its ``.mcap`` or ``.db3`` files, or a ``.bag``;
+    of a URL, a copy that is fetched before and removed after.
 
     Raises:
         BagError: when there is no such recording, or it is damaged or empty.
     """
-    path = Path(path)
+    path = path if is_url(path) else Path(path)
     with contextlib.ExitStack() as stack:
+        local = stack.enter_context(local_copy(path))
         with _explained(path):
-            file = _storage(path)
+            file = _storage(local)
             reader = stack.enter_context(AnyReader([file], default_typestore=typestore()))
             bag = BagReader(path, reader)
             if bag.count(bag.topics) == 0:
@@ -247,7 +254,7 @@ def _storage(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _explained(path: Path) -> Iterator[None]:
+def _explained(path: Location) -> Iterator[None]:
     """Turn whatever goes wrong while a recording is read into a BagError."""
     try:
         yield

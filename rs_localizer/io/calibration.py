@@ -159,8 +159,10 @@ def colmap_parameters(camera: Camera) -> dict[str, Any]:
     Raises:
         ValueError: for coefficients that no model of COLMAP has.
     """
-    distortion = str(camera.distortion_model)
-    order, D = _ORDER[distortion], camera.D.tolist()
+    distortion, D = str(camera.distortion_model), camera.D.tolist()
+    if distortion not in _ORDER:
+        raise ValueError(f"COLMAP has no lens {distortion}")
+    order = _ORDER[distortion]
     if len(D) > len(order):
         raise ValueError(
             f"COLMAP knows {len(order)} coefficients of {distortion}, the lens has {len(D)}"

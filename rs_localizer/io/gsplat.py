@@ -15,10 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.calibration import colmap_parameters
 from rs_localizer.io.nerfstudio import pixel_intrinsics
-
-_COLMAP_LENGTH = 8  # coefficients of FULL_OPENCV
 
 
 def exposed_rows(camera: Camera) -> tuple[float, float]:
@@ -26,6 +25,11 @@ def exposed_rows(camera: Camera) -> tuple[float, float]:
     width, height = camera.size
     times = camera.row_time(np.array([[0.0, 0.0], [width - 1.0, height - 1.0]]))
     return float(times.min()), float(times.max())
+
+
+def shutter_type(camera: Camera) -> str:
+    """As gsplat and NCore call it: ``ROLLING_TOP_TO_BOTTOM`` and so on, ``GLOBAL``."""
+    return f"ROLLING_{camera.scan_direction}".upper() if camera.readout_time > 0.0 else "GLOBAL"
 
 
 def write_gsplat(
@@ -46,21 +50,16 @@ def write_gsplat(
     np.save(folder / "viewmats.npy", views[:, 0])
     np.save(folder / "viewmats_rs.npy", views[:, 2])
     np.save(folder / "Ks.npy", np.broadcast_to(K, (len(names), 3, 3)))
-    rolling = camera.readout_time > 0.0
-    shutter = f"ROLLING_{camera.scan_direction}".upper() if rolling else "GLOBAL"
     width, height = camera.size
-    lens = [*focal, *centre, *_coefficients(camera)]
-    model = {4: "OPENCV", _COLMAP_LENGTH: "FULL_OPENCV"}[len(lens) - 4]
-    if camera.distortion_model == DistortionModel.EQUIDISTANT:
-        model = "OPENCV_FISHEYE"
+    lens = colmap_parameters(camera)
     images = []
     for number, (name, view) in enumerate(zip(names, views[:, 1], strict=True), 1):
         x, y, z, w = Rotation.from_matrix(view[:3, :3]).as_quat(canonical=True)
         images.append(f"{number} {_line([w, x, y, z, *view[:3, 3]])} 1 {name}\n\n")
     for file, text in (
         ("names.txt", "".join(f"{name}\n" for name in names)),
-        ("shutter.txt", f"{shutter}\n"),
-        ("cameras.txt", f"1 {model} {width} {height} {_line(lens)}\n"),
+        ("shutter.txt", f"{shutter_type(camera)}\n"),
+        ("cameras.txt", f"1 {lens['model']} {width} {height} {_line(lens['params'])}\n"),
         ("images.txt", "".join(images)),
         (
             "points3D.txt",
@@ -68,12 +67,6 @@ def write_gsplat(
         ),
     ):
         (folder / file).write_text(text, encoding="utf-8")
-
-
-def _coefficients(camera: Camera) -> list[float]:
-    """Of COLMAP: four, or eight where some of the others are not 0."""
-    D = [*camera.D.tolist(), *[0.0] * _COLMAP_LENGTH][:_COLMAP_LENGTH]
-    return D if any(D[4:]) else D[:4]
 
 
 def _line(values: Array | list[float]) -> str:

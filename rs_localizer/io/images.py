@@ -167,12 +167,12 @@ def decode(packed: bytes, format_: str) -> Gray:
     size = _claimed_size(packed, name)
     if size is None:
         raise MessageError(
-            f"the {name} image of {len(data)} bytes cannot be decoded: no header tells its size"
+            f"the {name} image of {len(data)} bytes cannot be decoded: no header has its size"
         )
     if math.prod(size) > min(_DENSEST * len(data), _MOST_PIXELS):
         raise MessageError(
-            f"the {name} image says that it is {size[0]} x {size[1]}, of which {len(data)} bytes "
-            f"cannot tell, or which is more than {_MOST_PIXELS // 1_000_000} megapixels"
+            f"the {name} image says that it is {size[0]} x {size[1]}, too much for {len(data)} "
+            f"bytes, or more than {_MOST_PIXELS // 1_000_000} megapixels"
         )
     if name == "PNG":
         data = np.frombuffer(_still_png(packed), np.uint8)

@@ -8,6 +8,7 @@ from __future__ import annotations
 # Inputs of the localizer.
 CORRESPONDENCES = "correspondences"  # which the marker detector publishes
 KEYPOINTS = "keypoints"
+DETECTIONS = "detections"  # tags of apriltag_ros
 MAP_POINTS = "map_points"
 CAMERA_INFO = "camera_info"
 IMU = "imu"

@@ -21,6 +21,8 @@
         quaternion: [0.0, 0.0, 0.0, 1.0]
         inverted: false            # optional: white on black paper
         shape: [[0.0, 0.0, 0.001], ...]  # optional, of any board: how far from flat each corner is
+        deviation: 0.0002          # optional, of any board: m, how well its points are known;
+                                   # without it as paper is: 0.2 mm for each 10 cm from its middle
       - type: circles              # or asymmetric_circles, OpenCV's pattern
         columns: 4                 # circles
         rows: 11
@@ -147,18 +149,22 @@ def _board(entry: Entry) -> Board:
     square = 0.0 if "circles" in kind else entry.number("square")
     pose = _pose(entry)
     shape = entry.take("shape", list) if "shape" in entry else None
+    deviation = entry.number("deviation") if "deviation" in entry else None
     if kind != _CHARUCO:
         inverted = entry.take("inverted", bool, False)
         entry.finish()
         with entry.named():
             if kind == _CHESSBOARD:
-                return Chessboard(columns, rows, square, pose, inverted, shape)
-            return CircleGrid(columns, rows, spacing, kind == _ASYMMETRIC, inverted, pose, shape)
+                return Chessboard(columns, rows, square, pose, inverted, shape, deviation)
+            asymmetric = kind == _ASYMMETRIC
+            return CircleGrid(columns, rows, spacing, asymmetric, inverted, pose, shape, deviation)
     marker, name = entry.number("marker"), entry.take("family", str)
     first_id, legacy = entry.take("first_id", int, 0), entry.take("legacy", bool, False)
     entry.finish()
     with entry.named():
-        return Charuco(columns, rows, square, marker, family(name), first_id, legacy, pose, shape)
+        return Charuco(
+            columns, rows, square, marker, family(name), first_id, legacy, pose, shape, deviation
+        )
 
 
 def _pose(entry: Entry) -> Pose:
@@ -182,6 +188,7 @@ _EXPLANATION = """\
 #     and whose y points into the wall.
 #   shape: of a board: how far from flat each of its points is, x y z along its axes, as calibrate
 #     finds it
+#   deviation: of a board: how well its points are known, m; not given: as those of paper
 #   corners: instead of these three: top left, top right, bottom right, bottom left, from the front
 #   position_deviation, rotation_deviation: standard deviations of a survey along the axes of
 #     map_frame, m and rad
@@ -216,6 +223,8 @@ def _marker_entry(marker: Marker) -> dict[str, Any]:
 def _board_entry(board: Board) -> dict[str, Any]:
     sizes: dict[str, Any] = {"columns": board.columns, "rows": board.rows}
     shape = {} if board.shape is None else {"shape": _numbers(np.round(board.shape, 7))}
+    if board.deviation is not None:
+        shape["deviation"] = float(f"{board.deviation:.3g}")
     if not isinstance(board, Charuco):
         inverted = {"inverted": True} if board.inverted else {}
         if isinstance(board, Chessboard):

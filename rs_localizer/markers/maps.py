@@ -12,7 +12,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Board, Charuco, Marker, with_points
+from rs_localizer.markers.prints import Board, Charuco, Marker, deviation_of, with_points
 
 
 class MarkerMapError(ValueError):
@@ -70,8 +70,21 @@ class MarkerMap:
         """
         return np.concatenate([item.points for item in (*self.markers, *self.boards)])
 
-    def with_points(self, points: Array) -> MarkerMap:
-        """The same map with its corners (n,3) elsewhere, in the order of :attr:`points`."""
+    @property
+    def settings(self) -> dict[str, float]:
+        """What the localizer is to be told of it: ``map_deviation`` (m), rms over the points of the
+        boards. Markers are exact: what their places are worth is their survey's to say.
+        """
+        boards = [(len(board.points), deviation_of(board)) for board in self.boards]
+        if not boards:
+            return {}
+        counts, deviations = np.array(boards).T
+        return {"map_deviation": float(np.sqrt(counts @ deviations**2 / counts.sum()))}
+
+    def with_points(self, points: Array, deviation: float | None = None) -> MarkerMap:
+        """The same map with its corners (n,3) elsewhere, in the order of :attr:`points`, those of
+        boards known to a deviation (m).
+        """
         sizes = [len(item.points) for item in (*self.markers, *self.boards)]
         parts = np.split(points, np.cumsum(sizes)[:-1])
         own = len(self.markers)
@@ -82,7 +95,7 @@ class MarkerMap:
                 for marker, part in zip(self.markers, parts[:own], strict=True)
             ),
             boards=tuple(
-                with_points(board, part)
+                with_points(board, part, deviation)
                 for board, part in zip(self.boards, parts[own:], strict=True)
             ),
         )

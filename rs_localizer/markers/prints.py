@@ -21,6 +21,9 @@ from rs_localizer.markers.poses import Pose, finite
 _SQUARE_TOLERANCE = 0.05
 # No camera sees more.
 _MOST_SQUARES = 200
+# Of a printed board whose shape nobody measured, a corner is off by this part of its distance from
+# the middle: 0.2 mm in 10 cm, as paper on a wall or a clipboard bends.
+_PAPER = 0.002
 
 _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
@@ -92,6 +95,7 @@ class Chessboard:
     pose: Pose = field(default_factory=Pose)
     inverted: bool = False  # white squares on black, with black paper around them
     shape: Array | None = None  # (n,3) m, how far from flat each corner is, in the print's axes
+    deviation: float | None = None  # m, of the points' places as they are given; None: paper's
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:  # OpenCV's own limit
@@ -136,6 +140,7 @@ class CircleGrid:
     inverted: bool = False  # white circles on black
     pose: Pose = field(default_factory=Pose)
     shape: Array | None = None  # (n,3) m, how far from flat each centre is, in the print's axes
+    deviation: float | None = None  # m, of the points' places as they are given; None: paper's
 
     def __post_init__(self) -> None:
         if self.columns < 2 or self.rows < 3:
@@ -183,6 +188,7 @@ class Charuco:
     legacy: bool = False
     pose: Pose = field(default_factory=Pose)
     shape: Array | None = None  # (n,3) m, how far from flat each corner is, in the print's axes
+    deviation: float | None = None  # m, of the points' places as they are given; None: paper's
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 2 or self.columns * self.rows < 6:
@@ -246,10 +252,18 @@ class Charuco:
 Board = Chessboard | CircleGrid | Charuco
 
 
-def with_points(board: Board, points: Array) -> Board:
-    """The board with its points at (n,3) in the map."""
+def with_points(board: Board, points: Array, deviation: float | None = None) -> Board:
+    """The board with its points at (n,3) in the map, known to a deviation (m)."""
     flat = replace(board, shape=None).points
-    return replace(board, shape=(points - flat) @ board.pose.rotation)
+    return replace(board, shape=(points - flat) @ board.pose.rotation, deviation=deviation)
+
+
+def deviation_of(board: Board) -> float:
+    """By how much (m, rms of one standard deviation) points are off: as given, or as paper is."""
+    if board.deviation is not None:
+        return board.deviation
+    apart = board.points - board.points.mean(axis=0)
+    return _PAPER * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
 def _bent(flat: Array, shape: Array | None) -> Array:
@@ -259,6 +273,8 @@ def _bent(flat: Array, shape: Array | None) -> Array:
 def _check_shape(board: Board, count: int) -> None:
     if board.shape is not None:
         object.__setattr__(board, "shape", finite(board.shape, (count, 3), "shape"))
+    if board.deviation is not None and not 0.0 <= board.deviation < np.inf:
+        raise ValueError(f"deviation must be 0 or more metres, found {board.deviation!r}")
 
 
 def _grid(columns: int, rows: int, spacing: float) -> Array:

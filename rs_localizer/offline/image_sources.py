@@ -63,7 +63,7 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
     for jpeg, gray, seconds in read_video(path):
         now = clock.relative(None if seconds is None else round(1e9 * seconds))
         if now is None:
-            lost = Refusal(Reason.NO_TIME, "OpenCV does not tell its presentation time")
+            lost = Refusal(Reason.NO_TIME, "OpenCV gives no presentation time")
             yield Shot(lost, _info(camera, 0), None, 0)
         else:
             yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from rs_localizer.config import NodeConfig, PublishTf
+from rs_localizer.config import ImuUse, NodeConfig, PublishTf
 from rs_localizer.io.bags import BagError, BagReader, make_message
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
-from rs_localizer.io.topics import CAMERA_INFO, IMU, MAP_POINTS, TF, TF_STATIC
+from rs_localizer.io.topics import CAMERA_INFO, DETECTIONS, IMU, MAP_POINTS, TF, TF_STATIC
 from rs_localizer.io.transforms import TransformError, TransformTree
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import IMU_TYPE, INPUTS, Input, Role, with_role
-from rs_localizer.pipeline.refusal import Refusal
+from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
 
 Item = tuple[str, int, Any]
 """Topic, time of recording in ns, message."""
@@ -137,7 +137,7 @@ def imu_topics(bag: BagReader) -> list[str]:
 
 def has_frames(bag: BagReader) -> bool:
     """Whether there is anything to localize: a cloud of any kind."""
-    return any(item.type in bag.topics.values() for item in with_role(Role.FRAMES))
+    return any(set(item.types) & set(bag.topics.values()) for item in with_role(Role.FRAMES))
 
 
 def _named(bag: BagReader, item: Input) -> list[str]:
@@ -145,12 +145,12 @@ def _named(bag: BagReader, item: Input) -> list[str]:
     return sorted(
         topic
         for topic, kind in bag.topics.items()
-        if kind == item.type and topic.split("/")[-1] == item.topic
+        if kind in item.types and topic.split("/")[-1] == item.topic
     )
 
 
 def _find(bag: BagReader, item: Input, given: str | None) -> str:
-    of_type = sorted(topic for topic, kind in bag.topics.items() if kind == item.type)
+    of_type = sorted(topic for topic, kind in bag.topics.items() if kind in item.types)
     if given is not None:
         if given in of_type:
             return given
@@ -236,10 +236,45 @@ def _connected(tree: TransformTree, target: str, source: str) -> bool:
     return True
 
 
-def replay(
-    bag: BagReader, topics: Topics, localizer: FrameLocalizer
-) -> Iterator[tuple[int, Localized | Refusal]]:
-    """Time of recording (ns) and result of every frame, as the node would have answered.
+def prepare(
+    bag: BagReader,
+    config: NodeConfig,
+    given: Mapping[str, str | None] | None = None,
+    notice: Notify = unheard,
+) -> tuple[Topics, FrameLocalizer]:
+    """What :func:`replay` needs: where the inputs are, and a localizer with its map.
+
+    Args:
+        bag: the recording.
+        config: the settings.
+        given: topics, as for :func:`find_topics`.
+        notice: told of what is odd.
+
+    Raises:
+        ValueError: for topics, transforms or a map that are missing or cannot be used.
+    """
+    topics = find_topics(bag, given)
+    if config.imu.use == ImuUse.NONE:
+        topics = topics.without(IMU)
+    if topics.lacks_map and not config.map_file:
+        raise BagError(f"{bag.path} has {topics.frames} and no map; give one with --map")
+    if DETECTIONS in topics.of and not config.marker_map:
+        raise BagError(f"{bag.path} has {topics.frames}; -p marker_map:=FILE says where tags are")
+    localizer = FrameLocalizer(config, notice, find_transforms(bag, topics, config))
+    localizer.load_map()
+    return topics, localizer
+
+
+class Answer(NamedTuple):
+    """What became of a frame."""
+
+    recorded_ns: int
+    stamp_ns: int  # of its message
+    result: Localized | Refusal
+
+
+def replay(bag: BagReader, topics: Topics, localizer: FrameLocalizer) -> Iterator[Answer]:
+    """The result of every frame, as the node would have answered.
 
     A message that is no frame and cannot be used gives a Refusal of its own, for a reason of
     :data:`NO_FRAMES`.
@@ -254,7 +289,7 @@ def replay(
     for topic, recorded_ns, message in messages:
         result = inputs[topic].take(localizer, message)
         if result is not None:
-            yield recorded_ns, result
+            yield Answer(recorded_ns, stamp_ns(message), result)
 
 
 def _list(topics: list[str]) -> str:

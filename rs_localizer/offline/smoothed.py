@@ -1,8 +1,11 @@
-"""``replay --smooth``: the frames of a whole recording, and one motion through all of them."""
+"""``replay --smooth``: the frames of a recording, and one motion through all of them."""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +17,7 @@ from rs_localizer.pipeline.pose_at_time import pose_at, published_moment, twist_
 from rs_localizer.pipeline.refusal import Refusal
 from rs_localizer.trajectory.observe import Observed
 from rs_localizer.trajectory.smoothing import smooth
+from rs_localizer.trajectory.spline import LEAST_FRAMES, stretches
 
 # Recordings are smoothed in windows of so many seconds and so much on both sides of them: what an
 # image farther away says is forgotten, since accelerations fade within 0.1 s.
@@ -22,7 +26,7 @@ _WINDOW_NS, _MARGIN_NS = 60_000_000_000, 2_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedFrames:
-    """What the whole recording says of each moment."""
+    """What the images say of the moments of one window."""
 
     frames: list[Localized]
     bridged: IntArray  # (b,) ns, stamps of those without an image of their own
@@ -30,45 +34,104 @@ class SmoothedFrames:
     shaken: int  # images that shake faster than a smooth motion, and keep their own poses
 
 
+class _Window(NamedTuple):
+    stamps_ns: IntArray  # (m,) of the images in it, each once
+    first_ns: int  # of the images in it and in its margins
+    last_ns: int
+    last_place: int  # of these images, in the recording
+
+
 def smooth_frames(
-    localizer: FrameLocalizer, localized: list[Localized], stamps_ns: list[int], rate: float | None
-) -> SmoothedFrames:
-    """The frames of a recording again, each with the motion that all of them say.
+    localizer: FrameLocalizer,
+    localized: Iterable[Localized],
+    stamps_ns: list[int],
+    rate: float | None,
+) -> Iterator[SmoothedFrames]:
+    """The frames of a recording again, each with the motion that all of them say, by windows.
+
+    A window is smoothed when the last image of it has come, and forgotten, so that the memory that
+    this takes does not grow with the recording.
 
     Args:
-        localizer: with the settings and the camera that localized them.
-        localized: the frames with a pose.
-        stamps_ns: of all images.
+        localizer: with the settings and the camera that localize them.
+        localized: the frames with a pose, in the order of the recording.
+        stamps_ns: of all images, in the same order.
         rate: Hz, samples of the motion; None: one for each image, at ``pose_time``.
 
     Raises:
         ValueError: when the frames are no single recording of one map, or too few.
     """
-    if localizer.calibration is None or not localized:
-        raise ValueError("no image has a pose: there is nothing to smooth")
-    maps = {frame.map_frame for frame in localized}
-    if len(maps) > 1:
-        raise ValueError(f"points lie in several frames: {', '.join(sorted(maps))}")
-    once = {frame.input_stamp_ns: frame for frame in localized}
-    stamps = np.array(sorted(once), dtype=np.int64)
-    inputs = np.array(sorted(set(stamps_ns)), dtype=np.int64)
-    if rate is not None:
-        count = int((stamps[-1] - stamps[0]) * 1e-9 * rate) + 1
-        inputs = stamps[0] + np.round(np.arange(count) * 1e9 / rate).astype(np.int64)
-    # The last window takes a rest that would be short.
-    windows = max(int((stamps[-1] - stamps[0]) // _WINDOW_NS), 1)
-    edges = stamps[0] + _WINDOW_NS * np.arange(1, windows)
-    result, bridged, undetermined, shaken = [], [], 0, 0
-    for k, wanted in enumerate(np.split(inputs, np.searchsorted(inputs, edges))):
-        first = 0 if k == 0 else np.searchsorted(stamps, edges[k - 1] - _MARGIN_NS)
-        last = len(stamps) if k == windows - 1 else np.searchsorted(stamps, edges[k] + _MARGIN_NS)
-        near = [once[int(stamp)] for stamp in stamps[first:last]]
-        part = _smoothed(localizer, near, wanted, rate is not None)
-        result += part.frames
-        bridged.append(part.bridged)
-        undetermined += part.undetermined
-        shaken += part.shaken
-    return SmoothedFrames(result, np.concatenate(bridged), undetermined, shaken)
+    pending = deque(_windows(np.array(stamps_ns, np.int64)))
+    first_ns, last_ns = min(stamps_ns, default=0), max(stamps_ns, default=0)
+    places = {stamp: place for place, stamp in reversed(list(enumerate(stamps_ns)))}
+    near: dict[int, Localized] = {}
+    maps: set[str] = set()
+    count = smoothed = 0
+
+    def finish() -> SmoothedFrames:
+        nonlocal smoothed
+        window = pending.popleft()
+        known = sorted(s for s in near if window.first_ns <= s <= window.last_ns)
+        frames = [near[s] for s in known]
+        for stamp in [s for s in known if pending and s < pending[0].first_ns]:
+            del near[stamp]
+        inputs = window.stamps_ns
+        if rate is not None:
+            inputs = _moments(inputs, first_ns, last_ns if not pending else None, rate)
+        if not stretches((np.array(known, np.int64) - first_ns).astype(np.float64) * 1e-9):
+            return SmoothedFrames([], inputs[:0], len(inputs), 0)
+        smoothed += 1
+        return _smoothed(localizer, frames, inputs, rate is not None)
+
+    for frame in localized:
+        count += 1
+        maps.add(frame.map_frame)
+        if len(maps) > 1:
+            raise ValueError(f"points lie in several frames: {', '.join(sorted(maps))}")
+        while pending and pending[0].last_place < places[frame.input_stamp_ns]:
+            yield finish()
+        near[frame.input_stamp_ns] = frame
+    while count and pending:
+        yield finish()
+    if count and not smoothed:
+        raise ValueError(f"{count} frames have a pose, none of them {LEAST_FRAMES} in a row")
+
+
+def _windows(stamps_ns: IntArray) -> Iterator[_Window]:
+    """Those that hold images; the last one takes a rest that would be short."""
+    if not len(stamps_ns):
+        return
+    order = np.argsort(stamps_ns, kind="stable")
+    stamps = stamps_ns[order]
+    most = max(int(stamps[-1] - stamps[0]) // _WINDOW_NS - 1, 0)
+    numbers = np.minimum((stamps - stamps[0]) // _WINDOW_NS, most)
+    for number in np.unique(numbers).tolist():
+        begin, end = np.searchsorted(numbers, [number, number + 1]).tolist()
+        start_ns = int(stamps[0]) + number * _WINDOW_NS
+        first = int(np.searchsorted(stamps, start_ns - _MARGIN_NS))
+        last = len(stamps)
+        if number < most:
+            last = int(np.searchsorted(stamps, start_ns + _WINDOW_NS + _MARGIN_NS))
+        yield _Window(
+            np.unique(stamps[begin:end]), int(stamps[first]), int(stamps[last - 1]),
+            int(order[first:last].max()),
+        )  # fmt: skip
+
+
+def _moments(stamps_ns: IntArray, first_ns: int, last_ns: int | None, rate: float) -> IntArray:
+    """Evenly sampled moments of a window, counted from the first image of the recording.
+
+    Args:
+        stamps_ns: (m,) of the images in the window.
+        first_ns: of the recording.
+        last_ns: of the recording, if this is the last window.
+        rate: Hz.
+    """
+    start_ns = first_ns + (int(stamps_ns[0]) - first_ns) // _WINDOW_NS * _WINDOW_NS
+    end_ns = start_ns + _WINDOW_NS if last_ns is None else last_ns + 1
+    count = [int((moment - first_ns) * 1e-9 * rate) for moment in (start_ns, end_ns)]
+    moments = first_ns + np.round(np.arange(count[0], count[1] + 1) * 1e9 / rate).astype(np.int64)
+    return moments[(moments >= start_ns) & (moments < end_ns)]
 
 
 def _smoothed(

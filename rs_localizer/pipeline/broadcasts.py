@@ -35,9 +35,7 @@ def broadcast(frame: Localized, config: NodeConfig, transforms: Transforms) -> B
     if config.publish_tf == PublishTf.NONE:
         return None
     if frame.input_stamp_ns == 0:
-        raise TransformError(
-            "header.stamp of the input is zero: TF cannot tell for when the pose is"
-        )
+        raise TransformError("header.stamp of the input is zero: the pose has no time for TF")
     map_from_body = Transform(frame.pose.rotation, frame.pose.position)
     if config.publish_tf == PublishTf.MAP_TO_CAMERA:
         return Broadcast(frame.stamp_ns, frame.map_frame, frame.body_frame, map_from_body)

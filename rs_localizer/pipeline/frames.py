@@ -6,9 +6,8 @@ Both feed their messages to a :class:`FrameLocalizer` and publish what
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +40,9 @@ from rs_localizer.pipeline.pose_at_time import middle_row_ns, pose_at, twist_at
 from rs_localizer.pipeline.published import ReadoutKnown, of_body, of_camera
 from rs_localizer.pipeline.readout_watch import ReadoutWatch
 from rs_localizer.pipeline.refusal import Notify, Refusal, unheard
-from rs_localizer.pipeline.single_frames import SingleFrames
+from rs_localizer.pipeline.tags import Tags, read_tags
 from rs_localizer.solvers.table import find_solver
-from rs_localizer.tracking import Tracker
+from rs_localizer.tracking import Memory, Tracker
 
 
 class Landmarks:
@@ -268,56 +267,6 @@ _STILL = Estimate(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Method:
-    """Camera, localizer and what leads it from frame to frame, which belong together."""
-
-    calibration: Calibration
-    config: NodeConfig
-    camera: Camera
-    localizer: Localizer
-    frames: Tracker | SingleFrames
-
-    @classmethod
-    def of(cls, calibration: Calibration, config: NodeConfig) -> Self:
-        """The method of these settings.
-
-        Raises:
-            ValueError: for settings that the localizer refuses.
-        """
-        camera = calibration.camera(config.readout_time, config.scan_direction)
-        localizer = Localizer(camera, config)
-        estimates_motion = find_solver(config.solver).rolling_shutter
-        timed = config.readout_time > 0.0 and estimates_motion
-        inertial = inertial_settings(config) if timed else None
-        frames: Tracker | SingleFrames
-        if timed and config.tracking:
-            frames = Tracker(localizer, inertial)
-        else:
-            # Without a readout time frames cannot predict each other; map and lens stay the same.
-            remembers = config.tracking and estimates_motion
-            frames = SingleFrames(localizer, inertial, remembers)
-        return cls(calibration, config, camera, localizer, frames)
-
-    @property
-    def tracker(self) -> Tracker | None:
-        """None: no frame predicts the next."""
-        return self.frames if isinstance(self.frames, Tracker) else None
-
-    def middle_row_ns(self, stamp_ns: int) -> int:
-        """When the middle row of the image with this stamp was exposed."""
-        return middle_row_ns(self.config, self.camera, stamp_ns)
-
-    def warm_up(self) -> None:
-        """Compile all that it needs, from points to messages."""
-        self.localizer.warm_up()
-        so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
-        twist_at(_STILL, 0.5, 1.0)
-        so3.log(np.eye(3))
-        so3.exp_many(np.zeros((1, 3)))  # of the watch over the readout time
-        matching.warm_up()
-
-
 class FrameLocalizer:
     """Localizes correspondences, or keypoints by a map, with the latest camera and settings.
 
@@ -343,28 +292,43 @@ class FrameLocalizer:
     ) -> None:
         self._notice = notice
         self.transforms: Transforms = TransformTree() if transforms is None else transforms
-        self.imu = ImuInput(notice)
+        self.imu: ImuInput = ImuInput(notice)
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
+        self._tags: Tags | None = None
         self._resets = StreamResets()
         self._calibration: Calibration | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
-        self._given = config  # the readout time may be found on the way
-        self._method = Method.of(ANY_CALIBRATION, config)
+        self._settings = config  # a readout time that is estimated takes the place of theirs
+        self._use(ANY_CALIBRATION, config)
 
     @property
     def config(self) -> NodeConfig:
-        return self._method.config
+        return self._config
 
     @config.setter
     def config(self, config: NodeConfig) -> None:
         self._use(self._calibration or ANY_CALIBRATION, config)
-        self._given = config
+        self._settings = config
 
     def _use(self, calibration: Calibration, config: NodeConfig) -> None:
-        # Nothing changes if this raises: camera, localizer and settings always belong together.
-        self._method = Method.of(calibration, config)
+        # Nothing changes if this raises: camera, tracker and settings always belong together.
+        camera = calibration.camera(config.readout_time, config.scan_direction)
+        localizer = Localizer(camera, config)
+        rolling = find_solver(config.solver).rolling_shutter
+        timed = config.readout_time > 0.0 and rolling
+        memory = Memory.NOTHING
+        if config.tracking and rolling:
+            # Without a readout time frames cannot predict each other; map and lens stay the same.
+            memory = Memory.MOTION if timed else Memory.MAP_AND_LENS
+        inertial = inertial_settings(config) if timed else None
+        self._tracker = Tracker(localizer, inertial, memory)
+        self._camera, self._config = camera, config
         self.readout_watch.reset()
+
+    def _middle_row_ns(self, stamp_ns: int) -> int:
+        """When the middle row of the image with this stamp was exposed."""
+        return middle_row_ns(self._config, self._camera, stamp_ns)
 
     @property
     def calibration(self) -> Calibration | None:
@@ -394,12 +358,17 @@ class FrameLocalizer:
 
     def _forget_motion(self) -> None:
         self.readout_watch.reset()
-        self._method.frames.reset()
+        self._tracker.reset()
 
     def warm_up(self) -> None:
         """Compile all that the present settings need, from points to messages."""
-        self._method.warm_up()
-        self.readout_watch.warm_up(self._method.camera)
+        self._tracker.localizer.warm_up()
+        so3.quaternion(pose_at(_STILL, 0.5).rotation.copy())
+        twist_at(_STILL, 0.5, 1.0)
+        so3.log(np.eye(3))
+        so3.exp_many(np.zeros((1, 3)))  # of the watch over the readout time
+        matching.warm_up()
+        self.readout_watch.warm_up(self._camera)
 
     def calibrate(self, calibration: Calibration) -> None:
         """Use this calibration from the next frame on.
@@ -409,7 +378,7 @@ class FrameLocalizer:
         """
         if calibration == self._calibration:  # drivers repeat it with every image
             return
-        self._use(calibration, self._given)
+        self._use(calibration, self._settings)
         before, self._calibration = self._calibration, calibration
         if before is not None:
             self._notice(
@@ -423,15 +392,17 @@ class FrameLocalizer:
         """Whether readings of the frame with this stamp are missing that may come within so many
         seconds.
         """
-        time_ns = self._method.middle_row_ns(stamp_ns)
-        return self.imu.awaits(self._method.frames, self.config, time_ns, patience)
+        time_ns = self._middle_row_ns(stamp_ns)
+        return self.imu.awaits(self._tracker, self._config, time_ns, patience)
 
     def load_map(self) -> None:
-        """Use the map of the setting ``map_file``, if there is one.
+        """Use the maps of the settings ``map_file`` and ``marker_map``, where there are any.
 
         Raises:
-            MapError: for a file that cannot be read or holds no map to match keypoints with.
+            ValueError: for a file that cannot be read or holds no such map.
         """
+        if self.config.marker_map:
+            self._tags = read_tags(self.config.marker_map, self._notice)
         if self.config.map_file:
             self.use_map(read_landmarks(self.config.map_file, self.config.map_frame))
 
@@ -447,6 +418,10 @@ class FrameLocalizer:
             return Refusal(Reason.EMPTY_CLOUD, str(error))
         except MessageError as error:
             return Refusal(Reason.BAD_CLOUD, str(error))
+        return self.localize_cloud(cloud)
+
+    def localize_cloud(self, cloud: Correspondences) -> Localized | Refusal:
+        """Localize correspondences, however they came."""
         self._follow(cloud.stamp_ns, cloud.frame)
         result = self._localize(cloud)
         if result:
@@ -470,50 +445,52 @@ class FrameLocalizer:
         by = self._landmarks.how(keypoints, self.config.matching)
         if isinstance(by, Refusal):
             return by
-        tracker = self._method.tracker
-        if by == MatchBy.DESCRIPTOR and tracker is not None and self.config.matching.gate > 0.0:
-            prior = tracker.prediction(self._method.middle_row_ns(keypoints.stamp_ns))
+        if by == MatchBy.DESCRIPTOR and self._config.matching.gate > 0.0:
+            prior = self._tracker.prediction(self._middle_row_ns(keypoints.stamp_ns))
             result = None if prior is None else self._localize_by_map(keypoints, prior)
             # Without its mounting a pose is none the worse.
             if result or (result is not None and result.reason is Reason.NO_TRANSFORM):
                 return result
         return self._localize_by_map(keypoints, None)
 
+    def localize_detections(self, message: Any) -> Localized | Refusal:
+        """Localize one AprilTagDetectionArray by ``marker_map``; never raises for bad ones."""
+        if self._tags is None:
+            return Refusal(Reason.NO_MAP, "detections need the setting marker_map")
+        cloud = self._tags.match(message)
+        return cloud if isinstance(cloud, Refusal) else self.localize_cloud(cloud)
+
     def _localize_by_map(self, keypoints: Keypoints, prior: Prior | None) -> Localized | Refusal:
-        method = self._method
-        found = self._landmarks.match(keypoints, method.config.matching, method.camera, prior)
-        return found if isinstance(found, Refusal) else self._localize(found)
+        cloud = self._landmarks.match(keypoints, self._config.matching, self._camera, prior)
+        return cloud if isinstance(cloud, Refusal) else self._localize(cloud)
 
     def _localize(self, cloud: Correspondences) -> Localized | Refusal:
         if self._calibration is None:
             return Refusal(Reason.NO_CAMERA_INFO, "no usable camera_info has come yet")
-        method, frame = self._method, self._calibration.frame
-        for name, text in oddities(cloud, method.camera, frame).items():
+        config, camera, frame = self._config, self._camera, self._calibration.frame
+        for name, text in oddities(cloud, camera, frame).items():
             self._notice(name, text)
         cloud = self._thinned(cloud)
-        given = (cloud.points, cloud.pixels, cloud.scores)
-        watch = self.readout_watch
-        deviation = max(method.config.readout_time_deviation, watch.error)
-        time_ns = method.middle_row_ns(cloud.stamp_ns)
-        method.frames.of_rest = watch.of_rest
-        if method.tracker is not None:
-            method.tracker.trusts_readout_time = watch.trusted
-            method.tracker.readout_time_deviation = deviation
-        result = self.imu.track(
-            method.frames, method.config, time_ns, frame, self.transforms, given
-        )
-        config = watch.add(method.config, method.camera, time_ns, result, cloud)
+        watch, tracker = self.readout_watch, self._tracker
+        deviation = max(config.readout_time_deviation, watch.error)
+        time_ns = self._middle_row_ns(cloud.stamp_ns)
+        tracker.of_rest = watch.of_rest
+        tracker.trusts_readout_time = watch.trusted
+        tracker.readout_time_deviation = deviation
+        matches = (cloud.points, cloud.pixels, cloud.scores)
+        result = self.imu.track(tracker, config, time_ns, frame, self.transforms, matches)
+        adopted = watch.add(config, camera, time_ns, result, cloud)
         wrong_axis = watch.wrong_axis
-        if config is not method.config:
-            self._use(method.calibration, config)
+        if adopted is not config:
+            self._use(self._calibration, adopted)
         if wrong_axis:
             return Refusal(Reason.SCAN_AXIS, wrong_axis)
         if not result:
             return Refusal(result.reason, result.detail)
         if result.lens is not None and not watch.axis_in_doubt:
             self._notice(Notice.LENS, lens_is_off(result.lens))
-        known = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
-        return self.mounted(of_camera(cloud, result, method.config, method.camera, frame, known))
+        readout = ReadoutKnown(deviation, watch.may_be_reversed, watch.surely_global)
+        return self.mounted(of_camera(cloud, result, config, camera, frame, readout))
 
     def _thinned(self, cloud: Correspondences) -> Correspondences:
         """The cloud with no more points than ``max_points``, which is said once."""
@@ -524,7 +501,7 @@ class FrameLocalizer:
                 Notice.TOO_MANY_POINTS,
                 f"{len(cloud.points)} points have come; max_points of them, {most}, are used",
             )
-        return thinned(cloud, most, self._method.camera.size)
+        return thinned(cloud, most, self._camera.size)
 
     def mounted(self, localized: Localized) -> Localized | Refusal:
         """The result of ``base_frame``, from that of the camera."""

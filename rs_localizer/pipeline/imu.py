@@ -28,7 +28,6 @@ from rs_localizer.io.imu import ImuReading
 from rs_localizer.io.transforms import TransformError, Transforms
 from rs_localizer.pipeline.reasons import IMU_REASONS
 from rs_localizer.pipeline.refusal import Notify
-from rs_localizer.pipeline.single_frames import SingleFrames
 from rs_localizer.tracking import Tracker
 
 # Beside the exposure: the spline through the readings wants neighbours, and the tracker those since
@@ -63,9 +62,6 @@ _OF_ALONE = {
     Alone.DISAGREES: ImuReason.DISAGREES,
     Alone.TURNED: ImuReason.TURNED,
 }
-
-
-Follower = Tracker | SingleFrames
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +152,7 @@ class ImuInput:
             self._gravity,
         )
 
-    def awaits(self, tracker: Follower, config: NodeConfig, time_ns: int, patience: float) -> bool:
+    def awaits(self, tracker: Tracker, config: NodeConfig, time_ns: int, patience: float) -> bool:
         """Whether readings of this exposure are missing that may come within so many seconds."""
         if not self._wanted(config) or tracker.inertial is None:
             return False
@@ -166,7 +162,7 @@ class ImuInput:
 
     def track(
         self,
-        tracker: Follower,
+        tracker: Tracker,
         config: NodeConfig,
         time_ns: int,
         camera_frame: str,
@@ -222,7 +218,7 @@ class ImuInput:
 
     def _samples(
         self,
-        tracker: Follower,
+        tracker: Tracker,
         config: NodeConfig,
         time_ns: int,
         camera_frame: str,
@@ -253,7 +249,7 @@ class ImuInput:
             return None
         return Unused(ImuReason.TWO_FRAMES, " and ".join(repr(name) for name in sorted(set(of))))
 
-    def _count(self, config: NodeConfig, tracker: Follower | None, unused: Unused | None) -> None:
+    def _count(self, config: NodeConfig, tracker: Tracker | None, unused: Unused | None) -> None:
         self._frames += 1
         self._used += unused is None
         self._recently.append(unused)
@@ -283,7 +279,7 @@ def inertial_settings(config: NodeConfig) -> InertialSettings | None:
     )
 
 
-def _exposure(config: NodeConfig, time_ns: int, tracker: Follower) -> tuple[int, int]:
+def _exposure(config: NodeConfig, time_ns: int, tracker: Tracker) -> tuple[int, int]:
     """First and last row by the clock of the IMU, as far as that is known."""
     status = tracker.inertial
     left = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset

@@ -1,7 +1,8 @@
 """THE list of the localizer's inputs: topic, type, role, and who reads and uses its messages.
 
-The node subscribes to it, replay looks for it in recordings, the commands have an option for each
-topic, and the diagnostics judge what does not come. A new input is one row and one reader.
+The node subscribes to it, replay looks for it in recordings, commands and launch file have an
+option for each topic, and the diagnostics judge what does not come. A new input is a row and a
+reader. Launch files read this list: it imports no kernels.
 """
 
 from __future__ import annotations
@@ -9,17 +10,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rs_localizer.core.reasons import Reason
 from rs_localizer.io import topics
 from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.clouds import EmptyCloudError
+from rs_localizer.io.detections import APRILTAG_TYPE, ISAAC_TYPE
 from rs_localizer.io.imu import read_imu
 from rs_localizer.io.keypoints import read_map
 from rs_localizer.io.messages import MessageError
-from rs_localizer.io.outputs import Localized
-from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.refusal import Refusal
+
+if TYPE_CHECKING:
+    from rs_localizer.io.outputs import Localized
+    from rs_localizer.pipeline.frames import FrameLocalizer
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -43,12 +48,14 @@ def _as_it_is(message: Any) -> Any:
 class Input:
     """One input.
 
-    ``read`` takes a message and returns what it says, which ``use`` gives to the localizer. Both
-    raise ``MessageError`` for what cannot be used; it is refused for the reason ``refused``.
+    ``read`` takes a message and returns what it says, which ``use`` gives to the localizer (frames
+    that are read as ``Correspondences``: ``FrameLocalizer.localize_cloud``). Both raise
+    ``MessageError`` for what cannot be used; it is refused for the reason ``refused``.
     """
 
     topic: str  # relative to the node's namespace; also the name of the input
     type: str  # of its messages
+    about: str  # what they hold
     role: Role
     use: Callable[[FrameLocalizer, Any], Localized | Refusal | None]
     refused: Reason
@@ -61,6 +68,12 @@ class Input:
     # Of what comes with every image, and only its stamp is new: what the localizer has of it.
     held: Callable[[FrameLocalizer], Any] | None = None
     help: str | None = None  # of its option in commands
+    also: tuple[str, ...] = ()  # other types with the same names of fields; none may be installed
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """All types of its messages."""
+        return self.type, *self.also
 
     @property
     def option(self) -> str:
@@ -69,8 +82,11 @@ class Input:
 
     def take(self, localizer: FrameLocalizer, message: Any) -> Localized | Refusal | None:
         """Read and use a message at once; of a frame, its result."""
+        frames = self.role is Role.FRAMES
         try:
             return self.use(localizer, self.read(message))
+        except EmptyCloudError as error:
+            return Refusal(Reason.EMPTY_CLOUD if frames else self.refused, str(error))
         except MessageError as error:
             return Refusal(self.refused, str(error))
 
@@ -80,6 +96,7 @@ _ROWS = (
     Input(
         topics.CAMERA_INFO,
         CAMERA_INFO_TYPE,
+        "the camera's calibration",
         Role.STATE,
         read=read_camera_info,
         use=lambda localizer, calibration: localizer.calibrate(calibration),
@@ -92,6 +109,7 @@ _ROWS = (
     Input(
         topics.MAP_POINTS,
         CLOUD_TYPE,
+        "the map for keypoints, latched",
         Role.STATE,
         read=read_map,
         use=lambda localizer, landmarks: localizer.use_map(landmarks),
@@ -104,6 +122,7 @@ _ROWS = (
     Input(
         topics.IMU,
         IMU_TYPE,
+        "the IMU beside the camera",
         Role.SAMPLES,
         read=read_imu,
         use=lambda localizer, reading: localizer.imu.add(reading),
@@ -113,6 +132,7 @@ _ROWS = (
     Input(
         topics.CORRESPONDENCES,
         CLOUD_TYPE,
+        "points of the map and their pixels",
         Role.FRAMES,
         use=lambda localizer, message: localizer.localize(message),
         refused=Reason.BAD_CLOUD,
@@ -120,11 +140,22 @@ _ROWS = (
     Input(
         topics.KEYPOINTS,
         CLOUD_TYPE,
+        "pixels with ids or descriptors, to be matched",
         Role.FRAMES,
         use=lambda localizer, message: localizer.localize_keypoints(message),
         refused=Reason.BAD_KEYPOINTS,
         needs=topics.MAP_POINTS,
         help="instead of correspondences",
+    ),
+    Input(
+        topics.DETECTIONS,
+        APRILTAG_TYPE,
+        "tags of another detector, with marker_map",
+        Role.FRAMES,
+        use=lambda localizer, message: localizer.localize_detections(message),
+        refused=Reason.BAD_DETECTIONS,
+        help="tags of apriltag_ros or isaac_ros_apriltag, with -p marker_map:=FILE",
+        also=(ISAAC_TYPE,),
     ),
 )
 

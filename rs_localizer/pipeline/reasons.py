@@ -54,9 +54,9 @@ REASONS: dict[str, Meaning] = {
     ),
     Reason.MODEL_ERROR: Meaning(
         "neighbouring rows share errors, many points lie just beyond the inlier gate, or errors "
-        "are large and smooth over the image: vibration that the rows cannot tell, or a map or "
+        "are large and smooth over the image: vibration that the rows cannot resolve, or a map or "
         "calibration that is too far off for any pose",
-        f"a stiffer mounting, the calibration (before a plane no frame tells its lens from a bent "
+        f"a stiffer mounting, the calibration (before a plane a wrong lens looks like a bent "
         f"map: show points at several depths), the map; {_TURNED}",
     ),
     Reason.UNCERTAIN: Meaning(
@@ -92,19 +92,27 @@ REASONS: dict[str, Meaning] = {
     Reason.BAD_IMU: Meaning(
         "a message on imu cannot be used", "its units: rad/s and m/s^2; what its driver fills in"
     ),
-    Reason.NO_MAP: Meaning("keypoints came before a map", "give map_file, or publish map_points"),
+    Reason.BAD_DETECTIONS: Meaning(
+        "a message on detections cannot be used, or its corners come in another order",
+        "lower left, lower right, upper right, upper left, as apriltag has them",
+    ),
+    Reason.NO_MAP: Meaning(
+        "keypoints came before a map, or detections without marker_map",
+        "give map_file, or publish map_points; marker_map for detections",
+    ),
     Reason.NO_MATCHES: Meaning(
-        "no keypoint matches a landmark", "are descriptors, or ids, of map and camera of one kind?"
+        "no keypoint matches a landmark, or no detected tag is in marker_map",
+        "are descriptors, or ids, of map and camera of one kind?",
     ),
     Reason.BAD_IMAGE: Meaning(
         "an image cannot be read", "its encoding: mono, color, Bayer, YUV, JPEG, PNG"
     ),
     Reason.NO_TIME: Meaning(
-        "OpenCV does not tell when an image of a video was taken",
+        "OpenCV gives no presentation time for an image of a video",
         "--rate, or another container; the image is left out",
     ),
     Reason.INTERNAL_ERROR: Meaning(
-        "a fault of this program, which goes on with the next frame", "please report the message"
+        "a fault of this program, which continues with the next frame", "please report the message"
     ),
     Reason.NO_TRANSFORM: Meaning(
         "TF does not say where the camera is on base_frame",
@@ -131,10 +139,10 @@ IMU_REASONS: dict[str, Meaning] = {
         "messages of the exposure are lost", "a reliable publisher, a machine with less to do"
     ),
     ImuReason.TOO_SLOW: Meaning(
-        "messages come too rarely to tell how a camera shakes", "a rate of 100 Hz, better 200 Hz"
+        "messages arrive too rarely to resolve vibration", "a rate of 100 Hz, better 200 Hz"
     ),
     ImuReason.SATURATED: Meaning(
-        "the camera turns faster than the gyroscope can tell", "a larger range of the gyroscope"
+        "the camera turns faster than the gyroscope can measure", "a larger range of the gyroscope"
     ),
     ImuReason.TWO_FRAMES: Meaning(
         "messages on imu come with two frame_ids in turns",

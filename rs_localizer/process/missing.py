@@ -17,7 +17,9 @@ _ONLY_PIP = ("numba", "rosbags")
 _EXTRAS = {
     "dask": "fleet",
     "distributed": "fleet",
+    "fsspec": "table",
     "h5py": "hloc",
+    "pyarrow": "table",
     "pycolmap": "mapping",
     "rerun": "view",
 }

@@ -24,11 +24,12 @@ PACKAGE = "rs_localizer"
 DRIVERS = {"v4l2_camera": "v4l2_camera_node", "usb_cam": "usb_cam_node_exe"}
 
 
-# Settings that name files, by the argument that names the params file of their node.
-_FILES: dict[str, tuple[Kind, str]] = {
-    "params_file": (NodeConfig, "map_file"),
-    "detector_params_file": (DetectorConfig, "marker_map"),
-}
+# Settings that name files, with the argument that names the params file of their node.
+_FILES: tuple[tuple[str, Kind, str], ...] = (
+    ("params_file", NodeConfig, "map_file"),
+    ("params_file", NodeConfig, "marker_map"),
+    ("detector_params_file", DetectorConfig, "marker_map"),
+)
 # An unknown argument that is so much like a known one (difflib) is a slip of the pen; others may
 # belong to the launch file that includes these.
 _ALIKE = 0.85
@@ -122,7 +123,7 @@ def need_known(words: Iterable[str], names: Sequence[str]) -> None:
 def need_files(configurations: Mapping[str, str]) -> None:
     """Raise ``RuntimeError`` if a file that is named does not exist."""
     files = {name: text for name, text in configurations.items() if name.endswith("params_file")}
-    for params_file, (kind, name) in _FILES.items():
+    for params_file, kind, name in _FILES:
         if params_file in configurations:
             known = read_params(configurations[params_file], kind)
             files[name] = configurations.get(name) or known.get(name, "")
@@ -149,14 +150,20 @@ def need_package(name: str, why: str) -> None:
         ) from None
 
 
-def localizer(configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]]) -> Node:
-    """The node rs_localizer with its params file and the settings that were given."""
+def localizer(
+    configurations: Mapping[str, str], remappings: Iterable[tuple[str, Any]],
+    of_map: Mapping[str, Any] | None = None,
+) -> Node:  # fmt: skip
+    """The node rs_localizer with its params file, what its map says, and the given settings."""
     return Node(
         package=PACKAGE,
         executable="localizer",
         name="rs_localizer",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file"), given(configurations)],
+        parameters=[
+            LaunchConfiguration("params_file"),
+            {**(of_map or {}), **given(configurations)},
+        ],
         remappings=list(remappings),
         arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
         output="screen",

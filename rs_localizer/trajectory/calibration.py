@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from rs_localizer.core.arrays import Array
@@ -107,6 +108,7 @@ class Block:
     readout_time: float  # s
     deviation: float  # s
     camera: Camera  # with the lens of this part
+    landmarks: Array  # (p,3) m, with the shape that this part finds
     delay: float = math.nan  # s, of the gyroscope where there is one
     delay_deviation: float = math.nan  # s
 
@@ -136,7 +138,8 @@ def blocks_of(
             continue
         value, deviation = own.state.readout_time, own.readout_time_deviation
         delay = _delay(own)
-        blocks.append(Block(float(start), float(end), value, deviation, own.camera, *delay))
+        shape = own.state.landmarks
+        blocks.append(Block(float(start), float(end), value, deviation, own.camera, shape, *delay))
     return tuple(blocks)
 
 
@@ -282,6 +285,21 @@ class Calibration:
         seen = self.posed.observations
         often = len(seen.points) >= _LEAST_SIGHTS * len(seen.landmarks)
         return len(seen.landmarks) if often and self.fit.freedom.landmarks == 0.0 else 0
+
+    @property
+    def shape_deviation(self) -> float:
+        """Of the landmarks that were estimated (m, rms): by the noise, and by half of what the
+        halves differ by but for a rigid motion.
+        """
+        count = 3 * len(np.unique(self.posed.observations.points))
+        first = 1 + len(self.fit.state.lens)
+        variances = np.diag(self.fit.border_covariance)[first : first + count]
+        apart = 0.0
+        if len(self.halves) == 2:
+            one, other = (half.landmarks - half.landmarks.mean(axis=0) for half in self.halves)
+            turn = Rotation.align_vectors(one, other)[0]
+            apart = float(np.mean(np.sum((one - turn.apply(other)) ** 2, axis=1)))
+        return math.sqrt(3.0 * self.inflation**2 * float(np.mean(variances)) + 0.25 * apart)
 
     @property
     def scatter(self) -> float:

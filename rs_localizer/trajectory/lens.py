@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera, DistortionModel
+from rs_localizer.core.camera import Camera
 
-# Columns of OpenCV's Jacobians: focal lengths and centre, distortion, place of the point.
-_PINHOLE = (slice(6, 10), 10, slice(3, 5))
-_FISHEYE = (slice(0, 4), 4, slice(11, 13))
-# What a lens without coefficients is given when its distortion is to be found.
-_COEFFICIENTS = {DistortionModel.PLUMB_BOB: 5, DistortionModel.RATIONAL_POLYNOMIAL: 8}
 # What is known of a lens that nobody has calibrated, as standard deviations: focal length by the
 # first guess of it; centre by the image's width (a lens is decentred by less, a crop of the sensor
 # may be by more); focal lengths by each other (pixels are square but for the rounding of scaled
@@ -24,11 +18,6 @@ _COEFFICIENTS = {DistortionModel.PLUMB_BOB: 5, DistortionModel.RATIONAL_POLYNOMI
 # converges: each order does about a third of the one before, a tangential one 0.3 %.
 _FOCAL_LENGTH, _CENTRE, _ASPECT = 0.3, 0.05, 0.002
 _ORDERS, _TANGENTIAL = (0.1, 0.03, 0.01, 0.003), 0.003
-_RADIAL = {
-    DistortionModel.PLUMB_BOB: {0: 0, 1: 1, 4: 2},
-    DistortionModel.RATIONAL_POLYNOMIAL: {0: 0, 1: 1, 4: 2, 5: 0, 6: 1, 7: 2},
-    DistortionModel.EQUIDISTANT: {0: 0, 1: 1, 2: 2, 3: 3},
-}
 _WIDEST = np.tan(np.radians(70.0))  # corners are not looked at beyond: no pinhole has any there
 _GRID = 9  # points along each side of the image, of an error that is averaged over it
 
@@ -66,7 +55,7 @@ def lens_values(camera: Camera) -> Array:
     """The numbers (m,) of a camera's lens: fx, fy, cx, cy, distortion (zeros where it has none)."""
     D = camera.D
     if len(D) == 0:
-        D = np.zeros(_COEFFICIENTS.get(DistortionModel(camera.distortion_model), 4))
+        D = np.zeros(len(camera.law.orders))
     K = camera.K
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *D])
 
@@ -87,24 +76,14 @@ def project(camera: Camera, values: Array, points: Array, free: bool) -> Project
 
     Without ``free`` the derivatives by the lens are left out.
     """
-    bearings = np.ascontiguousarray(points / points[:, 2:])[:, None]
     K = np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
-    zero, D = np.zeros(3), np.ascontiguousarray(values[4:])
-    found: Any
-    if camera.distortion_model == DistortionModel.EQUIDISTANT:
-        pinhole, first, ray = _FISHEYE
-        found = cv2.fisheye.projectPoints(bearings, zero, zero, K, D)
-    else:
-        pinhole, first, ray = _PINHOLE
-        found = cv2.projectPoints(bearings, zero, zero, K, D)
-    sensor, jacobian = found[:2]
+    rays, D = (points / points[:, 2:])[:, :2], np.ascontiguousarray(values[4:])
+    sensor, by_ray, by_matrix, by_coefficients = camera.law.project(rays, K, D)
     binning = np.array(camera.binning, float)
     offset = np.zeros(2) if camera.roi is None else (camera.roi.x_offset, camera.roi.y_offset)
-    jacobian = jacobian.reshape(len(points), 2, -1)
-    by_ray = jacobian[:, :, ray] / binning[:, None]
-    columns = [*range(*pinhole.indices(first)), *range(first, first + len(D))] if free else []
-    by_lens = jacobian[:, :, columns] / binning[:, None]
-    return Projected((sensor.reshape(-1, 2) - offset) / binning, by_ray, by_lens)
+    by_lens = np.concatenate([by_matrix, by_coefficients], axis=2) if free else by_matrix[:, :, :0]
+    steps = binning[:, None]
+    return Projected((sensor - offset) / binning, by_ray / steps, by_lens / steps)
 
 
 def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPrior:
@@ -130,8 +109,8 @@ def lens_prior(camera: Camera, deviations: tuple[float, float] | None) -> LensPr
     corner[0, :2] *= min(1.0, _WIDEST / float(np.linalg.norm(corner[0, :2])))
     plain = np.concatenate([mean[:4], np.zeros(len(values) - 4)])
     moves = np.linalg.norm(project(camera, plain, corner, True).by_lens[0], axis=0)[4:]
-    radial = _RADIAL[DistortionModel(camera.distortion_model)]
-    shares = [_ORDERS[radial[k]] if k in radial else _TANGENTIAL for k in range(len(moves))]
+    orders = [*camera.law.orders, *[None] * len(moves)][: len(moves)]
+    shares = [_TANGENTIAL if order is None else _ORDERS[order] for order in orders]
     spread[4:] = np.array(shares) * 0.5 * np.hypot(width, height) / moves
     information = np.diag(spread**-2.0)
     square = np.array([1.0, -1.0]) / (_ASPECT * focal)

@@ -5,7 +5,7 @@ from typing import Any
 from benchmarks.fuzzing.campaign import case_of, run
 from benchmarks.fuzzing.targets import Target, targets
 
-EXECUTIONS = 4000
+EXECUTIONS = 6000
 
 
 def test_no_reader_raises_another_error(tmp_path):

@@ -112,14 +112,6 @@ def test_a_wrong_calibration_is_named(here, capsys):
     assert re.search(r"warning: even the stillest images leave \d+\.\d px rms: the calib", said)
 
 
-def test_turned_images_are_named(here, capsys):
-    images = folder(here.path / "images", [np.ascontiguousarray(board(6, 4).T)])
-    assert detect(here, images, *here.board, "--rate", "30") == 1
-    assert "are of 240x320, the calibration is for 320x240: they are turned by a quarter" in (
-        capsys.readouterr().err
-    )
-
-
 def test_a_board_of_exactly_min_inliers_corners(here):
     images = folder(here.path / "images", [board(4, 3, x) for x in range(12)])
     assert detect(here, images, "--board", "4x3", "--square", "0.03", "--rate", "30") == 0

@@ -76,21 +76,6 @@ def test_replay_uses_it_and_says_so(tmp_path, capsys):
     assert main([*replay, "--out", str(tmp_path / "n"), "--imu", "/imu", "--no-imu"]) == 2
 
 
-def test_without_a_transform_the_reason_is_told(tmp_path, capsys):
-    assert simulate(tmp_path / "bag", *TURN, "--imu") == 0
-    with open_bag(tmp_path / "bag") as bag, BagWriter(tmp_path / "cut") as writer:
-        topics = [topic for topic in bag.topics if topic != "/tf_static"]
-        for topic, recorded_ns, message in bag.messages(topics):
-            writer.write(topic, message, recorded_ns)
-    out = tmp_path / "out"
-    words = ["replay", str(tmp_path / "cut"), "-p", "readout_time:=0.03", "--out", str(out)]
-    assert main(words) == 0
-    said = capsys.readouterr().out
-    assert re.search(r"localized with the IMU +0\.0%", said)
-    assert re.search(r"without: imu_no_transform +30", said)
-    assert "imu_no_transform: TF does not say how the IMU is turned against the camera" in said
-
-
 def test_the_topic_is_found_by_its_type(tmp_path):
     """Named so, else the only one: several that could be meant are none."""
     settings = ImuSettings()

@@ -52,17 +52,6 @@ def test_every_command_has_help_and_takes_its_example(name, capsys):
     parser.parse_args(COMMANDS[name].example.split()[2:])
 
 
-def test_help_imports_no_command():
-    code = (
-        "import sys; from rs_localizer.cli.main import main; main(['--help']);"
-        "sys.exit([m for m in sys.modules if m.startswith(('rosbags', 'matplotlib', 'rclpy'))])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.stderr.strip() == "[]"
-
-
 @pytest.mark.parametrize(
     ("words", "text"),
     [
@@ -73,6 +62,20 @@ def test_help_imports_no_command():
         (["replay"], "the following arguments are required: RECORDING"),
         (["replay", "bag", "--nonsense"], "unrecognized arguments: --nonsense"),
         (["replay", "bag", "--storage", "tape"], "invalid choice: 'tape'"),
+        (["replay", "bag", "-p", "sead:=1"], "'sead' is not a setting"),
+        (["replay", "bag", "--rate", "2"], "--rate goes with --ros"),
+        (["replay", "a", "b"], "many recordings need --out DIR"),
+        (["detect", "film.mp4", "--out", "o"], "give --map, --board or --features"),
+        (
+            ["detect", "x", "--board", "six", "--square", "1", "--out", "o"],
+            "of the form 6x4, got 'six'",
+        ),
+        (["calibrate", "x", "--out", "x.txt"], "x.txt"),
+        (["simulate", "x", "--noise", "-1"], "--noise: must be 0 or more, got -1"),
+        (["simulate", "x", "--images", "--noise", "2"], "--noise is for points"),
+        (["evaluate", "a"], "give EST and TRUTH"),
+        (["map", "convert", "a.ply", "b.obj"], "OUT must end in .npz or .ply or .yaml"),
+        (["markers", "make", "x", "--grid", "two"], "of the form 6x4, got 'two'"),
     ],
 )
 def test_wrong_usage(words, text, capsys):
@@ -99,13 +102,6 @@ def test_faults_are_one_line_and_an_exit_code(error, code, text, monkeypatch, ca
     monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
     assert main(["replay"]) == code
     assert capsys.readouterr().err.endswith(text)
-
-
-def test_results_as_json(capsys):
-    assert main(["readout", "--json", "imx219"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["command"] == "readout"
-    assert all(0.0 < entry["median"] < 0.2 for entry in found["result"])
 
 
 def test_what_a_command_prints_as_json(monkeypatch, capsys):
@@ -188,8 +184,9 @@ def test_a_fault_in_the_program_keeps_its_traceback(monkeypatch):
 SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("slow", ["numba", "cv2", "rosbags"])
+@pytest.mark.parametrize(
+    ("slow", "number"), [("numba", signal.SIGINT), ("rosbags", signal.SIGTERM)]
+)
 def test_signals_while_a_command_is_imported(tmp_path, number, slow):
     (tmp_path / f"{slow}.py").write_text(SLOW)
     process = subprocess.Popen(

@@ -42,18 +42,6 @@ def test_that_of_a_bag_is_found(recorded):
     np.testing.assert_allclose(imu.recording.imu_in_camera, [0.03, -0.02, -0.01], atol=1e-9)
 
 
-def test_it_may_be_asked_for_or_left_out(recorded):
-    for words in (("--imu",), ("--imu", "/imu")):
-        imu = imu_of(given(recorded, *words))
-        assert imu is not None
-        assert imu.asked
-    assert imu_of(given(recorded, "--no-imu")) is None
-    with pytest.raises(SourceError, match="has no topic /other"):
-        imu_of(given(recorded, "--imu", "/other"))
-    with pytest.raises(UsageError, match="not both"):
-        imu_of(given(recorded, "--imu", "/imu", "--no-imu"))
-
-
 def test_of_several_none_is_taken(recorded, tmp_path, capsys):
     with open_bag(recorded) as bag, BagWriter(tmp_path / "two") as out:
         for _, stamp_ns, message in bag.messages(["/imu"]):

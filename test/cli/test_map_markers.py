@@ -52,22 +52,6 @@ def test_info_and_convert(tmp_path, marker_file, capsys):
     np.testing.assert_array_equal(landmarks.points, read_marker_map(marker_file).points)
 
 
-def test_align(tmp_path, marker_file, capsys):
-    out = tmp_path / "aligned.yaml"
-    words = ["align", str(marker_file), str(out), "--upright", "0", "--origin", "0"]
-    assert main(["map", *words]) == 0
-    first = read_marker_map(out).markers[0]
-    np.testing.assert_allclose(first.pose.position, 0.0, atol=1e-9)
-    np.testing.assert_allclose(first.pose.rotation[:, 1], [0.0, 0.0, 1.0], atol=1e-9)
-    assert "turned by 90.000 deg" in capsys.readouterr().out
-    refused(words, 1, "exists; choose another OUT, or --overwrite", capsys)
-    refused(words[:3], 1, "exists", capsys)
-    other = str(tmp_path / "other.yaml")
-    refused(["align", str(marker_file), other], 2, "say what to align", capsys)
-    refused(["align", str(marker_file), other, "--origin", "9"], 1, "no marker 9", capsys)
-    refused(["align", str(marker_file), other, "--distance", "0", "1", "x"], 2, "two ids", capsys)
-
-
 def test_refine_and_survey_what_was_simulated(tmp_path, capsys):
     flight, out = tmp_path / "flight", tmp_path / "refined.npz"
     simulated = ["simulate", str(flight), "--duration", "1.5", "--keypoints", "--points", "120"]

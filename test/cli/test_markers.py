@@ -30,15 +30,6 @@ def test_make_and_check(tmp_path, capsys):
     assert read_marker_map(f"{out}.yaml").markers[0].size == pytest.approx(0.05)
 
 
-def test_pages_of_others_are_not_overwritten(tmp_path, capsys):
-    (tmp_path / "wall_2.png").write_text("a photograph")
-    words = ["--size", "0.13", "--grid", "2x1", "--format", "png"]
-    assert make(tmp_path / "wall", *words) == 1
-    assert "wall_2.png exists already" in capsys.readouterr().err
-    assert (tmp_path / "wall_2.png").read_text() == "a photograph"
-    assert not (tmp_path / "wall_1.png").exists()
-
-
 def test_problems_of_a_map_are_named(tmp_path, capsys):
     assert make(tmp_path / "wall", "--grid", "2x1", "--size", "0.05", "--gap", "0.03") == 0
     path = tmp_path / "wall.yaml"

@@ -158,26 +158,6 @@ def test_settings_of_a_file_and_of_the_command_line(recording, tmp_path):
     assert (middle - first).tolist() == [15_000_000] * FRAMES
 
 
-def test_frames_before_the_first_camera_info_are_refused(recording, tmp_path, capsys):
-    infos: list[int] = []
-
-    def late(topic: str, message: Any) -> str | None:
-        if topic != "/camera_info":
-            return topic
-        infos.append(1)
-        if len(infos) == 2:
-            message.k = np.zeros(9)
-        return topic if len(infos) > 1 else None
-
-    bag = rewrite(recording, tmp_path / "late", late)
-    assert main(["replay", str(bag), "--out", str(tmp_path / "out"), *SHUTTER]) == 0
-    rows = dict(line.rsplit(None, 1) for line in capsys.readouterr().out.splitlines()[:5])
-    assert rows["frames"] == str(FRAMES)
-    assert rows["localized"] == str(FRAMES - 2)
-    assert rows["  refused: no_camera_info"] == "2"
-    assert rows["  refused: bad_camera_info"] == "1"
-
-
 def test_no_frame_localized_is_a_failure(recording, tmp_path, capsys):
     def empty(topic: str, message: Any) -> str:
         if topic == "/correspondences":

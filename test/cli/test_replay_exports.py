@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.camera import Camera
@@ -88,6 +88,83 @@ def test_transforms_explain_every_pixel(flight, tmp_path):
         x, y, z = turns.inv().apply((cloud.points - moved) @ pose[:3, :3]).T
         seen = told["fl_x"] * x / -z + told["cx"], told["fl_y"] * -y / -z + told["cy"]
         assert np.median(np.hypot(seen[0] - u, seen[1] - v)) < 0.25
+
+
+def seen_between(start: Any, end: Any, camera: dict[str, Any], point: Any, shutter: str) -> Any:
+    """Pixel (2,) of a point as gsplat and NCore project it, by camera_from_map at both ends.
+
+    Both interpolate quaternion and translation by floor(row) / (rows - 1), of pixels whose first
+    one has its corner at 0, 0; in the middle of a row that is (row - 1/2) / (rows - 1).
+    """
+    (width, height), focal, centre = camera["size"], camera["focal"], camera["centre"]
+    slerp = Slerp([0.0, 1.0], Rotation.from_matrix([start[:3, :3], end[:3, :3]]))
+    pixel = np.array([width, height]) / 2
+    for _ in range(20):  # the row decides the pose, the pose the row
+        x, y = (pixel - 0.5) / (width - 1, height - 1)
+        time = {
+            "ROLLING_TOP_TO_BOTTOM": y, "ROLLING_BOTTOM_TO_TOP": 1.0 - y,
+            "ROLLING_LEFT_TO_RIGHT": x, "ROLLING_RIGHT_TO_LEFT": 1.0 - x,
+        }[shutter]  # fmt: skip
+        moved = (1.0 - time) * start[:3, 3] + time * end[:3, 3]
+        x, y, z = slerp(np.clip(time, 0.0, 1.0)).apply(point) + moved
+        pixel = focal * (x / z, y / z) + centre
+    return pixel
+
+
+@pytest.mark.parametrize(
+    ("direction", "more"),
+    [
+        ("top_to_bottom", ()), ("bottom_to_top", ("--smooth",)),
+        ("left_to_right", ("-p", "pose_time:=mid_frame")), ("right_to_left", ()),
+    ],
+)  # fmt: skip
+def test_both_ends_of_the_shutter_explain_every_pixel(
+    direction: str, more: tuple[str, ...], tmp_path: Path
+) -> None:
+    path, out = tmp_path / "flight", tmp_path / "out"
+    words = ["--duration", "0.2", "--noise", "0.001", "--outliers", "0", "--readout-time", "0.02"]
+    slow = ["--angular-velocity", "0.2", "0.5", "-0.3", "--linear-velocity", "0.3", "0.1", "0.1"]
+    assert main(["simulate", str(path), *words, *slow, "--scan-direction", direction]) == 0
+    words = ["--params", str(path / "parameters.yaml"), "--row", "first", "--row", "last", *more]
+    exports = ["--gsplat", str(tmp_path / "splat"), "--ncore", str(tmp_path / "ncore")]
+    assert main(["replay", str(path), "--out", str(out), *words, *exports]) == 0
+    starts, ends, Ks = (
+        np.load(tmp_path / "splat" / f"{name}.npy") for name in ("viewmats", "viewmats_rs", "Ks")
+    )
+    shutter = (tmp_path / "splat" / "shutter.txt").read_text().strip()
+    names = (tmp_path / "splat" / "names.txt").read_text().split()
+    assert shutter == f"ROLLING_{direction.upper()}"
+    # Our own poses of these rows are the same.
+    for views, name in ((starts, "first"), (ends, "last")):
+        own = read_tum(out / f"poses_{name}.txt")
+        assert len(own) == len(views)
+        poses = np.linalg.inv(views)
+        np.testing.assert_allclose(poses[:, :3, 3], own.positions, atol=1e-9)
+        turns = Rotation.from_matrix(poses[:, :3, :3]).inv() * Rotation.from_quat(own.quaternions)
+        assert turns.magnitude().max() < 1e-8
+    # NCore has the same poses the other way round, their times, and the same lens.
+    told = json.loads((tmp_path / "ncore" / "ncore.json").read_text())
+    lens = told["camera_model_parameters"]
+    assert (lens["shutter_type"], lens["camera_model_type"]) == (shutter, "opencv-pinhole")
+    camera = {
+        "size": lens["resolution"], "focal": np.array(lens["focal_length"]),
+        "centre": np.array(lens["principal_point"]),
+    }  # fmt: skip
+    np.testing.assert_array_equal(Ks[:, :2, 2], np.tile(camera["centre"], (len(Ks), 1)))
+    assert [frame["file_path"] for frame in told["frames"]] == names
+    for frame, start, end in zip(told["frames"], starts, ends, strict=True):
+        np.testing.assert_allclose(frame["T_sensor_world"], np.linalg.inv([start, end]), atol=1e-12)
+        first, last = frame["timestamps_us"]
+        assert abs(first - int(Path(frame["file_path"]).stem) / 1000) <= 1
+        assert last - first == 20_000
+    # Both project the points to where they were seen.
+    with open_bag(path) as bag:
+        clouds = [read_correspondences(m) for _, _, m in bag.messages(["/correspondences"])]
+    for cloud, start, end in zip(clouds, starts, ends, strict=True):
+        some = slice(None, None, 10)
+        found = [seen_between(start, end, camera, point, shutter) for point in cloud.points[some]]
+        errors = np.linalg.norm(found - (cloud.pixels[some] + 0.5), axis=1)
+        assert errors.max() < 0.01
 
 
 @pytest.mark.parametrize(

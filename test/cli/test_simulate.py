@@ -1,6 +1,5 @@
 """The bag of `simulate`: what it holds, and that its truth is the truth of its frames."""
 
-import re
 import shlex
 from collections import Counter
 from pathlib import Path
@@ -66,20 +65,3 @@ def test_the_next_command_has_the_shutter(tmp_path, monkeypatch, capsys):
     }
     assert main(command) == 0
     assert main(["evaluate", "my bag_poses", "my bag"]) == 0
-
-
-def test_fewer_points_than_asked_for_are_told(tmp_path, capsys):
-    # Two seconds at a narrow view of a room: some frames see a point, others none.
-    words = ("--focal", "30000", "--points", "5", "--duration", "2")
-    assert simulate(tmp_path / "bag", *words) == 0
-    line = capsys.readouterr().out.splitlines()[0]
-    found = re.search(
-        r"(\d) points each \(of 5 asked for; (\d+) frames see fewer, (\d+) of them none\)$", line
-    )
-    assert found, line
-    with open_bag(tmp_path / "bag") as bag:
-        widths = [message.width for _, _, message in bag.messages(["/correspondences"])]
-    assert int(found[2]) == sum(width < 5 for width in widths) > int(found[3]) > 0
-    assert int(found[3]) == widths.count(0)
-    assert simulate(tmp_path / "full", "--duration", "0.1") == 0
-    assert "asked for" not in capsys.readouterr().out

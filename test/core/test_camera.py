@@ -79,12 +79,6 @@ def test_row_time_runs_from_first_to_last_exposed_pixel():
         )
 
 
-def test_row_time_comes_from_the_raw_row_and_not_from_the_undistorted_one():
-    bent = camera(D=[-0.3, 0.1, 0.0, 0.0, 0.0])
-    raw = pixels()
-    np.testing.assert_allclose(bent.row_time(raw), (raw[:, 1] - 239.5) / 479, atol=1e-15)
-
-
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_row_time_of_a_crop_is_that_of_the_sensor_row(direction):
     cropped = camera(binning=(2, 2), roi=Roi(100, 60, 400, 300), scan_direction=direction)
@@ -128,26 +122,14 @@ def test_inside_is_the_area_of_the_pixels():
     ("changes", "said"),
     [
         ({"K": np.zeros((3, 3))}, "not calibrated: focal lengths are 0, 0"),
-        ({"K": np.full((3, 3), np.nan)}, "finite 3x3"),
-        ({"K": np.eye(4)}, "3x3"),
-        ({"K": np.triu(np.ones((3, 3)))}, "no skew"),
         ({"D": [0.1, 0.2]}, "plumb_bob takes 0 or 4 or 5 coefficients, got 2"),
-        ({"D": [np.inf] * 4}, "D must be finite"),
         ({"distortion_model": "fov"}, "one of plumb_bob, .*; got 'fov'"),
-        ({"scan_direction": "sideways"}, "one of top_to_bottom, .*; got 'sideways'"),
-        ({"width": 0}, "at least 2x2, got 0x480"),
         ({"readout_time": -0.1}, "readout_time must be 0 or more seconds, got -0.1"),
         ({"width": 640.5}, "width must be a whole number of pixels, got 640.5"),
-        ({"height": np.nan}, "height must be a whole number of pixels, got nan"),
-        ({"width": True}, "width must be a whole number of pixels, got True"),
-        ({"K": "matrix"}, "K must be numbers, got 'matrix'"),
         ({"readout_time": 30}, "at most 1 s, got 30: it is in seconds; 30 ms are 0.03"),
-        ({"readout_time": "fast"}, "readout_time must be 0 or more seconds, got 'fast'"),
         ({"K": np.diag([1e300, 1e300, 1.0])}, "focal lengths of 1e\\+300, .* are impossible"),
         ({"roi": Roi(0, 0, 700, 480)}, "does not lie on a sensor of 640x480"),
-        ({"roi": Roi(0, -5, 0, 0)}, "does not lie on a sensor"),
         ({"binning": (1.5, 2)}, "binning must be two numbers"),
-        ({"binning": (0, 1)}, "binning must be two numbers of 1 or more"),
     ],
 )
 def test_an_impossible_camera_is_refused_with_what_was_found(changes, said):

@@ -32,10 +32,6 @@ def test_rates_are_derivatives_by_the_row_time(tau):
     np.testing.assert_allclose(basis(tau)[1], expected, atol=1e-5)
 
 
-def test_value_and_slope_are_zero_in_the_middle_row():
-    np.testing.assert_allclose(basis(0.0), 0.0, atol=1e-15)
-
-
 def test_what_is_taken_away_there_makes_it_whole_waves_again():
     values, slopes = shake_in_the_middle(FUNCTIONS)
     for tau in TAUS:

@@ -51,14 +51,6 @@ def test_accelerations_are_the_second_derivatives_at_the_middle_row():
     np.testing.assert_allclose(sum(turns) / h**2, motion.angular_acceleration, atol=1e-6)
 
 
-def test_no_velocity_is_a_global_shutter():
-    motion = some_motion(speed=0.0)
-    for tau in (-0.5, 0.3):
-        rotation, translation = motion.at(tau)
-        np.testing.assert_array_equal(rotation, motion.rotation)
-        np.testing.assert_array_equal(translation, motion.translation)
-
-
 def test_the_solvers_model_and_ours_agree_to_first_order():
     rng = np.random.default_rng(1)
     rotation = Rotation.random(random_state=2).as_matrix()

@@ -44,12 +44,6 @@ def test_half_turns_have_a_logarithm(axis):
     np.testing.assert_allclose(so3.exp(vector_of), matrix, atol=1e-12)
 
 
-@given(axes, angles)
-def test_hat_is_the_cross_product(axis, angle):
-    a, b = np.array(axis), np.array([0.3, -0.2, 0.9])
-    np.testing.assert_allclose(so3.hat(a) @ b, np.cross(a, b), atol=1e-15)
-
-
 @given(axes, angles, st.integers(0, 2))
 def test_right_jacobian_is_the_derivative_of_the_exponential(axis, angle, direction):
     at, step = Rotation.from_rotvec(vector(axis, angle)), 1e-6 * np.eye(3)[direction]

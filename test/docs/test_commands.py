@@ -13,6 +13,7 @@ import pytest
 from benchmarks.__main__ import EXPERIMENTS
 from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.settings import parse_assignment, settings
 
 LINES = sorted({(page, line) for page in pages.NAMES for line in pages.shell(page)})
@@ -72,6 +73,7 @@ def test_launch_files_exist(page, line):
         *settings(),
         *settings(DetectorConfig),
         *settings(FeatureConfig),
+        *INPUTS,
         *re.findall(r"\"(\w+)\"", code),
     }
     if file == "two_cameras.launch.py":  # which puts these names together

@@ -50,7 +50,12 @@ def test_examples_run(page, images):
 
 CHECKS: dict[str, list[Callable[[Any], None]]] = {
     "README.md": [lambda it: _true(isinstance(it.result, rsl.Estimate))],
-    "docs/solvers.md": [lambda it: _near(np.median(it.t[:, 0], axis=0), [0.1, 0.0, 0.0], 1e-6)],
+    "docs/library.md": [
+        lambda it: _near(np.median(it.t[:, 0], axis=0), [0.1, 0.0, 0.0], 1e-6),
+        lambda it: _true(len(it.path) == len(it.images)),
+        lambda it: _true(isinstance(it.result, rsl.Estimate)),
+        lambda it: _near(it.straight.shape, (60, 2), 0),
+    ],
     "docs/calibration.md": [lambda it: _near(it.found.readout_time, 0.03, 2e-3)],
 }
 

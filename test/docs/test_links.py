@@ -1,6 +1,7 @@
 """Every link of README and docs leads somewhere."""
 
 import re
+import runpy
 
 import pages
 import pytest
@@ -55,3 +56,31 @@ def test_the_tree_of_the_architecture_is_that_of_the_package():
     named = {line.split()[0].rstrip("/") for line in tree.splitlines()[1:]}
     parts = {path.name for path in (pages.ROOT / "rs_localizer").iterdir()}
     assert named == {name for name in parts if name not in ("__pycache__", "compiled", "py.typed")}
+
+
+def test_the_ten_files_to_read_first_are_short():
+    (table,) = [t for t in pages.tables("docs/architecture.md") if "you learn" in t.columns]
+    files = [pages.ROOT / "rs_localizer" / pages.names_in(name)[0] for name in table.column("file")]
+    assert len(files) == 10
+    assert sum(len(file.read_text().splitlines()) for file in files) < 3000
+
+
+def test_pictures_are_what_their_script_draws():
+    drawn = runpy.run_path(str(pages.ROOT / "docs" / "pictures.py"))["PICTURES"]
+    for name, draw in drawn.items():
+        assert (pages.ROOT / "docs" / name).read_text(encoding="utf-8") == draw(), name
+
+
+_NODE = r"[\w/]+(?:\[[^]]+\]|\(\[[^]]+\]\))?"
+_STATEMENT = (
+    rf"{_NODE}(?: & {_NODE})*(?: (?:--|-- [\w ]+ --|-- \"[^\"]+\" --)> {_NODE}(?: & {_NODE})*)*"
+)
+
+
+@pytest.mark.parametrize("page", pages.NAMES)
+def test_diagrams_are_flowcharts(page):
+    """GitHub and the site draw them in the browser, where nobody would see an error."""
+    for diagram in pages.fenced(page, "mermaid"):
+        head, *lines = diagram.splitlines()
+        assert re.fullmatch("flowchart (LR|BT)", head)
+        assert [line for line in lines if not re.fullmatch(_STATEMENT, line.strip())] == []

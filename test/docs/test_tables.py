@@ -12,6 +12,8 @@ from rs_localizer.cli.main import COMMANDS
 from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.outputs import TYPES
+from rs_localizer.offline.table import COLUMNS
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.ros.node.health import State
 from rs_localizer.settings import Kind, settings
@@ -63,6 +65,16 @@ def test_the_table_of_solvers():
     assert said == {name: (it.sample_size, it.solutions) for name, it in solvers.items()}
 
 
+def test_the_columns_of_the_table_of_frames() -> None:
+    (table,) = pages.all_tables("column", "type")
+    said = {
+        name: kind
+        for names, kind in zip(table.column("column"), table.column("type"), strict=True)
+        for name in pages.names_in(names)
+    }
+    assert list(said.items()) == list(COLUMNS.items())
+
+
 def test_figures_are_of_solvers_that_exist():
     (table,) = [t for t in pages.all_tables("`solver`", "µs") if t.page == "docs/benchmarks.md"]
     assert {name for row in table.rows for name in pages.names_in(row[0])} <= set(SOLVERS)
@@ -74,7 +86,11 @@ def test_the_topics_of_the_localizer():
     unused: Any = None
     inputs = Feed(unused, unused, unused, unused).topics()
     taken = {name: topic.type for name, topic in inputs.items()}
-    assert {name for name, (way, _) in said.items() if way == "in"} == set(taken)
+    # Their packages are not installed everywhere; the node then does without.
+    optional = {name: item for name, item in INPUTS.items() if item.also}
+    assert {name for name, (way, _) in said.items() if way == "in"} == {*taken, *optional}
+    for name, item in optional.items():
+        assert said[name][1] == item.type.replace("/msg/", "/")
     for name, kind in taken.items():
         assert said[name][1] == f"{kind.__module__.split('.')[0]}/{kind.__name__}"
     sent = {name.removeprefix("~/"): kind for name, (_, kind) in said.items() if name[0] == "~"}

@@ -22,14 +22,16 @@ from rs_localizer.estimation.frame_fit import (
 )
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import maximum_a_posteriori
+from rs_localizer.estimation.prior_kernels import add_prior
 from rs_localizer.estimation.prior_terms import motion_terms
 from rs_localizer.estimation.refine import apply_step
-from rs_localizer.estimation.residuals import Lines
+from rs_localizer.estimation.residuals import Lines, linearized
 
 from .frames import PRIOR, distance, frame
 from .projection import gradient, jacobian_of, pixels_of, project, row_time, scene, shake, waves
 
 COUNT, NOISE = 60, 0.3  # px
+IMAGE = np.zeros((0, 0))  # smooth errors are of the image
 # Polynomials of the image, from the constant to the cubic ones, and the sizes of each degree.
 PLACES = [(i, degree - i) for degree in range(4) for i in range(degree + 1)]
 DEGREE_SIZES = np.array([1.0, 1.0, 0.5, 0.25])
@@ -79,7 +81,7 @@ def design(lines, inliers, turns=True, smooth=True):
 @pytest.mark.parametrize(("turns", "smooth"), itertools.product([False, True], repeat=2))
 def test_products_are_those_of_a_plain_design_matrix(turns, smooth):
     lines, inliers = lines_of()
-    found = products_of(lines, inliers, lines.errors, turns, smooth)
+    found = products_of(lines, inliers, lines.errors, turns, smooth, IMAGE)
     matrix, errors = design(lines, inliers, turns, smooth)
     scale = np.sqrt(np.sum(matrix**2, axis=0))
     np.testing.assert_allclose(
@@ -104,7 +106,7 @@ def test_a_smooth_error_has_a_mean_square_of_its_scale_over_the_image():
 def test_the_smooth_error_of_all_points_is_that_of_its_polynomials():
     lines, inliers = lines_of(1)
     coefficients = np.random.default_rng(2).normal(size=(2, SMOOTH_TERMS))
-    found = smooth_at(lines, inliers, coefficients.ravel())
+    found = smooth_at(lines, inliers, coefficients.ravel(), IMAGE)
     expected = polynomials(lines.image, inliers) @ coefficients.T
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
@@ -159,7 +161,7 @@ HYPER_MEAN[-1] = np.log(0.03)
 
 
 def solved(lines, inliers, log_scales, rounds, coefficients=None, hyper=HYPER_PRECISION):
-    normal = products_of(lines, inliers, lines.errors, True, True)
+    normal = products_of(lines, inliers, lines.errors, True, True, IMAGE)
     information, slope, _ = full_prior(TERMS, STATE, np.zeros((FUNCTIONS, 3)), 18 + TURNS + 20)
     coefficients = np.zeros(TURNS + 20) if coefficients is None else coefficients
     result = with_scales(
@@ -283,14 +285,15 @@ def test_scales_that_vanish_leave_the_covariance_of_the_motion_alone():
     assert found.decided.max() == 0.0
 
 
-def fitted(observations, start, scales=(5e-3, 0.3), hyper=0.2, turns=True, smooth=True):
+def fitted(observations, start, scales=(5e-3, 0.3), hyper=0.2, turns=True, smooth=True,
+           bend=IMAGE):  # fmt: skip
     """``scales``: of turns and smooth error, where the fit starts."""
     first = np.full(SCALES, np.log(scales[0]))
     first[-1] = np.log(scales[1])
     mean = HYPER_MEAN if hyper < 1.0 else first
     return fit_frame(
         observations.packed, len(observations), start, observations.row_time_gradient, PRIOR, 2.0,
-        30.0, 2.0, first, mean, np.full(SCALES, hyper), turns, smooth, 25,
+        30.0, 2.0, first, mean, np.full(SCALES, hyper), turns, smooth, bend, 25,
     )  # fmt: skip
 
 
@@ -364,3 +367,32 @@ def test_more_than_a_motion_is_chosen_by_the_evidence_only_if_there_is_more():
 def test_too_few_points_are_no_fit():
     observations, truth = frame(0, 0.02, 0.3, 5)
     assert not fitted(observations, truth).finite
+
+
+@pytest.mark.parametrize("of_map", [False, True], ids=["image", "map"])
+def test_the_covariance_is_beside_the_smooth_error_and_allows_for_it(of_map):
+    """That of the noise and of what the prior allows, of a best motion that weighs both."""
+    observations, state = frame(2, 0.02, NOISE)
+    bend = np.ascontiguousarray(observations.points[:, :2]) if of_map else IMAGE
+    scale = 0.01 if of_map else 0.7
+    fit = fitted(observations, state, (5e-3, scale), 1e9, turns=False, bend=bend)
+    assert fit.inliers.all()
+    lines = linearized(
+        observations.packed, len(observations), fit.state, observations.row_time_gradient,
+        np.zeros((len(observations), 6)),
+    )  # fmt: skip
+    matrix, _ = design(lines, fit.inliers, turns=False, smooth=not of_map)
+    motion, smooth = matrix[:, :18], matrix[:, 18:]
+    if of_map:  # a point that moves by (x, y) times a coefficient along each axis of the camera
+        moved = -lines.by_motion[:, :, 3:6]
+        smooth = np.einsum("nka,nb->nkba", moved, bend).reshape(len(motion), -1)
+    information, slope = np.zeros((18, 18)), np.zeros(18)
+    add_prior(*PRIOR, fit.state, 1.0, information, slope)
+    inverse = np.linalg.inv(fit.noise**2 * np.eye(len(motion)) + scale**2 * smooth @ smooth.T)
+    whole = np.linalg.inv(motion.T @ inverse @ motion + information)
+    gain = whole @ motion.T @ inverse
+    own = fit.noise**2 * gain @ gain.T + whole @ information @ whole
+    deviations = np.sqrt(np.diag(own))
+    np.testing.assert_allclose(fit.covariance / np.outer(deviations, deviations),
+                               own / np.outer(deviations, deviations), atol=0.02)  # fmt: skip
+    assert (np.diag(whole)[:6] > 1.2 * np.diag(own)[:6]).any()

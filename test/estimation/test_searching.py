@@ -44,6 +44,7 @@ def share(outliers, max_iterations, frames=30, **more):
     ])  # fmt: skip
 
 
+@pytest.mark.bench
 def test_more_iterations_find_what_fewer_do_not():
     few, default, many = (share(0.9, most) for most in (100, 1000, 10_000))
     assert few <= 0.6
@@ -92,10 +93,11 @@ def before_a_plane(seed):
     return points, pixels + rng.normal(size=(50, 2))
 
 
-def test_a_fast_camera_before_a_plane_that_faces_it_is_found():
+@pytest.mark.parametrize("frames", [10, pytest.param(40, marks=pytest.mark.bench)])
+def test_a_fast_camera_before_a_plane_that_faces_it_is_found(frames):
     """From the global-shutter pose, which leans, one in four was not, after all the samples."""
     localizer = Localizer(CAMERA, max_orientation_deviation=0.1)
-    for seed in range(40):
+    for seed in range(frames):
         estimate = localizer.localize(*before_a_plane(seed))
         assert estimate
         assert estimate.iterations <= 128

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from matplotlib.quiver import Quiver
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.evaluation import plots
 from rs_localizer.evaluation.comparison import (
     Answer,
     Recording,
@@ -19,12 +17,6 @@ from rs_localizer.evaluation.comparison import (
     predicted_pixels,
     table,
     true_rates,
-)
-from rs_localizer.evaluation.plots import (
-    error_picture,
-    inlier_picture,
-    residual_picture,
-    trajectory_picture,
 )
 
 MIDDLE_NS = 15_000_000
@@ -104,20 +96,6 @@ def test_table(recording, results):
     assert "error" not in table("A flight", blind, {"good": compare({}, None)})
 
 
-def test_pictures(recording, results, tmp_path):
-    """They are drawn at all, also where a method has no answer."""
-    matches = np.full(len(recording.stamps_ns), 105.0)
-    assert recording.truth is not None
-    for shown in (results, results | {"bad": compare({}, recording.truth)}):
-        for figure in (
-            trajectory_picture(recording, shown),
-            error_picture(shown),
-            inlier_picture(recording, shown, matches),
-        ):
-            figure.savefig(tmp_path / "figure.png")
-    assert residual_picture(recording, results, 0.03) is None  # there are no images
-
-
 def project(camera: Camera, points: Array, rotation: Rotation, centre: Array) -> Array:
     return camera.project(rotation.inv().apply(points - centre))
 
@@ -139,23 +117,3 @@ def test_predicted_pixels_move_with_the_rows():
     static = Answer(0, 0.0, 0, np.zeros(3), start.as_quat(), None, None, np.zeros(0))
     expected = project(camera, points, start, np.zeros(3))
     np.testing.assert_allclose(predicted_pixels(camera, static, points), expected, atol=1e-9)
-
-
-@pytest.mark.parametrize(("residual", "enlarged"), [(0.11, "500"), (3.0, "20"), (700.0, "0.1")])
-def test_arrows_stay_inside(residual, enlarged):
-    """All the points lie at the border of the image, and the arrows point outwards."""
-    pixels = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
-    outwards = (pixels - pixels.mean(axis=0)) / np.linalg.norm(pixels[2] / 2)
-    predicted = {"bad": pixels - residual * outwards, "good": pixels - 0.01 * outwards}
-    figure = plots.residuals(np.zeros((480, 640), np.uint8), pixels, predicted, "A frame")
-    assert figure.get_suptitle().startswith("A frame: ")
-    for axes in figure.axes:
-        assert axes.get_xlabel() == f"arrows {enlarged} times enlarged"
-        (arrows,) = (c for c in axes.collections if isinstance(c, Quiver))
-        tips = arrows.XY + np.stack([arrows.U, arrows.V], axis=1) / arrows.scale
-        left, right = axes.get_xlim()
-        bottom, top = axes.get_ylim()
-        assert left <= tips[:, 0].min() < tips[:, 0].max() <= right
-        assert top <= tips[:, 1].min() < tips[:, 1].max() <= bottom
-    longest = np.hypot(arrows.U, arrows.V).max() / arrows.scale
-    assert longest < 80.0

@@ -61,11 +61,6 @@ def test_every_edge_is_drawn_where_the_rows_see_it():
     assert v.max() < all_seen[:, 1].max() + 5
 
 
-def test_a_cube_behind_the_camera_is_not_drawn():
-    behind = Motion(np.eye(3), np.array([0.0, 0.0, -2.7]), np.zeros(3), np.zeros(3))
-    assert not drawn(behind).any()
-
-
 def test_animation_can_be_played():
     pictures = []
     for k in range(6):

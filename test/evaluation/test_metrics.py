@@ -35,12 +35,6 @@ def test_pose_errors_are_in_metres_and_degrees():
     assert len(pose_errors(moved.part(slice(3, 6)), TRUTH).linear) == 3
 
 
-def test_pose_errors_need_a_common_time():
-    later = Trajectory(STAMPS + 1, TRUTH.positions, TRUTH.quaternions)
-    assert len(pose_errors(later, TRUTH).angular) == 0
-    np.testing.assert_allclose(pose_errors(later, TRUTH, 1).angular, 0.0, atol=1e-5)
-
-
 def test_twist_errors():
     angular, linear = RNG.normal(size=(10, 3)), RNG.normal(size=(10, 3))
     true = Twists(STAMPS, angular, linear)

@@ -124,14 +124,6 @@ def test_a_clock_that_is_set_back_starts_over():
     assert lack(buffer.between(START + 500 * MS, START + 530 * MS)) == Lack.STOPPED
 
 
-def test_one_reading_without_force_leaves_the_turn():
-    buffer = filled(stamps(100))
-    buffer.add(START + 100 * PERIOD, "imu", (0.0, 0.0, 0.0))
-    found = buffer.between(START + 95 * PERIOD, START + 100 * PERIOD)
-    assert isinstance(found, Readings)
-    assert found.specific_forces is None
-
-
 def test_the_end_of_the_range_is_noticed():
     rng = np.random.default_rng(0)
     turn = 6.0 * np.sin(2.0 * np.pi * 3.0 * np.arange(400) * 2.5e-3)

@@ -1,9 +1,8 @@
 """Stamps of images: their own, or those of a rate; and what speaks against it."""
 
 import numpy as np
-import pytest
 
-from rs_localizer.io.image_clock import ImageClock, TimesError, readout_fault
+from rs_localizer.io.image_clock import ImageClock, readout_fault
 
 MS = 1_000_000
 # Milliseconds of a phone that leaves images out: 10 images/s on average.
@@ -35,23 +34,6 @@ def test_a_rate_overrides_and_is_compared():
     without = ImageClock(rate=30.0)
     assert without.relative(None) == 10**9
     assert without.fault() is None
-
-
-def test_names_are_times_unless_an_origin_is_given():
-    clock = ImageClock()
-    assert [clock.absolute(10**18 + k) for k in (0, 7)] == [10**18, 10**18 + 7]
-    assert "the names of the files" in clock.told()
-    moved = ImageClock(start_ns=3)
-    assert [moved.absolute(10**18 + k) for k in (0, 7)] == [3, 10]
-
-
-def test_without_times_and_rate_nothing_is_made_up():
-    with pytest.raises(TimesError, match="give --rate"):
-        ImageClock().relative(None)
-    clock = ImageClock()
-    clock.relative(0)
-    with pytest.raises(TimesError, match="give --rate"):
-        clock.relative(None)
 
 
 def test_a_readout_longer_than_a_period():

@@ -139,17 +139,6 @@ def test_jpeg_and_png():
     np.testing.assert_allclose(read_compressed_image(compressed(color)).pixels, SMOOTH, atol=1)
 
 
-def test_rows_stay_where_the_sensor_has_them():
-    # An Exif note "show this turned by a quarter" (orientation 6).
-    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
-    tiff = b"II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
-    exif = b"Exif\0\0" + tiff
-    segment = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
-    turned = JPEG[:2] + segment + JPEG[2:]
-    assert cv2.imdecode(np.frombuffer(turned, np.uint8), 0).shape == SMOOTH.T.shape
-    assert read_compressed_image(compressed(turned)).pixels.shape == SMOOTH.shape
-
-
 @pytest.mark.parametrize(
     ("data", "name", "text"),
     [
@@ -164,20 +153,6 @@ def test_rows_stay_where_the_sensor_has_them():
 def test_bad_compressed_images(data, name, text):
     with pytest.raises(MessageError, match=text):
         read_compressed_image(compressed(data, name))
-
-
-def test_sizes_that_an_image_claims():
-    """Refused before the decoder allocates them."""
-    wide = PNG[:16] + (30000).to_bytes(4) * 2 + PNG[24:]
-    with pytest.raises(MessageError, match="PNG image says that it is 30000 x 30000, of which"):
-        read_compressed_image(compressed(wide))
-    long = PNG[:33] + (2**30).to_bytes(4) + PNG[37:]
-    with pytest.raises(MessageError, match="has a chunk that is longer than it"):
-        read_compressed_image(compressed(long))
-    start = next(k for k in range(len(JPEG)) if JPEG[k : k + 2] == b"\xff\xc0")
-    tall = JPEG[: start + 5] + (65000).to_bytes(2) * 2 + JPEG[start + 9 :]
-    with pytest.raises(MessageError, match="JPEG image says that it is 65000 x 65000, of which"):
-        read_compressed_image(compressed(tall))
 
 
 def png_of(width: int, height: int) -> bytes:
@@ -214,7 +189,7 @@ def jpeg_of(width: int, height: int, before: bytes = b"") -> bytes:
 
 def test_a_jpeg_that_hides_its_size_is_not_decoded():
     hidden = JPEG[:2] + b"junk" + JPEG[2:]
-    with pytest.raises(MessageError, match="cannot be decoded: no header tells its size"):
+    with pytest.raises(MessageError, match="cannot be decoded: no header has its size"):
         read_compressed_image(compressed(hidden))
 
 

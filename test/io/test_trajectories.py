@@ -52,13 +52,6 @@ def test_poses_round_trip(tmp_path, name):
     assert ((tmp_path / name).read_bytes()[:2] == b"\x1f\x8b") == name.endswith(".gz")
 
 
-def test_comments_and_rounded_quaternions(tmp_path):
-    (tmp_path / "a.txt").write_text(f"# title\n\n  1.5 {POSE[:-1]}0.9996 \n# end\n")
-    read = read_tum(tmp_path / "a.txt")
-    assert read.stamps_ns.tolist() == [1_500_000_000]
-    np.testing.assert_array_equal(read.quaternions, [[0, 0, 0, 1]])
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

@@ -39,7 +39,7 @@ def test_what_people_write():
     ],
 )
 def test_traps(text, fault):
-    started = time.monotonic()
+    started = time.process_time()
     with pytest.raises(YamlError, match=fault):
         load_yaml(text)
-    assert time.monotonic() - started < 20.0
+    assert time.process_time() - started < 20.0

@@ -10,7 +10,7 @@ from rs_localizer.core import so3
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.poses import Pose
-from rs_localizer.markers.prints import Chessboard, Marker
+from rs_localizer.markers.prints import Marker
 
 TURN = so3.exp(np.array([0.4, -0.7, 0.2]))
 
@@ -60,20 +60,3 @@ def test_markers():
     assert [marker.size for marker in found] == pytest.approx([0.4, 0.4])
     assert np.linalg.norm(found[1].pose.position) == pytest.approx(4.0)
     np.testing.assert_allclose(found[0].deviations, known * [2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
-
-
-def test_what_cannot_be_wished():
-    with pytest.raises(ValueError, match="the map has no landmark 77"):
-        alignment(room(), Wishes(origin=77))
-    with pytest.raises(ValueError, match="a floor needs at least 3 ids, got 2"):
-        alignment(room(), Wishes(floor=(0, 1)))
-    line = replace(room(), points=np.outer(np.arange(20.0), [1.0, 2.0, 3.0]))
-    with pytest.raises(ValueError, match="lie on a line"):
-        alignment(line, Wishes(floor=(0, 1, 2)))
-    with pytest.raises(ValueError, match="3 and 3 are at one place"):
-        alignment(room(), Wishes(distance=(3, 3, 1.0)))
-    with pytest.raises(ValueError, match="only markers stand upright"):
-        alignment(room(), Wishes(upright=3))
-    boards = MarkerMap(boards=(Chessboard(6, 4, 0.03),))
-    with pytest.raises(ValueError, match="boards cannot be scaled"):
-        moved_markers(boards, alignment(boards, Wishes(scale=2.0)))

@@ -141,6 +141,7 @@ def test_the_report_says_what_an_imu_says(built, views):
     assert "| z is up | as in the marker map |" in page
 
 
+@pytest.mark.bench
 def test_without_calibration_lens_and_shutter_are_found(views, folder):
     """Nor a readout time, a direction or a scale; the images are enough for all but the last."""
     alone = folder / "alone"

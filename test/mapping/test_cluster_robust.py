@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import camera, ring, spot
 
-from rs_localizer.mapping.cluster_robust import Pull, pull_at_landmarks
+from rs_localizer.mapping.cluster_robust import pull_at_landmarks
 from rs_localizer.mapping.survey import Survey, survey
 from rs_localizer.mapping.unknown_markers import every_marker
 from rs_localizer.markers.families import family
@@ -43,13 +43,6 @@ def test_what_errors_pull_at_landmarks_is_their_long_run_variance(share):
         np.concatenate([own, left[..., None]], axis=2), landmarks, times, np.zeros(LANDMARKS)
     )
     assert pull.found / pull.expected == pytest.approx((1.0 + share) / (1.0 - share), rel=0.2)
-
-
-def test_few_seconds_are_not_believed():
-    assert Pull(0.0, 0.0).inflation(1.3) == pytest.approx(1.3)
-    assert Pull(10.0, 2.0).inflation(1.3) < 0.6 * 5.0
-    assert Pull(500.0, 100.0).inflation(1.3) == pytest.approx(5.0, rel=0.05)
-    assert Pull(50.0, 100.0).inflation(1.3) == 1.3
 
 
 def surveyed(share: float) -> Survey:

@@ -16,7 +16,6 @@ from rs_localizer.mapping.inertial_metres import (
     NoMetres,
     inertial_metres,
     place_by_imu,
-    refuse_early,
 )
 from rs_localizer.mapping.refine import RefinedMap, refine
 from rs_localizer.trajectory.imu import ImuRecording
@@ -167,27 +166,6 @@ def test_what_is_wrong_is_said(refined, imu, spoilt, said):
     (doubt,) = place.doubts
     assert doubt.startswith("the IMU gives no scale: ")
     assert re.search(said, doubt)
-
-
-def test_no_map_without_a_scale_that_is_asked_for(refined, imu):
-    silent = without_accelerometer(imu)
-    with pytest.raises(MappingError, match="gives no scale: the IMU has no accelerometer"):
-        place_by_imu(NOTHING, refined, GivenImu(silent, asked=True))
-    scaled = replace(NOTHING, scaled=True)
-    place = place_by_imu(scaled, refined, GivenImu(silent, asked=True))
-    assert place.placement is scaled
-    assert place.doubts[0].startswith("the IMU cannot check the scale: ")
-
-
-def test_another_clock_is_noticed_before_the_work(refined, imu):
-    """Unless the scale may be another's, or nobody asked."""
-    stamps = START_NS + np.round(1e9 * refined.times).astype(np.int64)
-    refuse_early(GivenImu(imu, asked=True), stamps)
-    refuse_early(GivenImu(by_another_clock(imu), asked=False), stamps)
-    with pytest.raises(MappingError, match="must be by one clock"):
-        refuse_early(GivenImu(by_another_clock(imu), asked=True), stamps)
-    with pytest.raises(MappingError, match="has no accelerometer"):
-        refuse_early(GivenImu(without_accelerometer(imu), asked=True), stamps)
 
 
 def test_gravity_that_was_taken_off(felt, refined, imu):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rs_localizer.mapping.gauge import Similarity, through, upright
+from rs_localizer.mapping.gauge import Similarity, through
 
 
 def test_the_similarity_through_points_is_found():
@@ -27,11 +27,3 @@ def test_points_of_a_plane_are_not_mirrored():
 def test_too_few_and_points_on_a_line_are_refused(points):
     with pytest.raises(ValueError, match="determine"):
         through(points, points)
-
-
-@pytest.mark.parametrize("down", [(0.0, 0.0, -2.0), (0.0, 0.0, 3.0), (1.0, 2.0, -3.0), (1.0, 0, 0)])
-def test_down_comes_down(down):
-    turn = upright(np.array(down))
-    assert np.allclose(turn @ np.array(down), [0.0, 0.0, -np.linalg.norm(down)])
-    assert np.allclose(turn @ turn.T, np.eye(3))
-    assert np.linalg.det(turn) == pytest.approx(1.0)

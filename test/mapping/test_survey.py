@@ -68,24 +68,6 @@ def test_what_does_not_hang_together_is_named(spotted):
     assert [[marker.id for marker in part] for part in found.apart] == [[3, 4]]
 
 
-def test_what_says_nothing_is_refused(spotted):
-    with pytest.raises(ValueError, match="0 images show a whole marker, at least 5"):
-        survey(camera(), [], MARKERS)
-    with pytest.raises(ValueError, match=r"no image shows marker 4x4_50 \d together with another"):
-        survey(camera(), only(spotted, [{0}, {1}, {2}]), MARKERS)
-    with pytest.raises(ValueError, match="the origin, marker 4x4_50 40, is in no image"):
-        survey(camera(), spotted, MARKERS, origin=40)
-
-
-def test_a_wrong_size_is_a_wrong_scale(spotted):
-    right = survey(camera(), spotted, MARKERS)
-    twice = survey(camera(), spotted, every_marker([family("4x4_50")], 2.0 * SIZE, {}))
-    first, second = (
-        np.array([marker.pose.position for marker in found.markers]) for found in (right, twice)
-    )
-    np.testing.assert_allclose(second, 2.0 * first, atol=0.01)
-
-
 def test_images_of_one_marker_do_not_hide_the_noise(spotted, poses):
     """All but every tenth image show one marker: two numbers more than a pose."""
     few = []

@@ -38,10 +38,6 @@ def test_blur_is_less_sharp():
     assert np.flatnonzero(blurred(views_of(values))).tolist() == [20]
 
 
-def test_all_views_of_a_short_recording_are_keyframes():
-    assert chosen(views_of([1.0] * 42)) == list(range(42))
-
-
 def test_of_a_long_one_the_sharpest_four_a_second_are():
     values = np.random.default_rng(0).uniform(1.0, 2.0, 900).tolist()
     rows = chosen(views_of(values))

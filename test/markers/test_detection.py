@@ -120,15 +120,6 @@ def test_ids_are_rows_of_the_maps_points(render, look, project):
     np.testing.assert_array_equal(again.pixels, found.pixels)
 
 
-def test_markers_that_are_not_in_the_map_are_named(render, look):
-    known, other = wall("5x5_50", (2, 1), 0.08, 0.04)
-    prints = [(pattern(m.family, m.id), m.corners) for m in (known, other)]
-    found = MarkerDetector(MarkerMap((known,))).detect(render(prints, look()))
-    assert found.ids.tolist() == [0, 1, 2, 3]
-    assert found.unknown == ("5x5_50 1",)
-    assert found.repeated == ()
-
-
 def test_noise_shows_nothing():
     noise = np.random.default_rng(0).integers(0, 256, (480, 640), np.uint8)
     marker_map = MarkerMap(

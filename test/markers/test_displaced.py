@@ -66,14 +66,3 @@ def test_a_shaking_rolling_shutter_hides_no_marker():
     assert text.startswith("marker 4x4_50 4 is not where the map has it")
     assert "about 1.0 cm (+0.0" in text
     assert said(0.0, spin=4.0, fit=_RollingFit()) is None
-
-
-def test_with_two_markers_nobody_knows_which_is_off():
-    check = LeaveOneOut(MARKERS)
-    ids = np.arange(8)
-    for _ in range(10):
-        check.add(
-            CAMERA,
-            Detections(ids, MARKERS.points[:8], np.zeros((8, 2)), np.ones(8), (), (), (), ()),
-        )
-    assert check.fault() is None

@@ -123,6 +123,26 @@ def test_faults_of_markers(tmp_path, entry, text):
     assert str(tmp_path / "map.yaml") in str(error.value)
 
 
+def test_points_of_a_board_are_known_as_paper_is_unless_its_file_says_better(tmp_path):
+    paper = read(tmp_path, {"map_frame": "map", "boards": [CHESSBOARD]})
+    x, y = np.mgrid[-2.5:3, -1.5:2] * 0.03
+    rms = np.sqrt(np.mean(x**2 + y**2))
+    assert paper.settings == pytest.approx({"map_deviation": 0.002 * rms})
+    measured = paper.with_points(paper.points + np.array([0.0, 0.0, 1e-3]), 3.21e-4)
+    write_marker_map(tmp_path / "again.yaml", measured)
+    again = read_marker_map(tmp_path / "again.yaml")
+    assert again.settings == pytest.approx({"map_deviation": 3.21e-4})
+    np.testing.assert_allclose(again.points, measured.points)
+    exact = [CHESSBOARD | {"deviation": 0}, CHARUCO]
+    mean = read(tmp_path, {"map_frame": "map", "boards": exact}).settings["map_deviation"]
+    alone = read(tmp_path, {"map_frame": "map", "boards": [CHARUCO]}).settings["map_deviation"]
+    assert mean == pytest.approx(np.sqrt(6 / 30) * alone)
+    # Markers are exact: what their places are worth is their survey's to say.
+    assert read(tmp_path, {"map_frame": "map", "markers": [MARKER]}).settings == {}
+    with pytest.raises(MarkerMapError, match="deviation must be 0 or more metres, found -1"):
+        read(tmp_path, {"map_frame": "map", "boards": [CHESSBOARD | {"deviation": -1}]})
+
+
 @pytest.mark.parametrize(
     ("tree", "text"),
     [

@@ -1,7 +1,6 @@
 """Pages are true to scale and hold what their map says: the detector reads them."""
 
 import re
-from typing import Any
 
 import cv2
 import numpy as np
@@ -68,22 +67,3 @@ def test_pdf_has_the_size_of_the_paper(tmp_path):
     for width, height in boxes:
         assert float(width) == pytest.approx(215.9 / 25.4 * 72, abs=0.01)
         assert float(height) == pytest.approx(279.4 / 25.4 * 72, abs=0.01)
-
-
-def standing() -> Any:
-    return Pose(np.zeros(3), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]))
-
-
-def test_a_page_tells_how_the_map_lies_on_it():
-    (page,) = plan(MarkerMap(wall("4x4_50", (2, 3), 0.06, 0.02, pose=standing())))
-    assert page.axes is not None
-    assert (page.axes.right, page.axes.up, page.axes.out) == ("+x", "+z", "-y")
-    # In the middle of the grid, which is that of all figures.
-    boxes = np.array([(x, y, x + f.width, y + f.height) for x, y, f in page.figures])
-    middle = 0.5 * (boxes[:, :2].min(axis=0) + boxes[:, 2:].max(axis=0))
-    np.testing.assert_allclose(page.axes.origin, middle, atol=1e-6)
-    assert "the first print is at (-0.04, 0, 0.08) m" in page.axes.where
-    (page,) = plan(MarkerMap(boards=(Chessboard(6, 4, 0.02),)))
-    assert page.axes is not None
-    assert (page.axes.right, page.axes.up, page.axes.out) == ("+x", "+y", "+z")
-    assert page.axes.where == "the origin is in the middle of the print"

@@ -144,10 +144,3 @@ def test_the_mutual_check_and_the_best_of_several():
     assert matched(matcher, given, mutual=False) == {1: 0, 2: 1}
     # The same distance twice: the first.
     assert matched(matcher, keypoints(2, descriptors=bits(2, 2))) == {0: 0}
-
-
-def test_bytes_are_numbers_where_the_map_has_numbers():
-    """SIFT comes in bytes or in floats."""
-    rows = np.random.default_rng(0).integers(0, 256, (20, 128), dtype=np.uint8)
-    matcher = Matcher(make_map(20, descriptors=rows.astype(np.float32)))
-    assert matched(matcher, keypoints(5, descriptors=rows[:5])) == {k: k for k in range(5)}

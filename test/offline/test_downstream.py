@@ -85,7 +85,7 @@ def replayed(flight: Flight, config: NodeConfig) -> tuple[list[Localized], Frame
     with open_bag(flight.path) as bag:
         topics = find_topics(bag)
         used = localizer(config, find_transforms(bag, topics, config))
-        found = [result for _, result in replay(bag, topics, used)]
+        found = [answer.result for answer in replay(bag, topics, used)]
     assert all(found)
     assert len(found) == LENGTH
     return found, used

@@ -38,13 +38,6 @@ def test_a_frame_comes_when_its_readings_have():
     assert [name for name in out if name[0] == "r"] == [f"r{i}" for i in range(12)]
 
 
-def test_those_behind_wait_too():
-    out = played(recording(), lambda name: 60 if name == "f0" else 0)
-    assert [name for name in out if name[0] != "r"] == ["i0", "f0", "i1", "f1", "i2", "f2"]
-    assert out.index("f0") == out.index("r9") + 1
-    assert out.index("f1") == out.index("f0") + 2
-
-
 def test_a_frame_whose_readings_never_come_goes_on():
     items = recording()
     assert played(items, lambda name: 10_000)[-5:] == ["f0", "i1", "f1", "i2", "f2"]  # at its end

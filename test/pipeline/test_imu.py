@@ -201,7 +201,14 @@ FAULTS: dict[str, tuple[Change, ImuReason]] = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+# What a reading buffer by itself says of the others is in test/inertial/test_buffer.py.
+QUICK = ("stops", "begins late", "is set back", "is cut")
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [*QUICK, *(pytest.param(f, marks=pytest.mark.bench) for f in FAULTS if f not in QUICK)],
+)
 def test_the_camera_goes_on_alone(flight, fault):
     change, reason = FAULTS[fault]
     flown = fly(flight, change)

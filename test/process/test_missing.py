@@ -41,9 +41,6 @@ def run(code: str, environment: dict[str, str], *words: str) -> subprocess.Compl
     ("name", "words", "advice"),
     [
         ("scipy", ("detect", "video.mp4"), "sudo apt install python3-scipy, or pip install scipy"),
-        ("numba", ("detect", "video.mp4"), "pip install numba (beside Ubuntu's ROS with"),
-        ("cv2", ("detect", "video.mp4"), "pip install opencv-python-headless"),
-        ("tqdm", ("replay", "bag"), "sudo apt install python3-tqdm"),
         ("rosbags", ("evaluate", "a", "b"), "pip install rosbags"),
     ],
 )
@@ -57,8 +54,7 @@ def test_a_command_says_it_in_one_line(tmp_path, name, words, advice):
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("code", [NODE, DETECTOR])
-@pytest.mark.parametrize("name", ["scipy", "numba", "yaml"])
+@pytest.mark.parametrize(("name", "code"), [("scipy", NODE), ("yaml", DETECTOR)])
 def test_a_node_says_it_in_one_line(tmp_path, name, code):
     pytest.importorskip("rclpy", reason="needs ROS 2")
     done = run(code, without(tmp_path, name))

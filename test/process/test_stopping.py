@@ -26,14 +26,16 @@ with StopSignals():
 """
 
 
+@pytest.mark.bench
 def test_random_signals():
     ended = list(campaign(10, seed=1, commands=("replay", "detect", "markers")))
     assert [one for one in ended if one.fault] == []
     assert any(one.code > 128 for one in ended)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("body", ["import numba.fake", "Finalized()"])
+@pytest.mark.parametrize(
+    ("body", "number"), [("import numba.fake", signal.SIGINT), ("Finalized()", signal.SIGHUP)]
+)
 def test_no_interrupt_is_lost(tmp_path, number, body):
     """Nor raised where code from C would lose it, or be left half done."""
     folder = f"{tmp_path}"

@@ -17,6 +17,10 @@ from rclpy.context import Context
 from rs_localizer.config import DetectorConfig, FeatureConfig
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.markers.map_files import write_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.markers.prints import Chessboard
+from rs_localizer.pipeline.inputs import INPUTS
 from rs_localizer.ros.localizer.node import Feed
 from rs_localizer.settings import NODE_NAME, build, load_params_file, settings, write_parameters
 
@@ -158,7 +162,7 @@ def test_arguments_and_files_exist(describe, file):
 
 def test_every_input_can_be_remapped(describe):
     unused: Any = None
-    inputs = set(Feed(unused, unused, unused, unused).topics())
+    inputs = set(Feed(unused, unused, unused, unused).topics()) | set(INPUTS)
     launched = node(describe("localizer.launch.py"), "localizer")
     assert {name for name, _ in launched.options["remappings"]} == inputs
     assert launched.options["name"] == NODE_NAME
@@ -195,22 +199,27 @@ def test_the_detector_knows_the_localizers_shutter(describe, tmp_path):
     assert parameters(description, "localizer") == {"stamp_offset": 0.005, "use_sim_time": True}
 
 
-def test_markers_need_a_map(describe, tmp_path):
-    with pytest.raises(RuntimeError, match="marker_map must name a file"):
-        describe("markers.launch.py")
-    file = tmp_path / "detector.yaml"
-    file.write_text(f"/**:\n  ros__parameters: {{marker_map: {WALL}}}\n")
-    description = describe("markers.launch.py", detector_params_file=str(file))
-    assert "marker_map" not in parameters(description, "marker_detector")
+def test_the_localizer_knows_how_well_a_board_is_known(describe, tmp_path):
+    file = tmp_path / "board.yaml"
+    board = Chessboard(6, 4, 0.03, deviation=2.5e-4)
+    write_marker_map(file, MarkerMap(boards=(board,)))
+    chosen = {"marker_map": str(file), "params_file": str(ROOT / "config" / "rs_localizer.yaml")}
+    of_map = {"map_deviation": 2.5e-4}
+    found = parameters(describe("markers.launch.py", **chosen), "localizer")
+    assert found == pytest.approx(of_map)
+    given = describe("markers.launch.py", **chosen, map_deviation="0.0")
+    assert parameters(given, "localizer") == {"map_deviation": 0.0}
+    own = tmp_path / "own.yaml"
+    own.write_text("/**:\n  ros__parameters: {map_deviation: 0.001}\n")
+    chosen["params_file"] = str(own)
+    assert parameters(describe("markers.launch.py", **chosen), "localizer") == {}
 
 
 @pytest.mark.parametrize(
     ("file", "given", "text"),
     [
         ("markers.launch.py", {"camera": "v4l"}, "one of none, v4l2_camera, usb_cam; got 'v4l'"),
-        ("markers.launch.py", {"camera": "usb_cam"}, "sudo apt install ros-jazzy-usb-cam"),
         ("markers.launch.py", {"rviz": "true"}, "rviz:=true needs the package rviz2"),
-        ("localizer.launch.py", {"rviz": "True"}, "rviz:=true needs the package rviz2"),
     ],
 )
 def test_what_cannot_be_started_is_said_before_anything_is(
@@ -225,10 +234,7 @@ def test_what_cannot_be_started_is_said_before_anything_is(
     ("file", "name"),
     [
         ("localizer.launch.py", "params_file"),
-        ("localizer.launch.py", "map_file"),
         ("markers.launch.py", "marker_map"),
-        ("markers.launch.py", "detector_params_file"),
-        ("features.launch.py", "features_params_file"),
         ("two_cameras.launch.py", "right_params_file"),
     ],
 )

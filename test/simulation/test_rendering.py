@@ -138,17 +138,6 @@ def test_corners_are_where_they_project_to():
     assert np.abs(all_errors[distances < 1.0].mean(axis=0)).max() < 0.01
 
 
-def test_a_far_picture_does_not_alias():
-    squares = np.indices((1024, 1024)).sum(0) % 2
-    plane = TexturedPlane(
-        np.array([5.0, 2.56, 2.56]), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]),
-        0.005, (255 * squares).astype(np.uint8),
-    )  # fmt: skip
-    still = ConstantVelocity(np.zeros(3), np.zeros(3), 1.0)
-    image = Renderer(CAMERA, [plane]).image(still, 0)[20:50, 30:60]
-    assert np.abs(image - 127.5).max() < 8.0
-
-
 def test_exposure_blurs_along_the_motion_and_shifts_nothing():
     """An edge that passes by at v px per exposure is a ramp of that width, in the same place."""
     edge = np.full((400, 800), 20, np.uint8)

@@ -135,15 +135,6 @@ def test_noise_has_the_ordered_size_in_both_coordinates():
     assert abs(np.corrcoef(noise.T)[0, 1]) < 0.06
 
 
-def test_seed_decides_everything():
-    one, same, other = (frames(FrameSettings(points=50), seed=seed) for seed in (4, 4, 5))
-    for a, b in zip(one, same, strict=True):
-        np.testing.assert_array_equal(a.pixels, b.pixels)
-        np.testing.assert_array_equal(a.ids, b.ids)
-    assert not np.array_equal(one[0].pixels, other[0].pixels)
-    assert not np.array_equal(one[0].pixels, one[1].pixels)
-
-
 def test_no_frame_touches_a_gap():
     t = np.arange(0.0, 3.0, 1 / 120)
     t = t[((t < 1.0) | (t > 1.4)) & ((t < 2.0) | (t > 2.05))]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory.calibration import calibrate
-from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, NoMount, first_mount
+from rs_localizer.trajectory.gyro import GyroMount, GyroSamples, first_mount
 from rs_localizer.trajectory.gyro_terms import MOUNT, GyroTerms
 from rs_localizer.trajectory.imu import ImuRecording
 from rs_localizer.trajectory.model import State
@@ -100,16 +100,3 @@ def test_a_turn_about_one_axis_leaves_the_rotation_about_it_open():
     assert abs(mount.delay - OFFSET) < 5e-3
     between = Rotation.from_matrix(mount.camera_from_imu.T @ CAMERA_FROM_IMU)
     assert between.magnitude() < np.radians(3.0)
-
-
-def test_what_does_not_go_together_is_refused():
-    rng = np.random.default_rng(1)
-    motion, other = projector.Motion.random(rng), projector.Motion.random(rng)
-    spline = spline_of(motion, 3.0, 1 / 30)
-    times, rates = gyroscope(rng, motion, 3.0, np.zeros((3, 3)))
-    with pytest.raises(NoMount, match=r"5\d\.\d times the camera's: are they in rad/s"):
-        first_mount(GyroSamples(times, np.degrees(rates)), spline)
-    with pytest.raises(NoMount, match="are not the camera's"):
-        first_mount(GyroSamples(*gyroscope(rng, other, 3.0, np.zeros((3, 3)))), spline)
-    with pytest.raises(NoMount, match="0 samples of the IMU lie in the time"):
-        first_mount(GyroSamples(times + 100.0, rates), spline)

@@ -38,11 +38,6 @@ def test_of_a_shutter_as_it_is_set_there_is_no_doubt():
     assert found.logarithm < -4.6
 
 
-@pytest.mark.parametrize("share", [0.7, 1.5])
-def test_nor_of_one_that_is_nearer_to_the_setting_than_to_none(share):
-    assert odds(share * SET, speed=1.0).logarithm < 0.0
-
-
 def test_at_rest_nothing_is_known():
     assert abs(odds(0.0, speed=0.0).logarithm) < 1e-9
     assert ShutterHypotheses().logarithm == 0.0

@@ -57,7 +57,7 @@ def run(frames: Frames) -> Smoothed:
     return smooth(CAMERA, [image for _, image, _ in frames], [e for _, _, e in frames])
 
 
-@pytest.mark.parametrize("turn", [0.14, 0.35])
+@pytest.mark.parametrize("turn", [0.14, pytest.param(0.35, marks=pytest.mark.bench)])
 def test_smoothed_motion_is_better_than_tracked_and_its_covariance_holds(turn):
     rng = np.random.default_rng(11)
     motion = projector.Motion.random(rng, turn, 0.08)

@@ -71,7 +71,7 @@ def alignment(found: Map | MarkerMap, wishes: Wishes) -> Similarity:
         one, other, wanted = wishes.distance
         apart = float(np.linalg.norm(place(one) - place(other)))
         if not apart > 0.0:
-            raise ValueError(f"{one} and {other} are at one place: no size can be told by them")
+            raise ValueError(f"{one} and {other} are at one place: they give no scale")
         scale = wanted / apart
     origin = np.zeros(3)
     if wishes.origin is not None:

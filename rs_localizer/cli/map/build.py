@@ -339,8 +339,8 @@ def _tell(args: argparse.Namespace, built: Built, looked: Looked) -> None:
         print(f"  {name:30} {text}")
     if not built.placement.scaled:
         print(
-            "warning: nothing tells the scale: poses and velocities are in units of the map; give "
-            "--markers, --point and --distance, or --imu"
+            "warning: nothing determines the scale: poses and velocities are in units of the map; "
+            "give --markers, --point and --distance, or --imu"
         )
     check = built.refined.readout_check
     if check is not None and check.differs:

@@ -205,8 +205,8 @@ def _tell(found: Survey, every: Array, images: int) -> None:
         )
     if found.rare:
         print(
-            f"left out: {_listed(found.rare)}: too few images show them, or not enough to tell "
-            "which way they are turned"
+            f"left out: {_listed(found.rare)}: too few images show them, or not enough to "
+            "determine their orientation"
         )
 
 

@@ -147,7 +147,7 @@ def _find_windows(h: Array, n: int, first: Array, last: Array) -> None:
 
 @inlined
 def _deflate(
-    h: Array, n: int, lane: int, begin: int, end: int, bound: float, counts: Any, found: Array
+    h: Array, n: int, lane: int, begin: int, end: int, bound: float, counts: Any, eigenvalues: Array
 ) -> None:
     """Take the real eigenvalues of the diagonal block ``begin .. end`` of size one or two."""
     at = (end * (n + 1) + end) * LANES + lane
@@ -164,7 +164,7 @@ def _deflate(
             near -= product / span
     for value in (near, far) if begin < end else (near, np.nan):
         if abs(value) <= bound:
-            found[counts[lane] * LANES + lane] = value
+            eigenvalues[counts[lane] * LANES + lane] = value
             counts[lane] += 1
 
 

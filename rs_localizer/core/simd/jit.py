@@ -91,12 +91,12 @@ def digest(part: str, package: Path) -> str:
     files; after an update it would run the old code. Hence one folder per state of the sources.
     """
     parts = PARTS[: PARTS.index(part) + 1] if part in PARTS else PARTS
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for folder in parts:
         for file in sorted((package / folder).rglob("*.py")):
-            found.update(file.relative_to(package).as_posix().encode())
-            found.update(file.read_bytes())
-    return found.hexdigest()[:16]
+            sha.update(file.relative_to(package).as_posix().encode())
+            sha.update(file.read_bytes())
+    return sha.hexdigest()[:16]
 
 
 _digest = functools.cache(digest)
@@ -134,8 +134,8 @@ def _compiled(function: F, inline: str) -> F:
     template = compiled.get_call_template
     # Numba would compile a callee for every constant among its arguments, as often with all that
     # it calls.
-    compiled.get_call_template = lambda given, named: template(
-        tuple(map(numba.types.unliteral, given)),
+    compiled.get_call_template = lambda positional, named: template(
+        tuple(map(numba.types.unliteral, positional)),
         {name: numba.types.unliteral(kind) for name, kind in named.items()},
     )
     if Path(function.__code__.co_filename).is_file():  # not what was typed at a prompt
@@ -192,11 +192,11 @@ class _Implementation(CompileResultCacheImpl):
             case ((str() as name, "object", (code, intermediate)), described, *rest):
                 kept = (name, "object", (code, _NOTHING)), described, *rest
                 target.codegen()._engine._defined_symbols.add(described.llvm_cpython_wrapper_name)
-                found = super().rebuild(target, kept)
-                found.library._get_module_for_linking = functools.cache(
+                rebuilt = super().rebuild(target, kept)
+                rebuilt.library._get_module_for_linking = functools.cache(
                     functools.partial(_intermediate, target.codegen(), intermediate)
                 )
-                return found
+                return rebuilt
         return super().rebuild(target, stored)
 
 
@@ -242,17 +242,17 @@ class _Cache(FunctionCache):
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """What came with the package, so that a machine's users get the same bits, else theirs."""
-        found = self._load_shipped(signature, target)
-        return self._load_own(signature, target) if found is None else found
+        overload = self._load_shipped(signature, target)
+        return self._load_own(signature, target) if overload is None else overload
 
     def _load_own(self, signature: Any, target: Any) -> Any:
         if not self._is_own():
             return None
         try:
-            found = super().load_overload(signature, target)
-            if found is not None:
+            overload = super().load_overload(signature, target)
+            if overload is not None:
                 _mark(Path(self._cache_path).parent)
-            return found
+            return overload
         except (*_DAMAGE, pickle.UnpicklingError) as error:
             _say(f"damaged files are compiled anew ({self._cache_file._index_path}: {error!r})")
             with contextlib.suppress(OSError):  # saving says what is wrong with the folder
@@ -267,9 +267,9 @@ class _Cache(FunctionCache):
         target.refresh()  # or the code would call a runtime that is not there yet
         try:
             for key in shipped.keys(self._index_key(signature, target.codegen())):
-                found = self._shipped.load(key)
-                if found is not None:
-                    return self._impl.rebuild(target, found)
+                machine_code = self._shipped.load(key)
+                if machine_code is not None:
+                    return self._impl.rebuild(target, machine_code)
         except (*_DAMAGE, pickle.UnpicklingError, OSError) as error:
             _say(f"what came with the package is damaged ({shipped.FOLDER}: {error!r})")
         return None

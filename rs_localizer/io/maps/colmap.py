@@ -167,7 +167,11 @@ def _read_binary_images(data: bytes) -> dict[str, ModelImage]:
 
 def _read_text_images(path: Path) -> dict[str, ModelImage]:
     found: dict[str, ModelImage] = {}
-    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line[:1] != "#"]
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise MapError(f"{path.name} cannot be read as text: {error}") from error
+    lines = [line for line in text.splitlines() if line[:1] != "#"]
     # Every second line lists the features of an image, and may be empty.
     for line, features in zip_longest(lines[::2], lines[1::2], fillvalue=""):
         words = line.split(maxsplit=9)

@@ -8,16 +8,17 @@ from rs_localizer.io.maps.colmap import read_colmap
 from rs_localizer.io.maps.landmarks import Map, MapError
 from rs_localizer.io.maps.npz import read_npz, write_npz
 from rs_localizer.io.maps.ply import read_ply, write_ply
+from rs_localizer.io.remote import Location, local_copy
 
 _READERS = {".npz": read_npz, ".ply": read_ply}
 WRITERS = {".npz": write_npz, ".ply": write_ply}
 
 
-def read_map_file(path: Path | str, frame: str, database: Path | None = None) -> Map:
+def read_map_file(path: Location, frame: str, database: Path | None = None) -> Map:
     """Read a map: a folder of COLMAP, a NumPy archive (.npz) or a PLY file (.ply).
 
     Args:
-        path: of the file or folder.
+        path: of the file or folder, or its URL.
         frame: in which its points are given; files do not say.
         database: COLMAP's, where it is not near the model.
 
@@ -25,18 +26,19 @@ def read_map_file(path: Path | str, frame: str, database: Path | None = None) ->
         MapError: for anything that is no map, naming the file and what was found.
         OSError: for a file that is not there or cannot be read.
     """
-    path = Path(path)
-    path.stat()  # what does not exist is said to be so
-    try:
-        if path.is_dir():
-            return read_colmap(path, frame, database)
-        if database is not None:
-            raise MapError("it is not a folder of COLMAP, which alone has a database")
-        if path.suffix not in _READERS:
-            raise MapError(f"expected a folder of COLMAP or a file ending in {', '.join(_READERS)}")
-        return _READERS[path.suffix](path, frame)
-    except MapError as error:
-        raise MapError(f"{path}: {error}") from error
+    with local_copy(path) as file:
+        file.stat()  # what does not exist is said to be so
+        try:
+            if file.is_dir():
+                return read_colmap(file, frame, database)
+            if database is not None:
+                raise MapError("it is not a folder of COLMAP, which alone has a database")
+            if file.suffix not in _READERS:
+                known = ", ".join(_READERS)
+                raise MapError(f"expected a folder of COLMAP or a file ending in {known}")
+            return _READERS[file.suffix](file, frame)
+        except MapError as error:
+            raise MapError(f"{path}: {error}") from error
 
 
 def write_map_file(path: Path | str, landmarks: Map) -> None:

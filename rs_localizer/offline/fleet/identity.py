@@ -10,6 +10,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rs_localizer.io.remote import Location, fingerprint, is_url
+
 MARKER = "fleet.json"
 """Written last into a result's folder: it is complete, and of what."""
 
@@ -26,7 +28,7 @@ def program() -> str:
     return found.hexdigest()[:16]
 
 
-def identity(command: str, settings: Mapping[str, Any], inputs: Sequence[Path]) -> str:
+def identity(command: str, settings: Mapping[str, Any], inputs: Sequence[Location]) -> str:
     """A digest of all that decides what a result is.
 
     Args:
@@ -36,15 +38,18 @@ def identity(command: str, settings: Mapping[str, Any], inputs: Sequence[Path]) 
             times of what is in them, since reading all of a recording takes long.
     """
     said = json.dumps(
-        [program(), command, settings, [_fingerprint(path) for path in inputs]],
+        [program(), command, settings, [_fingerprint(place) for place in inputs]],
         sort_keys=True,
         default=str,
     )
     return hashlib.sha256(said.encode()).hexdigest()
 
 
-def _fingerprint(path: Path) -> list[tuple[str, int, int]]:
+def _fingerprint(place: Location) -> list[tuple[str, int, int]] | str:
     """Name below the path, size and time of change (ns) of each file; of nothing, nothing."""
+    if is_url(place):
+        return fingerprint(place)
+    path = Path(place)
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     found = []
     for file in files:
@@ -80,19 +85,20 @@ def read_marker(folder: Path) -> dict[str, Any] | None:
     return found if is_ours else None
 
 
-def folder_names(recordings: Sequence[Path], reserved: Collection[str] = ()) -> list[str]:
+def folder_names(recordings: Sequence[Location], reserved: Collection[str] = ()) -> list[str]:
     """A name for each recording: its own, with as many parent folders as tell it from the others.
 
     Args:
-        recordings: different absolute paths.
+        recordings: different absolute paths, or URLs.
         reserved: names of what else is there.
 
     Returns:
         as many different names: of ``a/flight`` and ``b/flight``, ``a_flight`` and ``b_flight``.
     """
+    paths = [_as_path(place) for place in recordings]
     names: dict[Path, str] = {}
     depth = 1
-    while left := [path for path in recordings if path not in names]:
+    while left := [path for path in paths if path not in names]:
         labels = {path: _label(path, depth) for path in left}
         counts = Counter(labels.values())
         taken = {*reserved, *names.values()}
@@ -103,7 +109,12 @@ def folder_names(recordings: Sequence[Path], reserved: Collection[str] = ()) -> 
             elif deepest:  # "a/b_c" and "a_b/c", say
                 names[path] = _numbered(label, {*taken, *names.values()})
         depth += 1
-    return [names[path] for path in recordings]
+    return [names[path] for path in paths]
+
+
+def _as_path(place: Location) -> Path:
+    """Of a URL: its parts below the scheme."""
+    return Path("/", place.replace("://", "/")) if is_url(place) else Path(place)
 
 
 def _label(path: Path, depth: int) -> str:

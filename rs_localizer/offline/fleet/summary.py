@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rs_localizer.io.atomic_files import atomic_files
+from rs_localizer.io.remote import Location
 from rs_localizer.offline.fleet.task import Figures
 
 if TYPE_CHECKING:  # half a second of importing, which workers do not need
@@ -30,7 +31,7 @@ _WIDTH, _PANEL = 8.0, 1.7  # inches
 class Row:
     """What the summary says of a recording."""
 
-    recording: Path
+    recording: Location
     folder: str
     state: str
     figures: Figures

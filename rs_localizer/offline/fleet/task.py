@@ -25,6 +25,7 @@ from llvmlite import binding
 
 from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.io.atomic_files import write_errors
+from rs_localizer.io.remote import Location
 from rs_localizer.offline.fleet.identity import program, read_marker, write_marker
 
 
@@ -97,8 +98,9 @@ class Kind:
     """What is done with each recording, by functions that a worker can import."""
 
     command: str
-    # Arguments of the command, recording, folder to create: does it, as for one recording alone.
-    work: Callable[[Namespace, Path, Path], Figures]
+    # Arguments of the command, recording (a path; a URL where the command takes URLs), folder to
+    # create: does it, as for one recording alone.
+    work: Callable[[Namespace, Any, Path], Figures]
     kernels: str  # names what has to be compiled for it
     # Compiles just that; without it, the first recording on a machine does, and the others wait.
     warm: Callable[[Namespace], None] | None = None
@@ -110,7 +112,7 @@ class Task:
 
     kind: Kind
     arguments: Namespace
-    recording: Path  # absolute, as are all paths: workers are elsewhere
+    recording: Location  # absolute, as are all paths: workers are elsewhere
     out: Path  # directory of all results
     name: str  # of the folder in it
     identity: str
@@ -198,23 +200,32 @@ def _attempt(task: Task) -> tuple[Figures | None, str]:
 
 def _work(task: Task, folder: Path) -> Figures:
     kind = task.kind
+    if kind.warm is not None:
+        compiled_elsewhere(kind.kernels, kind.warm, task.arguments)
+        return kind.work(task.arguments, task.recording, folder)
     with alone_until_compiled(kind.kernels) as first:
-        if first and kind.warm is None:
+        if first:
             return kind.work(task.arguments, task.recording, folder)
-        if first and kind.warm is not None:
-            _warm_elsewhere(kind.warm, task.arguments)
     return kind.work(task.arguments, task.recording, folder)
 
 
-def _warm_elsewhere(warm: Callable[[Namespace], None], arguments: Namespace) -> None:
-    """Compile in another process.
+def compiled_elsewhere(kernels: str, warm: Callable[[Any], None], arguments: Any) -> None:
+    """Compile in another process, unless this machine has compiled it before.
 
-    One that has compiled kernels itself rounds differently than those that load them.
+    A process that has compiled kernels itself rounds differently than those that load them.
+
+    Args:
+        kernels: names what ``warm(arguments)`` compiles.
+        warm: a function that another process can import.
+        arguments: can be pickled.
     """
-    given = pickle.dumps(sys.path) + pickle.dumps((warm, arguments))
-    words = [sys.executable, "-c", _WARM]
-    if subprocess.run(words, input=given, capture_output=True, check=False).returncode != 0:
-        warm(arguments)  # says why
+    with alone_until_compiled(kernels) as first:
+        if not first:
+            return
+        given = pickle.dumps(sys.path) + pickle.dumps((warm, arguments))
+        words = [sys.executable, "-c", _WARM]
+        if subprocess.run(words, input=given, capture_output=True, check=False).returncode != 0:
+            warm(arguments)  # says why
 
 
 def _complete(task: Task, inner: Path, figures: Figures) -> None:

@@ -20,6 +20,7 @@ from rs_localizer.io.images import Gray, read_any_image
 from rs_localizer.io.keypoints import read_keypoints
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.remote import is_url, url_name
 from rs_localizer.io.topics import COMPRESSED_IMAGE, CORRESPONDENCES
 from rs_localizer.offline.image_sources import image_topics
 from rs_localizer.offline.replay import Topics
@@ -197,7 +198,7 @@ def write_view(
     calibration, config = localizer.calibration, localizer.config
     assert calibration is not None  # without one there is no frame
     camera = calibration.camera(config.readout_time, config.scan_direction)
-    name = bag.path.resolve().name
+    name = url_name(bag.path) if is_url(bag.path) else Path(bag.path).resolve().name
     # The viewer keeps what its user has arranged by application: for each recording on its own.
     stream = rr.RecordingStream(f"{_APPLICATION} {name}", recording_id=name)
     items = list(shown(bag, topics))

@@ -99,7 +99,7 @@ def _judge(condition: Condition, summary: Summary[Sight]) -> Judgement:
     if (idle := out_of_service(condition.life_cycle)) is not None:
         return idle
     if not condition.wanted:
-        message = f"nobody listens to the {condition.output} or the debug image"
+        message = f"nobody subscribes to the {condition.output} or the debug image"
         return Judgement(Level.OK, State.IDLE, message)
     causes = [f"{item.topic}: {item.cause}" for item in condition.silence.values() if item.cause]
     if causes or not condition.silence:
@@ -247,7 +247,7 @@ class ImageNode(
             _LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.get_logger().info(
-            f"active with {self._description}; listening to images while somebody listens to "
+            f"active with {self._description}; subscribed to images while somebody subscribes to "
             f"{' or '.join(self._outputs.topics)}"
         )
 

@@ -151,10 +151,10 @@ def _wait_for_listeners(node: Any, publishers: Mapping[str, Any]) -> None:
         if time.monotonic() > deadline:
             if len(deaf) == len(publishers):
                 raise PlayerError(
-                    f"nobody listens to {' and '.join(deaf)}: start the node, or check its "
+                    f"nobody subscribes to {' and '.join(deaf)}: start the node, or check its "
                     "topics and ROS_DOMAIN_ID"
                 )
-            node.get_logger().warning(f"nobody listens to {', '.join(deaf)}")
+            node.get_logger().warning(f"nobody subscribes to {', '.join(deaf)}")
             return
         time.sleep(0.05)
 

@@ -266,5 +266,5 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
 def _heard(item: Silence) -> str:
     if not item.cause:
         quality = "reliable" if item.reliable else "best effort"
-        return f"messages come, {quality}" if item.heard else "no message yet"
+        return f"messages arrive, {quality}" if item.heard else "no message yet"
     return f"silent for {item.seconds:.0f} s: {item.cause}"

@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from rs_localizer.config import ImuUse, NodeConfig, Px4Odometry
 from rs_localizer.core.reasons import Notice
-from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
 from rs_localizer.pipeline.compiling import is_compiled
@@ -34,7 +34,7 @@ from rs_localizer.ros.localizer.health import (
     tell,
 )
 from rs_localizer.ros.localizer.transforms import Broadcaster
-from rs_localizer.ros.node.conversion import make_message, message_class
+from rs_localizer.ros.node.conversion import installed, make_message, message_class
 from rs_localizer.ros.node.health import Health
 from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.managed import ManagedNode
@@ -84,7 +84,11 @@ class Feed:
             Role.STATE: self._state_topic,
             Role.SAMPLES: self._samples_topic,
         }
-        return {name: make[item.role](item) for name, item in INPUTS.items()}
+        return {
+            name: make[item.role](item)
+            for name, item in INPUTS.items()
+            if not item.also or installed(*item.types)  # of packages that most do not have
+        }
 
     def take_config(self, config: NodeConfig) -> None:
         """Use these settings from the next frame on."""
@@ -108,7 +112,7 @@ class Feed:
             need = Need(_lacks_samples, self._frames.config.imu.wait)
             self._worker.process(item.topic, message, localize, need)
 
-        return Topic(message_class(item.type), take)
+        return Topic(installed(*item.types), take)
 
     def _samples_topic(self, item: Input) -> Topic:
         """A topic whose messages are all used here; frames wait for them."""
@@ -252,7 +256,6 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
 
     task = "localizer"
     lack = Notice.NO_POSE
-    faults = MapError
 
     def __init__(self, **options: Any) -> None:
         self._localizer: FrameLocalizer | None = None  # the worker's: here only to be read
@@ -276,7 +279,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         )
 
         def compiles() -> None:
-            with contextlib.suppress(MapError):  # of which on_configure tells, at once
+            with contextlib.suppress(ValueError):  # of which on_configure tells, at once
                 frames.load_map()
                 log.info(f"kernels are ready after {warm_up(frames):.1f} s")
 

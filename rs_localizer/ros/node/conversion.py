@@ -17,6 +17,16 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
+def installed(*type_names: str) -> Any:
+    """The rclpy class of the first of these types that is installed; None: none is."""
+    for name in type_names:
+        try:
+            return message_class(name)
+        except ImportError:
+            continue
+    return None
+
+
 def type_name(message_type: Any) -> str:
     """The name of an rclpy class, such as ``geometry_msgs/msg/Pose``."""
     return f"{message_type.__module__.split('.')[0]}/msg/{message_type.__name__}"

@@ -309,7 +309,7 @@ class Inputs:
             cause, mismatch = self._cause(self._subscriptions[name])
         if mismatch:
             self._refusals.notice(
-                Notice.INCOMPATIBLE_PUBLISHER, f"nothing is heard on {topic}: {cause}"
+                Notice.INCOMPATIBLE_PUBLISHER, f"no message arrives on {topic}: {cause}"
             )
         reliability, _ = policies(self._subscriptions[name].qos_profile)
         reliable = reliability == ReliabilityPolicy.RELIABLE

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation, Slerp
 
 from rs_localizer.io.transforms import TransformError, TransformTree, from_numbers
 
@@ -84,16 +83,6 @@ def test_the_same_as_tf2(tree, target, source, stamp_ns, text):
     tolerance = 1e-15 if stamp_ns == 1_012_345_678 else 0.0
     assert np.allclose(found.translation, expected.translation, rtol=0.0, atol=tolerance)
     assert np.allclose(found.rotation, expected.rotation, rtol=0.0, atol=tolerance)
-
-
-def test_between_two_samples(tree):
-    # By scipy: positions on a line, rotations by slerp, the shorter way round.
-    found = tree.lookup("odom", "base", 1_012_345_678)
-    share = 0.012345678 / 0.033333333
-    quaternions = [(0.0, 0.0, 0.6, 0.8), (0.0, 0.1, -0.6, -0.793725393319377)]
-    slerp = Slerp([0.0, 1.0], Rotation.from_quat(quaternions))
-    assert np.allclose(found.rotation, slerp(share).as_matrix(), atol=1e-12)
-    assert np.allclose(found.translation, [1.0 + 0.1 * share, 2.0 + 0.1 * share, 0.1], atol=1e-12)
 
 
 def test_what_moves(tree):

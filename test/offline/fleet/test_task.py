@@ -86,19 +86,6 @@ def test_a_fault_is_a_reason_and_leaves_nothing(tmp_path, fault, reason):
     assert list((given.out / PARTIAL).iterdir()) == []
 
 
-def test_another_recording_is_another_result(tmp_path):
-    old = task(tmp_path)
-    perform(old)
-    old.recording.write_text("hello there")
-    new = task(tmp_path)
-    assert new.identity != old.identity
-    assert finished(new) is None
-    outcome = perform(new)
-    assert outcome.figures is not None
-    assert outcome.figures["letters"] == 11
-    assert (new.folder / "letters").read_text() == "11"
-
-
 def test_identity_is_of_settings_files_and_times(tmp_path):
     recording = tmp_path / "bag"
     recording.mkdir()

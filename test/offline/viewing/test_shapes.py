@@ -8,7 +8,7 @@ from scipy.stats import chi2
 import rs_localizer as rsl
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.outputs import Localized, Pose
-from rs_localizer.offline.viewing.shapes import ellipsoid, eye, readout_path, reproject
+from rs_localizer.offline.viewing.shapes import ellipsoid, readout_path, reproject
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = rsl.Camera(width=640, height=480, K=K, readout_time=0.03)
@@ -49,12 +49,6 @@ def test_the_ellipsoid_holds_95_percent():
     )
 
 
-def test_a_flat_covariance_is_a_flat_ellipsoid():
-    shape = ellipsoid(np.diag([4.0, 0.0, 1.0]) - 1e-18 * np.eye(3))
-    assert shape.half_sizes[0] == 0.0
-    assert np.linalg.norm(shape.quaternion) == pytest.approx(1.0)
-
-
 def test_reprojections_are_of_the_row_that_sees_the_point():
     """At a depth of 2 m, where a metre is 250 px; at tau the camera has gone 0.2 tau to the right,
     so that the point appears as much to the left."""
@@ -73,12 +67,3 @@ def test_the_way_within_the_readout_is_that_of_the_camera():
     way = readout_path(localized(np.zeros((0, 3)), np.zeros((0, 2))))
     np.testing.assert_allclose(way[4], [0.0, 0.0, -1.0], atol=1e-12)
     assert np.linalg.norm(way[-1] - way[0]) == pytest.approx(0.2)
-
-
-def test_the_eye_sees_camera_and_points():
-    points = np.array([[0.1, 0.0, 1.0], [-0.1, 0.0, 1.0], [0.0, 0.1, 1.0]])
-    look = eye([localized(points, np.zeros((3, 2)))])
-    ahead = look.target - look.position
-    assert ahead @ np.array([0.0, 0.0, 1.0]) > 0.0
-    assert look.depth == pytest.approx(2.0, abs=0.1)
-    np.testing.assert_allclose(look.up, [0.0, -1.0, 0.0])

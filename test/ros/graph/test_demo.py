@@ -56,8 +56,7 @@ def children(pid: int) -> list[int]:
     return [int(word) for word in found.stdout.split()]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_no_process_behind(tmp_path, number):
+def test_a_signal_leaves_no_process_behind(tmp_path):
     with (tmp_path / "log").open("w") as log:
         demo = subprocess.Popen(
             [*DEMO, "--out", str(tmp_path / "out")], stdout=log, stderr=log, start_new_session=True
@@ -67,8 +66,8 @@ def test_a_signal_leaves_no_process_behind(tmp_path, number):
         assert demo.poll() is None, (tmp_path / "log").read_text()
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    demo.send_signal(number)
-    assert demo.wait(30.0) == 128 + number
+    demo.send_signal(signal.SIGINT)
+    assert demo.wait(30.0) == 130
     assert (tmp_path / "log").read_text().endswith("rs_localizer demo: interrupted\n")
     for node in nodes:
         with pytest.raises(ProcessLookupError):

@@ -97,7 +97,7 @@ def test_poses_of_a_node_are_counted(tmp_path, start_node):
     # It listens to /cam/correspondences: nobody hears the recording.
     assert (player.returncode, output) == (1, "")
     assert errors.startswith(
-        "rs_localizer replay: nobody listens to /camera_info and /correspondences: start the node"
+        "rs_localizer replay: nobody subscribes to /camera_info and /correspondences: start the "
     )
     assert errors.count("\n") == 1
     remapped = [f"{topic}:=/{topic}" for topic in ("camera_info", "correspondences")]

@@ -1,15 +1,11 @@
 """The first start on a machine: while kernels are compiled, the node answers and says so."""
 
-import time
 from typing import Any
 
-import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import GetParameters
-
-SOON = 5.0  # s; compiling takes half a minute
 
 
 def said(peer: Any) -> list[tuple[bytes, str]]:
@@ -25,38 +21,21 @@ def said(peer: Any) -> list[tuple[bytes, str]]:
     return found
 
 
-@pytest.mark.parametrize("autostart", [True, False])
-def test_services_answer_while_kernels_are_compiled(start_node, peer, tmp_path, autostart):
+def test_services_answer_while_kernels_are_compiled(start_node, peer, tmp_path):
     states = said(peer)
-    chosen = f"autostart:={str(autostart).lower()}"
-    node = start_node("-p", chosen, XDG_CACHE_HOME=str(tmp_path / "cache"))
-    if not autostart:
-        client = peer.node.create_client(ChangeState, "/rs_localizer/change_state")
-        assert peer.spin_until(client.service_is_ready)
-        peer.spin_until(lambda: False, 0.3)
-        request = ChangeState.Request()
-        request.transition.id = Transition.TRANSITION_CONFIGURE
-        configured = client.call_async(request)
+    node = start_node(XDG_CACHE_HOME=str(tmp_path / "cache"))
     node.wait_for_log("compiling kernels")
     service = "/rs_localizer/get_parameters"
     first = GetParameters.Request(names=["solver"])
-    peer.call(GetParameters, service, first)  # has found the node
-    times = []
     # A few of some hundred are compiled by then.
-    while len(times) < 3 or len(list(tmp_path.rglob("*.nbc"))) < 4:
-        started = time.monotonic()
+    while len(list(tmp_path.rglob("*.nbc"))) < 4:
         values = peer.call(GetParameters, service, first).values
         assert [value.string_value for value in values] == ["r6p_vcwt"]
         state = peer.call(GetState, "/rs_localizer/get_state", GetState.Request())
         assert state.current_state.label == "unconfigured"
-        times.append(time.monotonic() - started)
-    # The first ones wait for discovery.
-    assert min(times) < SOON
     # Diagnostics come once a second, and are heard when they have found us.
     assert peer.spin_until(lambda: (b"\1", "compiling") in states)
     assert "kernels are ready" not in node.log
-    if not autostart:
-        assert not configured.done()
     assert node.stop() == 0
     assert "Traceback" not in node.log
 

@@ -1,29 +1,19 @@
 """An IMU beside the camera, heard by a node in its own process: as offline, or as without it."""
 
-import importlib
-import importlib.util
 import re
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.qos import QoSProfile
-from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
+import robot as around
+from robot import ENVIRONMENT, KINDS, SHUTTER, replayed
 
 from rs_localizer.cli.main import main as command_line
-from rs_localizer.io.bags import open_bag, typestore
-from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import TYPES
-from rs_localizer.ros.node.conversion import copy_message, message_class
+from rs_localizer.ros.node.conversion import copy_message
 
-STAND_IN = Path(__file__).parents[1] / "stand_in"
-INSTALLED = importlib.util.find_spec("tf2_ros") is not None
-ENVIRONMENT = {} if INSTALLED else {"PYTHONPATH": str(STAND_IN)}
-SHUTTER = ("-p", "readout_time:=0.03")
 # The node's inputs are best effort, and a busy machine loses messages: here, none may be lost.
 RELIABLE = [
     word
@@ -52,42 +42,13 @@ def items(recording) -> list[Item]:
         ]
 
 
-KINDS = {"/imu": Imu, "/camera_info": CameraInfo, "/correspondences": PointCloud2}
-
-
-class Robot:
-    """Sends what the node needs, and keeps what it answers and what it says of itself."""
+class Robot(around.Robot):
+    """One with an IMU."""
 
     def __init__(self, peer: Any, tf2_ros: Any) -> None:
-        self.peer = peer
-        self.answers: dict[str, list[bytes]] = {name: [] for name in TYPES}
-        self.values: dict[str, str] = {}
+        super().__init__(peer, "/imu")
         self._sent = 0
-        for name, kind in TYPES.items():
-            peer.node.create_subscription(
-                message_class(kind), f"/rs_localizer/{name}", self.answers[name].append,
-                QoSProfile(depth=100), raw=True,
-            )  # fmt: skip
-        peer.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_status, 10)
-        self._publishers = {
-            topic: peer.node.create_publisher(kind, topic, QoSProfile(depth=500))
-            for topic, kind in KINDS.items()
-        }
         self._static = tf2_ros.StaticTransformBroadcaster(peer.node)
-
-    def _take_status(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name.endswith(": localizer"):
-                self.values = {item.key: item.value for item in status.values}
-
-    def connect(self) -> None:
-        def connected() -> bool:
-            return all(p.get_subscription_count() for p in self._publishers.values()) and all(
-                self.peer.node.count_publishers(f"/rs_localizer/{name}") for name in TYPES
-            )
-
-        assert self.peer.spin_until(connected), "the node was not found"
-        self.peer.spin_until(lambda: False, 0.3)  # the other side has to find us, too
 
     def mount(self, recording: Path) -> None:
         with open_bag(recording) as bag:
@@ -95,25 +56,25 @@ class Robot:
         transform = message.transforms[0]
         self._static.sendTransform(copy_message(transform, "geometry_msgs/msg/TransformStamped"))
 
-    def greet(self, items: list[Item], listens: bool = True) -> None:
-        """The camera, and the first reading, at which the node begins to listen to TF, if it can.
+    def greet(self, items: list[Item]) -> None:
+        """The camera, and the first reading, at which the node begins to listen to TF.
 
         Until it does: it may still have been looking for us.
         """
-        listening = False
-        for _ in range(20 if listens else 1):
+        for _ in range(20):
             for topic in ("/camera_info", "/imu"):
-                self.send(next(item for item in items if item[0] == topic))
-            listening = self.peer.spin_until(
-                lambda: self.peer.node.count_subscribers("/tf_static"), 1.0
-            )
-            if listening:
+                self.pass_on(next(item for item in items if item[0] == topic))
+            if self.peer.spin_until(self._is_heard, 1.0):
                 break
-        assert listening == listens
+        else:
+            raise AssertionError("the node does not listen to TF")
         self.peer.spin_until(lambda: False, 1.0)
 
-    def send(self, item: Item) -> None:
-        self._publishers[item[0]].publish(item[2])
+    def _is_heard(self) -> bool:
+        return bool(self.peer.node.count_subscribers("/tf_static"))
+
+    def pass_on(self, item: Item) -> None:
+        self.publishers[item[0]].publish(item[2])
         self._sent += item[0] == "/correspondences"
 
     def wait_for_answers(self) -> None:
@@ -123,31 +84,19 @@ class Robot:
             f"{len(answered)} of {self._sent} frames: {self.values}"
         )
 
-    def play(self, items: list[Item], delay: Callable[[Item], float] = lambda item: 0.0) -> None:
-        """Send what was recorded in its order, as if some had come so many seconds later.
-
-        Frames come one by one: this machine may be busy, and the newest would win.
-        """
-        order = sorted((item[1] * 1e-9 + delay(item), i) for i, item in enumerate(items))
-        for _, i in order:
-            if items[i][0] == "/correspondences":
+    def play(self, items: list[Item]) -> None:
+        """Send in this order, frames one by one: of those that wait the newest would win."""
+        for item in items:
+            if item[0] == "/correspondences":
                 self.wait_for_answers()
-            self.send(items[i])
+            self.pass_on(item)
         self.wait_for_answers()
-
-    def bytes_of(self, name: str) -> dict[int, bytes]:
-        """What the node said on a topic, by stamp."""
-        received = [typestore().deserialize_cdr(d, TYPES[name]) for d in self.answers[name]]
-        return {stamp_ns(m): bytes(typestore().serialize_cdr(m, TYPES[name])) for m in received}
 
 
 @pytest.fixture
-def robot(peer, monkeypatch) -> Iterator[Robot]:
-    if not INSTALLED:
-        monkeypatch.syspath_prepend(str(STAND_IN))
-    yield Robot(peer, importlib.import_module("tf2_ros"))
-    if not INSTALLED:
-        del sys.modules["tf2_ros"]
+def robot(peer) -> Iterator[Robot]:
+    with around.tf2_ros() as tf2_ros:
+        yield Robot(peer, tf2_ros)
 
 
 def at_frames(items: list[Item], late: float) -> list[list[Item]]:
@@ -161,21 +110,6 @@ def at_frames(items: list[Item], late: float) -> list[list[Item]]:
     return parts
 
 
-def offline(recording: Path, out: Path, *words: str) -> dict[str, dict[int, bytes]]:
-    """What replay says of it, by topic and stamp."""
-    # In a process of its own: what other tests have compiled in this one may round differently.
-    replay = ["replay", str(recording), "--out", str(out), *SHUTTER, *words]
-    subprocess.run([sys.executable, "-m", "rs_localizer", *replay], check=True, capture_output=True)
-    with open_bag(out / "result") as bag:
-        return {
-            name: {
-                stamp_ns(m): bytes(typestore().serialize_cdr(m, kind))
-                for _, _, m in bag.messages([f"/rs_localizer/{name}"])
-            }
-            for name, kind in TYPES.items()
-        }
-
-
 def test_node_and_replay_say_the_same(recording, items, tmp_path, start_node, robot):
     start_node(*SHUTTER, *RELIABLE, "-p", "imu.wait:=1.0", **ENVIRONMENT)
     robot.connect()
@@ -185,11 +119,11 @@ def test_node_and_replay_say_the_same(recording, items, tmp_path, start_node, ro
     assert robot.peer.spin_until(lambda: "IMU" in robot.values)
     used = (robot.values["IMU"], robot.values["IMU used (share of the last frames)"])
     assert used == ("used", "100%"), robot.values
-    both = offline(recording, tmp_path / "both")
-    alone = offline(recording, tmp_path / "alone", "--no-imu")
+    both = replayed(recording, tmp_path / "both", *SHUTTER)
+    alone = replayed(recording, tmp_path / "alone", *SHUTTER, "--no-imu")
     for name in TYPES:
         assert len(both[name]) == FRAMES
-        assert robot.bytes_of(name) == both[name]
+        assert robot.answered(name) == both[name]
     assert both["twist"] != alone["twist"]
     assert float(robot.values["IMU rate (Hz)"]) == pytest.approx(400.0)
     assert re.match(r"(-?\d+\.\d+ ){3}\+- ", robot.values["IMU bias (deg/s, camera axes)"])
@@ -203,9 +137,9 @@ def test_an_imu_that_is_late_is_not_waited_for(recording, items, tmp_path, start
     robot.greet(items)
     for part in at_frames(items, 0.1):
         robot.play(part)
-    alone = offline(recording, tmp_path / "alone", "--no-imu")
+    alone = replayed(recording, tmp_path / "alone", *SHUTTER, "--no-imu")
     for name in TYPES:
-        assert robot.bytes_of(name) == alone[name]
+        assert robot.answered(name) == alone[name]
     node.wait_for_log("imu_late: the IMU is not used: IMU messages arrive later than imu.wait")
     assert robot.peer.spin_until(lambda: "IMU not used: imu_late" in robot.values)
     assert "older than the last row" in robot.values["IMU"]

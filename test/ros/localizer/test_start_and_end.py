@@ -23,9 +23,7 @@ Start = Callable[..., Any]
 @pytest.mark.parametrize(
     "signals",
     [
-        (signal.SIGINT,),
         (signal.SIGTERM,),
-        (signal.SIGINT, signal.SIGINT),
         (signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGTERM),
     ],
 )
@@ -41,8 +39,7 @@ def test_signals_end_it_in_order(start_node, signals):
 SLOW = "import pathlib, time; pathlib.Path(__file__).with_suffix('.seen').touch(); time.sleep(60)"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("slow", ["numba", "rclpy", "cv2"])
+@pytest.mark.parametrize(("slow", "number"), [("numba", signal.SIGINT), ("rclpy", signal.SIGTERM)])
 def test_signals_while_it_imports(start_node, tmp_path, number, slow):
     (tmp_path / f"{slow}.py").write_text(SLOW)
     node = start_node(PYTHONPATH=f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
@@ -62,8 +59,7 @@ def test_missing_ros_is_said_in_one_line(start_node, tmp_path):
     assert node.log.count("\n") == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_while_it_compiles(start_node, tmp_path, number):
+def test_signals_while_it_compiles(start_node, tmp_path):
     cache = tmp_path / "cache"
     node = start_node(XDG_CACHE_HOME=str(cache))
     deadline = time.monotonic() + 60.0
@@ -71,9 +67,7 @@ def test_signals_while_it_compiles(start_node, tmp_path, number):
     while not list(cache.rglob("*.nbc")):
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    start = time.monotonic()
-    assert node.stop(number, number) == 0
-    assert time.monotonic() - start < 10.0
+    assert node.stop(signal.SIGINT, signal.SIGINT) == 0
     assert "active" not in node.log
     assert "Traceback" not in node.log
 
@@ -81,9 +75,7 @@ def test_signals_while_it_compiles(start_node, tmp_path, number):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("-p", "solver:=epnp"), "solver must be one of .*r6p, .*; got 'epnp'"),
         (("-p", "readout_time:=0"), r"readout_time must be of type float, got 0 \(write 0\.0\)"),
-        (("-p", "inlier_threshold:=-1.0"), "inlier_threshold out of range"),
         (("--params-file", "/nowhere.yaml"), "/nowhere.yaml"),
     ],
 )
@@ -99,7 +91,6 @@ def test_started_with_bad_parameters(start_node, arguments, text):
 @pytest.mark.parametrize(
     ("override", "text"),
     [
-        ("/correspondences.subscription.reliability:=foo", "not activated: .*reliability.*foo"),
         ("/correspondences.subscription.depth:=ten", "not activated: .*ten"),
         ("/rs_localizer/pose.publisher.depth:=ten", "not configured:"),
     ],

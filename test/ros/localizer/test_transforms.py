@@ -5,57 +5,49 @@ import importlib.util
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
+from robot import tf2_ros
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.io.outputs import Localized, Pose
 from rs_localizer.io.transforms import TransformError
 from rs_localizer.ros.localizer.transforms import Broadcaster, check
 
-STAND_IN = Path(__file__).parents[1] / "stand_in"
 Notes = list[tuple[str, str]]
 HALF_TURN = (0.0, 0.0, 1.0, 0.0)
 
 
 @pytest.fixture
-def tf2_ros(monkeypatch) -> Iterator[ModuleType]:
-    installed = importlib.util.find_spec("tf2_ros") is not None
-    if not installed:
-        monkeypatch.syspath_prepend(str(STAND_IN))
-    yield importlib.import_module("tf2_ros")
-    if not installed:
-        del sys.modules["tf2_ros"]
-
-
-@pytest.fixture
-def robot(tf2_ros, peer) -> Any:
+def robot(peer) -> Any:
     """Sends transforms, and hears what comes on TF."""
-    moving = tf2_ros.TransformBroadcaster(peer.node)
-    static: list[Any] = []
+    with tf2_ros() as tf2:
+        moving = tf2.TransformBroadcaster(peer.node)
+        static: list[Any] = []
 
-    def send(parent: str, child: str, x: float, stamp_ns: int = 0, turn: Any = HALF_TURN) -> None:
-        item = TransformStamped(child_frame_id=child)
-        item.header.frame_id = parent
-        item.header.stamp.sec, item.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        item.transform.translation.x = x
-        q = item.transform.rotation
-        q.x, q.y, q.z, q.w = turn
-        if stamp_ns:
-            moving.sendTransform(item)
-        else:  # tf2_ros of Jazzy sends the first transform of a child for ever
-            static.append(tf2_ros.StaticTransformBroadcaster(peer.node))
-            static[-1].sendTransform(item)
+        def send(
+            parent: str, child: str, x: float, stamp_ns: int = 0, turn: Any = HALF_TURN
+        ) -> None:
+            item = TransformStamped(child_frame_id=child)
+            item.header.frame_id = parent
+            item.header.stamp.sec, item.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            item.transform.translation.x = x
+            q = item.transform.rotation
+            q.x, q.y, q.z, q.w = turn
+            if stamp_ns:
+                moving.sendTransform(item)
+            else:  # tf2_ros of Jazzy sends the first transform of a child for ever
+                static.append(tf2.StaticTransformBroadcaster(peer.node))
+                static[-1].sendTransform(item)
 
-    buffer = tf2_ros.Buffer()
-    listener = tf2_ros.TransformListener(buffer, peer.node)
-    yield SimpleNamespace(send=send, buffer=buffer)
-    listener.unregister()
+        buffer = tf2.Buffer()
+        listener = tf2.TransformListener(buffer, peer.node)
+        yield SimpleNamespace(send=send, buffer=buffer)
+        listener.unregister()
 
 
 @pytest.fixture
@@ -131,9 +123,7 @@ def test_map_to_odom(made, robot, peer):
     robot.send("odom", "base_link", 2.0, 6 * second)
     known(node, peer, "odom", "base_link", 6 * second)
     # Odometry comes later than the frame: nothing waits, and it is sent when it has come.
-    started = time.monotonic()
     node.publish(frame(7 * second, x=10.0), node.config)
-    assert time.monotonic() - started < 0.4
     robot.send("odom", "base_link", 3.0, 8 * second)
     sent = heard(robot, peer, "map", "odom", None)
     assert sent.header.stamp.sec == 7

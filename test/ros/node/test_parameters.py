@@ -5,12 +5,11 @@ from collections.abc import Iterator
 
 import pytest
 import rclpy
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rs_localizer.config import NodeConfig, VelocityPrior
+from rs_localizer.config import NodeConfig
 from rs_localizer.ros.node import parameters
 from rs_localizer.settings import settings
 
@@ -59,34 +58,6 @@ def test_every_setting_is_a_parameter_with_its_default(recorder):
         assert type(value) is type(setting.default)
 
 
-def test_descriptions_ranges_and_choices(recorder):
-    def describe(name: str) -> ParameterDescriptor:
-        return recorder.node.describe_parameter(name)
-
-    for name, setting in settings().items():
-        assert describe(name).description == setting.description
-        assert describe(name).read_only == setting.read_only
-    threshold = describe("inlier_threshold").floating_point_range[0]
-    assert (threshold.from_value, threshold.to_value) == (0.01, 1000.0)
-    seed = describe("seed").integer_range[0]
-    assert (seed.from_value, seed.to_value) == (0, 2**31 - 1)
-    assert describe("scan_direction").additional_constraints == (
-        "one of top_to_bottom, bottom_to_top, left_to_right, right_to_left"
-    )
-    assert describe("autostart").read_only
-    assert not describe("solver").read_only
-
-
-def test_several_at_once_are_one_change(recorder):
-    change = {"solver": "p3p", "seed": 4, "velocity_prior__linear": 0.5}
-    assert recorder.set_all(**change) == (True, "")
-    expected = NodeConfig(
-        solver="p3p", seed=4, velocity_prior=VelocityPrior(VelocityPrior().angular, 0.5)
-    )
-    assert recorder.applied == [expected]
-    assert parameters.read(recorder.node, NodeConfig) == expected
-
-
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -124,12 +95,3 @@ def test_what_is_refused_stays_as_it_was(recorder, change, reason):
 def test_bad_values_at_start(context, assignment, text):
     with pytest.raises(ValueError, match=text):
         Recorder(context, "-p", assignment)
-
-
-def test_numbers_in_a_row(context):
-    recorder = Recorder(context, "-p", "gravity_in_map:=[0.0, 1.0, 0.0]")
-    assert recorder.config.gravity_in_map == (0.0, 1.0, 0.0)
-    assert recorder.set_all(gravity_in_map=[0.0, -9.81, 0.0]) == (True, "")
-    assert recorder.applied[-1].gravity_in_map == (0.0, -9.81, 0.0)
-    assert recorder.set_all(gravity_in_map=[0.0, 1.0])[1].startswith("gravity_in_map must be 3")
-    recorder.node.destroy_node()

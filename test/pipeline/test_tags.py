@@ -1,0 +1,229 @@
+"""Tags of AprilRobotics' own detector: its pixels and corners, the poses that come of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rs_localizer.simulation.walls
+from rs_localizer.cli.main import main
+from rs_localizer.config import NodeConfig
+from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.detections import APRILTAG_TYPE, ISAAC_TYPE, read_detections
+from rs_localizer.io.images import read_any_image
+from rs_localizer.io.messages import MessageError
+from rs_localizer.io.outputs import Localized
+from rs_localizer.io.trajectories import read_tum
+from rs_localizer.markers.detection import MarkerDetector
+from rs_localizer.markers.map_files import read_marker_map
+from rs_localizer.pipeline.frames import FrameLocalizer
+from rs_localizer.pipeline.refusal import Refusal
+
+READOUT = 0.02
+FAMILY = "tag36h11"
+
+
+def array(kind: str, header: Any, tags: list[tuple[str, int, np.ndarray]]) -> Any:
+    """An AprilTagDetectionArray of either package; corners as they come."""
+    package = kind.split("/")[0]
+    point = {"isaac_ros_apriltag_interfaces": "geometry_msgs"}.get(package, package)
+
+    def at(x: float, y: float) -> Any:
+        z = {"z": 0.0} if point == "geometry_msgs" else {}
+        return make_message(f"{point}/msg/Point", x=float(x), y=float(y), **z)
+
+    def detection(family: str, number: int, corners: np.ndarray) -> Any:
+        common: dict[str, Any] = {
+            "family": family, "id": number, "corners": [at(*corner) for corner in corners],
+        }  # fmt: skip
+        middle = at(*corners.mean(axis=0))
+        if package == "apriltag_msgs":
+            more = {"hamming": 0, "goodness": 0.0, "decision_margin": 50.0, "centre": middle}
+            more["homography"] = np.eye(3).ravel()
+        else:
+            pose = make_message(
+                "geometry_msgs/msg/Pose",
+                position=at(0, 0), orientation=make_message(
+                    "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0
+                ),
+            )  # fmt: skip
+            pose = make_message(
+                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)
+            )
+            pose = make_message(
+                "geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=pose
+            )
+            more = {"center": middle, "pose": pose}
+        return make_message(f"{package}/msg/AprilTagDetection", **common, **more)
+
+    return make_message(kind, header=header, detections=[detection(*tag) for tag in tags])
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("tags") / "walls"
+    words = ["--images", "--duration", "0.2", "--readout-time", str(READOUT), "--format", "png"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rs_localizer.simulation.walls, "_FAMILY", "apriltag_36h11")
+        assert main(["simulate", str(path), *words, "--trajectory", "tum_vi_room5"]) == 0
+    return path
+
+
+def images(walls: Path) -> list[tuple[Any, np.ndarray]]:
+    with open_bag(walls) as bag:
+        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("Image"))
+        return [(m.header, read_any_image(m).pixels) for _, _, m in bag.messages([topic])]
+
+
+def of_apriltag(walls: Path) -> list[Any]:
+    """What apriltag_ros publishes of the images: ``p`` of the library, copied."""
+    library = pytest.importorskip("pupil_apriltags", reason="needs pupil-apriltags")
+    detector = library.Detector(families=FAMILY, quad_decimate=1.0)
+    return [
+        array(
+            APRILTAG_TYPE,
+            header,
+            [(FAMILY, tag.tag_id, tag.corners) for tag in detector.detect(image)],
+        )
+        for header, image in images(walls)
+    ]
+
+
+def test_pixels_and_corners_are_those_of_our_own_detector(walls: Path) -> None:
+    ours = MarkerDetector(read_marker_map(walls / "marker_map.yaml"))
+    offsets = []
+    for message, (_, image) in zip(of_apriltag(walls), images(walls), strict=True):
+        found = read_detections(message)
+        (seen,) = (item for item in ours.detect(image).markers if "36h11" in item.family.name)
+        known = dict(zip(found.ids.tolist(), found.corners, strict=True))
+        for number, quad, exact in zip(seen.ids.tolist(), seen.quads, seen.found, strict=True):
+            if number in known and exact.all():
+                offsets.append(known[number] - quad)
+    assert len(offsets) > 20
+    apart = np.array(offsets).reshape(-1, 2)
+    # Another pixel's corner would be off by 0.5 px, another corner of the tag by tens.
+    assert np.abs(np.median(apart, axis=0)).max() < 0.1
+    assert np.median(np.linalg.norm(apart, axis=1)) < 0.4
+
+
+def localizer(walls: Path, notices: list[tuple[str, str]]) -> FrameLocalizer:
+    config = NodeConfig(readout_time=READOUT, marker_map=str(walls / "marker_map.yaml"))
+    made = FrameLocalizer(config, lambda name, text: notices.append((name, text)))
+    made.load_map()
+    with open_bag(walls) as bag:
+        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
+        _, _, info = next(iter(bag.messages([topic])))
+    made.calibrate(read_camera_info(info))
+    return made
+
+
+def written(walls: Path, path: Path, messages: list[Any]) -> Path:
+    """A recording of detections and camera_info."""
+    with open_bag(walls) as bag, BagWriter(path) as writer:
+        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
+        for _, stamp_ns, info in bag.messages([topic]):
+            writer.write("/camera_info", info, stamp_ns)
+        for message in messages:
+            stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            writer.write("/detections", message, stamp_ns)
+    return path
+
+
+def test_poses_are_those_of_our_own_detector_within_their_covariances(
+    walls: Path, tmp_path: Path
+) -> None:
+    marker_map = walls / "marker_map.yaml"
+    assert main(["detect", str(walls), "--map", str(marker_map), "--out", str(tmp_path / "o")]) == 0
+    shutter = ["-p", f"readout_time:={READOUT}"]
+    assert main(["replay", str(tmp_path / "o"), *shutter, "--out", str(tmp_path / "own")]) == 0
+    path = written(walls, tmp_path / "tags", of_apriltag(walls))
+    words = [*shutter, "-p", f"marker_map:={marker_map}"]
+    assert main(["replay", str(path), *words, "--out", str(tmp_path / "theirs")]) == 0
+    own, theirs = (read_tum(tmp_path / name / "poses.txt") for name in ("own", "theirs"))
+    common, a, b = np.intersect1d(own.stamps_ns, theirs.stamps_ns, return_indices=True)
+    assert len(common) == len(images(walls))
+    apart = own.positions[a] - theirs.positions[b]
+    deviations = []
+    for name in ("own", "theirs"):
+        with open_bag(tmp_path / name / "result") as bag:
+            said = bag.messages(["/rs_localizer/pose_with_covariance"])
+            blocks = [m.pose.covariance.reshape(6, 6)[:3, :3] for _, _, m in said]
+            deviations.append(np.array(blocks))
+    both = deviations[0] + deviations[1]
+    distances = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(both), apart)
+    assert np.median(distances) < 7.8  # 95 % of chi-squared with 3 degrees of freedom
+
+
+def corners_of(walls: Path, order: list[int], shift: float = 0.5) -> list[list[Any]]:
+    """Our own detector's quads as tags whose corners come in this order of apriltag's."""
+    ours = MarkerDetector(read_marker_map(walls / "marker_map.yaml"))
+    found = []
+    for header, image in images(walls)[:4]:
+        tags = []
+        for seen in ours.detect(image).markers:
+            for number, quad in zip(seen.ids.tolist(), seen.quads, strict=True):
+                tags.append((FAMILY, number, (quad[::-1] + shift)[order]))
+        found.append([header, tags])
+    return found
+
+
+@pytest.mark.parametrize("kind", [APRILTAG_TYPE, ISAAC_TYPE])
+def test_both_messages_are_read_by_their_fields(walls: Path, kind: str) -> None:
+    notices: list[tuple[str, str]] = []
+    made = localizer(walls, notices)
+    for header, tags in corners_of(walls, [0, 1, 2, 3]):
+        message = array(kind, header, [*tags, ("36h11", 500, tags[0][2])])
+        result = made.localize_detections(message)
+        assert isinstance(result, Localized), result
+        assert set(result.inliers.dtype.names or ()) >= {"x", "u", "id", "residual"}
+    assert ("unknown_markers", "the detector has found tag36h11 500, which the map does not have") \
+        in notices  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("order", "named"),
+    [
+        ([3, 2, 1, 0], "upper left, upper right, lower right, lower left"),
+        ([1, 2, 3, 0], "lower right, upper right, upper left, lower left"),
+        ([2, 3, 0, 1], "upper right, upper left, lower left, lower right"),
+        ([0, 3, 2, 1], "lower left, upper left, upper right, lower right"),
+    ],
+)
+def test_another_order_of_corners_is_named(walls: Path, order: list[int], named: str) -> None:
+    made = localizer(walls, [])
+    for header, tags in corners_of(walls, order):
+        result = made.localize_detections(array(APRILTAG_TYPE, header, tags))
+        assert isinstance(result, Refusal)
+        assert result.reason == "bad_detections"
+        assert result.detail == (
+            f"the map fits corners in the order {named}; apriltag's is lower left, lower right, "
+            "upper right, upper left"
+        )
+
+
+def test_what_cannot_be_used_is_refused(walls: Path, tmp_path: Path, capsys: Any) -> None:
+    ((header, tags), *_) = corners_of(walls, [0, 1, 2, 3])
+    made = localizer(walls, [])
+    for wrong, reason in (
+        (array(APRILTAG_TYPE, header, []), "empty_cloud"),
+        (array(APRILTAG_TYPE, header, [("tag25h9", 3, tags[0][2])]), "no_matches"),
+        (array(APRILTAG_TYPE, header, [tags[0], tags[0]]), "no_matches"),
+        (array(APRILTAG_TYPE, header, [(*tags[0][:2], tags[0][2] * np.nan)]), "bad_detections"),
+        (SimpleNamespace(header=header), "bad_detections"),
+    ):
+        result = made.localize_detections(wrong)
+        assert isinstance(result, Refusal)
+        assert result.reason == reason
+    with pytest.raises(MessageError, match="a detection has 3 corners, not 4"):
+        read_detections(
+            SimpleNamespace(header=header, detections=[SimpleNamespace(corners=[1, 2, 3])])
+        )
+    assert isinstance(FrameLocalizer(NodeConfig()).localize_detections(None), Refusal)
+    path = written(walls, tmp_path / "tags", [array(APRILTAG_TYPE, header, tags)])
+    assert main(["replay", str(path), "--out", str(tmp_path / "out")]) == 1
+    assert "-p marker_map:=FILE says where tags are" in capsys.readouterr().err

@@ -1,0 +1,155 @@
+"""A robot around the localizer in its own process: what it sends, and what it hears of the node."""
+
+import contextlib
+import importlib
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.bags import BagWriter, open_bag, typestore
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.outputs import TYPES
+from rs_localizer.ros.node.conversion import copy_message, message_class
+from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.recording import write_simulated
+from rs_localizer.simulation.scene import room
+from rs_localizer.simulation.true_motion import ConstantVelocity
+
+READOUT_TIME = 0.03
+SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
+K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
+START_NS = 10**12
+KINDS = {"/camera_info": CameraInfo, "/correspondences": PointCloud2, "/imu": Imu}
+STAND_IN = Path(__file__).parents[1] / "stand_in"
+INSTALLED = importlib.util.find_spec("tf2_ros") is not None
+# Of a node that needs TF.
+ENVIRONMENT = {} if INSTALLED else {"PYTHONPATH": str(STAND_IN)}
+
+
+@contextlib.contextmanager
+def tf2_ros() -> Iterator[Any]:
+    """tf2_ros, or its stand-in where it is not installed."""
+    if not INSTALLED:
+        sys.path.insert(0, str(STAND_IN))
+    try:
+        yield importlib.import_module("tf2_ros")
+    finally:
+        if not INSTALLED:
+            sys.path.remove(str(STAND_IN))
+            del sys.modules["tf2_ros"]
+
+
+def record(
+    path: Path, known: float = 1.0, count: int = 12, more: Sequence[tuple[str, Any]] = ()
+) -> Path:
+    """A flight, a calibration that knows a part of the distortion, and more messages before."""
+    distortion = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
+    camera = Camera(640, 480, K, distortion, readout_time=READOUT_TIME)
+    motion = ConstantVelocity(
+        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.5, start_ns=START_NS
+    )
+    world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
+    settings = FrameSettings(points=100, noise=0.7, outliers=0.3)
+    with BagWriter(path) as bag:
+        for topic, message in more:
+            bag.write(topic, message, START_NS)
+        for frame in list(simulate_frames(camera, motion, world, settings))[:count]:
+            write_simulated(bag, replace(camera, D=known * distortion), frame)
+    return path
+
+
+def inputs(recording: Path) -> list[tuple[Any, Any]]:
+    """Pairs of camera_info and correspondences as rclpy's messages."""
+    with open_bag(recording) as bag:
+        found: dict[str, list[Any]] = {"/camera_info": [], "/correspondences": []}
+        for topic, _, message in bag.messages(tuple(found)):
+            found[topic].append(copy_message(message, message.__msgtype__))
+    return list(zip(*found.values(), strict=True))
+
+
+def replayed(recording: Path, out: Path, *words: str) -> dict[str, dict[int, bytes]]:
+    """What replay says of a recording, by topic and stamp."""
+    # In a process of its own: what other tests have compiled in this one may round differently.
+    replay = ["replay", str(recording), "--out", str(out), *words]
+    subprocess.run([sys.executable, "-m", "rs_localizer", *replay], check=True, capture_output=True)
+    with open_bag(out / "result") as bag:
+        return {
+            name: serialized([m for _, _, m in bag.messages([f"/rs_localizer/{name}"])], kind)
+            for name, kind in TYPES.items()
+        }
+
+
+def serialized(messages: list[Any], kind: str) -> dict[int, bytes]:
+    """Messages by their stamps, through one serializer: DDS may pad differently."""
+    return {stamp_ns(m): bytes(typestore().serialize_cdr(m, kind)) for m in messages}
+
+
+class Robot:
+    """Sends what the node needs, and keeps what it answers and says of itself."""
+
+    def __init__(self, peer: Any, *topics: str, namespace: str = "") -> None:
+        self.peer = peer
+        self._node = f"{namespace}/rs_localizer"
+        self.answers: dict[str, list[bytes]] = {name: [] for name in TYPES}
+        self.values: dict[str, str] = {}  # of the diagnostics
+        for name, kind in TYPES.items():
+            peer.node.create_subscription(
+                message_class(kind), f"{self._node}/{name}", self.answers[name].append,
+                QoSProfile(depth=100), raw=True,
+            )  # fmt: skip
+        peer.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_status, 10)
+        self.publishers = {
+            topic: peer.node.create_publisher(KINDS[topic], namespace + topic, 500)
+            for topic in ("/camera_info", "/correspondences", *topics)
+        }
+
+    def _take_status(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith(": localizer"):
+                self.values = {item.key: item.value for item in status.values}
+
+    def connect(self) -> None:
+        def connected() -> bool:
+            count = self.peer.node.count_publishers
+            heard = all(one.get_subscription_count() for one in self.publishers.values())
+            return heard and all(count(f"{self._node}/{name}") for name in TYPES)
+
+        assert self.peer.spin_until(connected), "the node was not found"
+        self.peer.spin_until(lambda: False, 0.3)  # the other side has to find us, too
+
+    def send(self, info: Any, cloud: Any, timeout: float = 1.0) -> bool:
+        """Send a frame; whether the node has answered."""
+        before = len(self.answers["inliers"])
+        if info is not None:
+            self.publishers["/camera_info"].publish(info)
+            self.peer.spin_until(lambda: False, 0.02)
+        self.publishers["/correspondences"].publish(cloud)
+        return bool(self.peer.spin_until(lambda: len(self.answers["inliers"]) > before, timeout))
+
+    def localize(self, info: Any, cloud: Any) -> None:
+        """Send a frame until the node has answered."""
+        assert any(self.send(info, cloud) for _ in range(20)), "no answer"
+
+    def answered(self, name: str) -> dict[int, bytes]:
+        """What the node said on a topic, by stamp."""
+        received = [typestore().deserialize_cdr(d, TYPES[name]) for d in self.answers[name]]
+        return serialized(received, TYPES[name])
+
+    def set(self, name: str, value: object) -> tuple[bool, str]:
+        """Set a parameter: whether it was, and the reason if not."""
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[parameter])
+        result = self.peer.call(SetParameters, f"{self._node}/set_parameters", request).results[0]
+        return result.successful, result.reason
