@@ -10,9 +10,9 @@ from launch import LaunchContext, LaunchDescription
 from rs_localizer.config import FeatureConfig
 from rs_localizer.ros.launching import (
     camera_driver,
+    chosen_parameters,
     detector,
     from_camera,
-    given,
     localizer,
     views,
 )
@@ -29,6 +29,8 @@ def _nodes(context: LaunchContext) -> list:
     return [
         *camera_driver(chosen),
         *views(chosen),
-        detector(chosen, FEATURES_NAME, "features_params_file", given(chosen, FeatureConfig)),
+        detector(
+            chosen, FEATURES_NAME, "features_params_file", chosen_parameters(chosen, FeatureConfig)
+        ),
         localizer(chosen, [("camera_info", LaunchConfiguration("camera_info"))]),
     ]

@@ -16,9 +16,9 @@ from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMapError
 from rs_localizer.ros.launching import (
     camera_driver,
+    chosen_parameters,
     detector,
     from_camera,
-    given,
     localizer,
     read_params,
     views,
@@ -46,7 +46,7 @@ def _nodes(context: LaunchContext) -> list:
             chosen,
             DETECTOR_NAME,
             "detector_params_file",
-            shutter | given(chosen, DetectorConfig),
+            shutter | chosen_parameters(chosen, DetectorConfig),
         ),
         localizer(
             {name: text for name, text in chosen.items() if name != "marker_map"},

@@ -72,11 +72,11 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
         raise ValueError(
             f"nothing is known of a camera {name!r}{hint}; rs_localizer calibrate measures it"
         )
-    found = [entry for entry in named if _has(entry.mode, mode)]
-    if not found:
+    matching = [entry for entry in named if _has(entry.mode, mode)]
+    if not matching:
         modes = ", ".join(f"{entry.name}: {entry.mode}" for entry in named)
         raise ValueError(f"no mode {mode!r} of {name!r} is known, but {modes}")
-    return found
+    return matching
 
 
 def _has(text: str, words: str) -> bool:

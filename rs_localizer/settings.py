@@ -32,7 +32,7 @@ _FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")
 
 Kind = type[NodeConfig] | type[DetectorConfig] | type[FeatureConfig]
 Config = TypeVar("Config", NodeConfig, DetectorConfig, FeatureConfig)
-_found: dict[Kind, dict[str, Setting]] = {}
+_cached: dict[Kind, dict[str, Setting]] = {}
 
 
 class SettingsError(ValueError):
@@ -54,9 +54,9 @@ class Setting:
 
 def settings(kind: Kind = NodeConfig) -> dict[str, Setting]:
     """All settings of a node, by dotted name."""
-    if kind not in _found:
-        _found[kind] = dict(_walk(kind(), ""))
-    return _found[kind]
+    if kind not in _cached:
+        _cached[kind] = dict(_walk(kind(), ""))
+    return _cached[kind]
 
 
 def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
@@ -70,11 +70,11 @@ def _walk(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 
 def unknown(name: str, kind: Kind = NodeConfig) -> str | None:
     """What to say of a name that is no setting; None for settings and what every node may have."""
-    known = settings(kind)
-    if name in known or name.split(".")[0] in _FOREIGN:
+    names = settings(kind)
+    if name in names or name.split(".")[0] in _FOREIGN:
         return None
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(names)}"
     return f"{name!r} is not a setting; {hint}"
 
 

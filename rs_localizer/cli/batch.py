@@ -184,11 +184,11 @@ def only_one(out: Path) -> Iterator[None]:
 
 def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
     started, busy = time.perf_counter(), 0.0
-    left = _find_finished(tasks, rows)
-    if before := len(tasks) - len(left):
+    open_tasks = _find_finished(tasks, rows)
+    if before := len(tasks) - len(open_tasks):
         print(f"{before} of {len(tasks)} recordings have been done before")
     bar = tqdm(total=len(tasks), initial=before, unit="recording", disable=None)
-    with bar, contextlib.closing(perform_all(left, where)) as outcomes:
+    with bar, contextlib.closing(perform_all(open_tasks, where)) as outcomes:
         for outcome in outcomes:
             rows[outcome.name] = row = _row(rows[outcome.name].recording, outcome)
             busy += outcome.seconds
@@ -196,21 +196,21 @@ def _work(tasks: list[Task], where: Where, rows: dict[str, Row]) -> None:
             bar.write(f"{row.folder}: {_said(row)}")
     wall = time.perf_counter() - started
     print(f"{counted(list(rows.values()))}")
-    if left:
+    if open_tasks:
         print(f"{wall:.1f} s for {busy:.1f} s of work")
 
 
 def _find_finished(tasks: list[Task], rows: dict[str, Row]) -> list[Task]:
     """Enter what is complete on disk; the tasks of which nothing is known."""
-    left = []
+    open_tasks = []
     for task in tasks:
         if rows[task.name].state != OPEN:
             continue
         if (figures := finished(task)) is None:
-            left.append(task)
+            open_tasks.append(task)
         else:
             rows[task.name] = Row(task.recording, task.name, DONE, figures)
-    return left
+    return open_tasks
 
 
 def _row(recording: Location, outcome: Outcome) -> Row:

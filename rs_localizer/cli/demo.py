@@ -156,7 +156,7 @@ def play_room(
     room = RoomScene(directory)
     recording = room.record()
     maps = (room.map_file, room.global_map_file)
-    given = {
+    with_maps = {
         name: {**settings, "map_file": str(file)}
         for (name, settings), file in zip(methods.items(), maps, strict=True)
     }
@@ -166,7 +166,7 @@ def play_room(
         answers = session.play(
             recording,
             room.readout_time,
-            given,
+            with_maps,
             bar.update,
             lossless=(next(iter(methods)),),
             topic=KEYPOINTS,
@@ -333,9 +333,9 @@ def _fly(directory: Path, most: int | None) -> Path:
         for stamp in frame_stamps(motion, _FLIGHT_CAMERA, _SEEN.rate)
         if start_ns <= stamp < end_ns
     ][:most]
-    way = motion.state(start_ns, np.linspace(0.0, _FLIGHT_DURATION, 200)).positions
+    path = motion.state(start_ns, np.linspace(0.0, _FLIGHT_DURATION, 200)).positions
     frames = simulate_frames(
-        _FLIGHT_CAMERA, motion, room(way, np.random.default_rng(0)), _SEEN, stamps_ns=stamps
+        _FLIGHT_CAMERA, motion, room(path, np.random.default_rng(0)), _SEEN, stamps_ns=stamps
     )
     with BagWriter(directory / "flight") as bag:
         bar = tqdm(frames, "Simulating a flight", len(stamps), unit="frame", disable=None)

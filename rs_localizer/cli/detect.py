@@ -139,7 +139,7 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
         f"{recorded.corners:.0f} corners each (median){fit}"
     )
     if recorded.with_corners < recorded.images:
-        print(f"{recorded.images - recorded.with_corners} images show nothing of the map")
+        print(f"{recorded.images - recorded.with_corners} images show no part of the map")
     tell_left_out(recorded.refused, recorded.carried)
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
@@ -226,11 +226,11 @@ def _detect_of_many(args: argparse.Namespace, recording: Path, out: Path) -> Fig
     )
 
 
-def _figures(found: Recorded) -> Figures:
+def _figures(recorded: Recorded) -> Figures:
     return {
-        "images": found.images,
-        "with corners": found.with_corners,
-        "corners": found.corners,
-        "residual of a still pose (px)": found.residual,
-        "warnings": "; ".join(found.faults),
+        "images": recorded.images,
+        "with corners": recorded.with_corners,
+        "corners": recorded.corners,
+        "residual of a still pose (px)": recorded.residual,
+        "warnings": "; ".join(recorded.faults),
     }

@@ -116,11 +116,11 @@ def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
     """Compare one estimate with its truth; print and draw it."""
     estimate = _read(args.estimate, args.pose_topic, args.twist_topic, args.twists)
     truth = _read(args.truth, args.truth_pose_topic, args.truth_twist_topic, args.truth_twists)
-    found = estimate_offset(estimate.poses, truth.poses)
+    offset = estimate_offset(estimate.poses, truth.poses)
     tolerance_ns = round(args.tolerance * 1e9)
     whole = len(estimate.poses)
     if args.offset is not None:
-        seconds = _offset(args.offset, found)
+        seconds = _offset(args.offset, offset)
         estimate, truth = _moved(estimate, truth, seconds)
         tolerance_ns = 0
         print(f"{seconds:+.4f} s are added to the times of {args.estimate}")
@@ -128,7 +128,7 @@ def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
     if len(poses.stamps_ns) == 0:
         raise ValueError(
             f"no pose of {args.estimate} is within {args.tolerance:g} s of one of {args.truth}: "
-            f"{_span(estimate.poses)} against {_span(truth.poses)}{_hint(found)}"
+            f"{_span(estimate.poses)} against {_span(truth.poses)}{_hint(offset)}"
         )
     twists = None
     if estimate.twists is not None and truth.twists is not None:
@@ -136,7 +136,7 @@ def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
     print(f"{len(poses.stamps_ns)} of {whole} poses compared")
     if args.offset is None:
         print(_coverage(args.truth, estimate.poses, truth.poses, tolerance_ns))
-        _print_offset(found)
+        _print_offset(offset)
     if text := _other_frames(estimate.poses, truth.poses, tolerance_ns):
         print(f"warning: {text}")
     print()
@@ -148,15 +148,15 @@ def evaluate_one(args: argparse.Namespace) -> tuple[Errors, Errors | None]:
     return poses, twists
 
 
-def _offset(given: str, found: TimeOffset | None) -> float:
-    if given != _AUTO:
-        return float(number()(given))
-    if found is None:
+def _offset(text: str, estimated: TimeOffset | None) -> float:
+    if text != _AUTO:
+        return float(number()(text))
+    if estimated is None:
         raise ValueError(
             "the motion does not determine a time offset: too short, too little turning, or not "
             "the same motion; give it with --offset SECONDS"
         )
-    return found.seconds
+    return estimated.seconds
 
 
 def _moved(estimate: Motions, truth: Motions, seconds: float) -> tuple[Motions, Motions]:
@@ -171,23 +171,23 @@ def _moved(estimate: Motions, truth: Motions, seconds: float) -> tuple[Motions, 
     return Motions(poses.part(inside), twists), Motions(true, true_twists)
 
 
-def _hint(found: TimeOffset | None) -> str:
-    if found is None:
+def _hint(offset: TimeOffset | None) -> str:
+    if offset is None:
         return ""
     return (
-        f"; the motions agree when {found.seconds:+.4f} s are added to its times: --offset {_AUTO}"
+        f"; the motions agree when {offset.seconds:+.4f} s are added to its times: --offset {_AUTO}"
     )
 
 
-def _print_offset(found: TimeOffset | None) -> None:
+def _print_offset(offset: TimeOffset | None) -> None:
     """What the time offset is; a warning where it matters."""
-    if found is None:
+    if offset is None:
         print("time offset: not determined by this motion")
         return
-    before, after = found.before, found.after
+    before, after = offset.before, offset.after
     print(
-        f"time offset: {round(found.seconds, 4) + 0.0:+.4f} s to be added (angular speeds "
-        f"correlate by {found.correlation:.3f})"
+        f"time offset: {round(offset.seconds, 4) + 0.0:+.4f} s to be added (angular speeds "
+        f"correlate by {offset.correlation:.3f})"
     )
     if not before < _WORSE * after:  # NaN compares false
         print(
@@ -256,8 +256,8 @@ def _coverage(path: Path, estimate: Trajectory, truth: Trajectory, tolerance_ns:
 def _read(
     path: Path, pose_topic: str | None, twist_topic: str | None, twists: Path | None
 ) -> Motions:
-    found = read_motions(path, pose_topic, twist_topic)
-    return found if twists is None else Motions(found.poses, read_twists(twists))
+    motions = read_motions(path, pose_topic, twist_topic)
+    return motions if twists is None else Motions(motions.poses, read_twists(twists))
 
 
 def named_errors(poses: Errors, twists: Errors | None) -> list[tuple[str, Array]]:
@@ -348,5 +348,5 @@ def _figures(poses: Errors, twists: Errors | None) -> Figures:
 def _truth_of(estimate: Path, truths: Path) -> Path:
     """The truth of an estimate: of the same name in another directory, whatever the suffix."""
     name = estimate.name if estimate.is_dir() else estimate.stem
-    found = [truths / name] if (truths / name).exists() else sorted(truths.glob(f"{name}.*"))
-    return found[0] if len(found) == 1 else truths / name
+    files = [truths / name] if (truths / name).exists() else sorted(truths.glob(f"{name}.*"))
+    return files[0] if len(files) == 1 else truths / name

@@ -119,7 +119,7 @@ def time_faults(args: argparse.Namespace, clock: ImageClock | None, period: floa
     """
     faults = []
     if clock is not None:
-        print(clock.told())
+        print(clock.description())
         faults.append(clock.fault())
     faults.append(readout_fault(build(shutter_values(args)).readout_time, period))
     return [fault for fault in faults if fault]
@@ -172,8 +172,8 @@ def opened(
         if value is not None:
             raise UsageError(f"--{name} is for videos and folders; a bag has its own times")
     with open_bag(path) as bag:
-        given = None if args.calibration is None else read_calibration(args.calibration)
-        yield of_bag(bag, given, args, calibrated)
+        camera = None if args.calibration is None else read_calibration(args.calibration)
+        yield of_bag(bag, camera, args, calibrated)
 
 
 def of_bag(
@@ -213,6 +213,6 @@ def tell_times(clock: ImageClock | None) -> None:
     """Say where the times of images are from that have been read, and what speaks against them."""
     if clock is None:
         return
-    print(clock.told())
+    print(clock.description())
     if fault := clock.fault():
         print(f"warning: {fault}")

@@ -82,17 +82,17 @@ def run(args: argparse.Namespace) -> None:
     with open_h5(args.features) as features, open_h5(args.matches) as matches:
         answers = localize_queries(reference, queries, pairs, features, matches, config)
         bar = tqdm(answers, total=len(queries), unit="image", desc="localize", disable=None)
-        found = list(bar)
-    if not any(isinstance(answer.result, Estimate) for answer in found):
-        raise ValueError(f"none of {len(found)} queries was localized; {_why(found)}")
+        localized = list(bar)
+    if not any(isinstance(answer.result, Estimate) for answer in localized):
+        raise ValueError(f"none of {len(localized)} queries was localized; {_why(localized)}")
     with atomic_files(args.results, motion) as (results_part, motion_part):
-        results_part.write_text("".join(_lines(found, args)), encoding="utf-8")
+        results_part.write_text("".join(_lines(localized, args)), encoding="utf-8")
         motion_part.write_text(
-            json.dumps(_motions(found, args, config), indent=1), encoding="utf-8"
+            json.dumps(_motions(localized, args, config), indent=1), encoding="utf-8"
         )
     if unknown:
         print(f"{len(unknown)} paired images are not in the model, the first one: {unknown[0]}")
-    _tell(found, args.results, motion, config)
+    _tell(localized, args.results, motion, config)
 
 
 def _lines(answers: list[Answer], args: argparse.Namespace) -> list[str]:

@@ -39,7 +39,7 @@ _STEERING = {
 _COMMON = (
     ("--json", "print the result as JSON"),
     ("--quiet", "print nothing but faults"),
-    ("--verbose", "of a fault, say where in the program it was found"),
+    ("--verbose", "print the traceback of a fault"),
 )
 
 
@@ -90,7 +90,7 @@ COMMANDS = {
     ),
     "readout": Command(
         "rs_localizer.cli.readout",
-        "what others say of a camera's readout time: median, spread, sources",
+        "published readout times of a camera: median, spread, sources",
         "rs_localizer readout imx219 1920x1080",
     ),
     "evaluate": Command(
@@ -100,7 +100,7 @@ COMMANDS = {
     ),
     "map": Command(
         "rs_localizer.cli.map",
-        "make a map of a room or of markers, refine, align and convert it, say what it holds",
+        "make a map of a room or of markers; refine, align, convert and describe it",
         "rs_localizer map build walk.mp4 --calibration lens.yaml --params shutter.yaml --out room",
     ),
     "watch": Command(
@@ -233,8 +233,8 @@ def _output(name: str, common: Collection[str]) -> Iterator[None]:
 
 def _print_json(name: str, result: Any, printed: str) -> None:
     """The figures of a command, or the lines that it has printed."""
-    found = {"text": printed.splitlines()} if result is None else {"result": result}
-    print(json.dumps({"command": name, **_as_json(found)}, indent=1))
+    content = {"text": printed.splitlines()} if result is None else {"result": result}
+    print(json.dumps({"command": name, **_as_json(content)}, indent=1))
 
 
 def _as_json(value: Any) -> Any:

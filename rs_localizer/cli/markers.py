@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--grid",
         metavar="2x3",
         help=f"markers, columns x rows (default: {_GRID}); what does not fit on a page together "
-        "is to be cut out and mounted as the map says",
+        "is to be cut out and mounted as in the map",
     )
     kind.add_argument("--chessboard", metavar="6x4", help="inner corners, along a row x rows")
     kind.add_argument("--charuco", metavar="5x7", help="squares, along a row x rows")
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     make.add_argument("--overwrite", action="store_true", help="replace earlier files")
     check = commands.add_parser(
         "check",
-        help="say what is wrong with a map file",
+        help="check a map file",
         description="Read a map and look for overlaps, mirrored markers and sizes in other units.",
     )
     check.add_argument("map", type=Path, metavar="MAP")
@@ -97,9 +97,9 @@ def _make(args: argparse.Namespace) -> None:
         raise
     except ValueError as error:  # the arguments are all that can be wrong with it
         raise UsageError(str(error)) from error
-    found = problems(marker_map)
-    if found:
-        raise UsageError(found[0])
+    faults = problems(marker_map)
+    if faults:
+        raise UsageError(faults[0])
     # An ending would be lost with a dot in the name.
     target = Path(f"{args.out}.{args.format}")
     map_file = Path(f"{args.out}.yaml")
@@ -166,11 +166,11 @@ def _counts(text: str, option: str) -> tuple[int, int]:
 
 def _check(path: Path) -> None:
     marker_map = read_marker_map(path)
-    found = problems(marker_map)
-    for text in found:
+    faults = problems(marker_map)
+    for text in faults:
         print(text)
-    if found:
-        count = "a problem" if len(found) == 1 else f"{len(found)} problems"
+    if faults:
+        count = "a problem" if len(faults) == 1 else f"{len(faults)} problems"
         raise ValueError(f"{path} has {count}")
     kinds = sorted({marker.family.name for marker, _ in marker_map.all_markers()})
     of = f" of {', '.join(kinds)}" if kinds else ""

@@ -16,16 +16,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> list[dict[str, object]]:
-    found = find_readout(args.name, args.mode)
-    width = max(len(entry.name) for entry in found)
-    modes = max(len(entry.mode) for entry in found)
+    entries = find_readout(args.name, args.mode)
+    width = max(len(entry.name) for entry in entries)
+    modes = max(len(entry.mode) for entry in entries)
     print(f"{'camera':{width}}  {'mode':{modes}}  median ms  quartiles ms   number  source")
-    for entry in found:
+    for entry in entries:
         spread = f"{1e3 * entry.low:.2f} to {1e3 * entry.high:.2f}"
         note = "; about the interval between images, rather an upper bound"
         print(
             f"{entry.name:{width}}  {entry.mode:{modes}}  {1e3 * entry.median:9.2f}  {spread:14} "
             f"{entry.number:6}  {entry.source}{note if entry.upper_bound else ''}"
         )
-    print("What others say, of modes that may not be yours: rs_localizer calibrate measures it.")
-    return [asdict(entry) for entry in found]
+    print("Published values, perhaps of other modes: rs_localizer calibrate measures yours.")
+    return [asdict(entry) for entry in entries]

@@ -150,8 +150,8 @@ def _replayed(args: argparse.Namespace) -> NodeConfig:
 
 def _settings(args: argparse.Namespace) -> NodeConfig:
     """The settings that the arguments give; refuses those that cannot be."""
-    given = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
-    return given_settings(args, given, FrameLocalizer)  # refuses what it cannot do
+    assignments = [] if args.map is None else [f"map_file:={json.dumps(str(args.map))}"]
+    return given_settings(args, assignments, FrameLocalizer)  # refuses what it cannot do
 
 
 def _name(recording: Location) -> str:
@@ -217,11 +217,11 @@ def _detect_command(path: Location) -> str:
     """What finds the matches in images."""
     source = shlex.quote(str(path))
     calibration = "" if is_url(path) or is_bag(Path(path)) else " --calibration camera.yaml"
-    seen = shlex.quote(f"{_name(path)}_seen")
+    out = shlex.quote(f"{_name(path)}_seen")
     return (
-        f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {seen} (or --board "
+        f"run: rs_localizer detect {source} --map MAP.yaml{calibration} --out {out} (or --board "
         "6x4 --square 0.03, or --features sift, instead of --map), then: rs_localizer replay "
-        f"{seen}"
+        f"{out}"
     )
 
 
@@ -253,8 +253,8 @@ def _check_usage(args: argparse.Namespace) -> None:
         return
     if is_batch(args):
         raise UsageError("--ros plays one recording, and needs no workers")
-    given = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
-    if any((*given, args.rows, args.nerfstudio, args.gsplat, args.ncore, args.parquet)):
+    offline = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
+    if any((*offline, args.rows, args.nerfstudio, args.gsplat, args.ncore, args.parquet)):
         raise UsageError(
             "--out, --overwrite, --params, --map, --row, --nerfstudio, --gsplat, --ncore, "
             "--parquet, --smooth, -p are for offline replay; with --ros the node has the settings "

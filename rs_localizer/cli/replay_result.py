@@ -224,8 +224,8 @@ class Exports:
         if self._ncore is not None:
             exposed = np.array([self._exposed[stamp] for stamp in images], np.int64)
             with self._folder(self._ncore, bag, images) as (folder, names):
-                found = sequence(self._camera, names, exposed, poses[:, [0, 2]])
-                (folder / NCORE).write_text(json.dumps(found, indent=1), encoding="utf-8")
+                content = sequence(self._camera, names, exposed, poses[:, [0, 2]])
+                (folder / NCORE).write_text(json.dumps(content, indent=1), encoding="utf-8")
 
     @contextlib.contextmanager
     def _folder(
@@ -457,7 +457,7 @@ class Tally:
 
 def figures(tally: Tally) -> Figures:
     """What the summary of many recordings says of this one."""
-    seen, deviation = tally.readout or (np.nan, np.nan)
+    readout_time, deviation = tally.readout or (np.nan, np.nan)
     return {
         "frames": tally.total,
         "localized": tally.localized,
@@ -466,7 +466,7 @@ def figures(tally: Tally) -> Figures:
         "with twist": int(np.count_nonzero(tally.column("twist"))),
         "mostly refused for": next((reason for reason, _ in tally.refused.most_common(1)), ""),
         "noticed": ", ".join(f"{name} {count}" for name, (count, _) in tally.notices.items()),
-        "readout time seen (ms)": 1e3 * seen,
+        "readout time seen (ms)": 1e3 * readout_time,
         "its deviation (ms)": 1e3 * deviation,
     }
 

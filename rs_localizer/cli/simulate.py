@@ -284,11 +284,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_camera_arguments(parser.add_argument_group("camera"))
     add_imu_arguments(parser.add_argument_group("IMU"))
     frames = FrameSettings()
-    seen = parser.add_argument_group("what it sees: points")
-    option(seen, "--points", integer(1), frames.points, "N", "of a frame, if it sees so many")
-    option(seen, "--noise", number(0.0), frames.noise, "PX", "deviation of each raw coordinate")
-    option(seen, "--outliers", number(0.0, 1.0), frames.outliers, "SHARE", "of the points")
-    seen.add_argument(
+    points = parser.add_argument_group("what it sees: points")
+    option(points, "--points", integer(1), frames.points, "N", "of a frame, if it sees so many")
+    option(points, "--noise", number(0.0), frames.noise, "PX", "deviation of each raw coordinate")
+    option(points, "--outliers", number(0.0, 1.0), frames.outliers, "SHARE", "of the points")
+    points.add_argument(
         "--keypoints",
         action="store_true",
         help=f"pixels with binary descriptors, and the map beside them, {MAP}: for matching",
@@ -330,9 +330,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     foreign = _OF_POINTS if args.images else _OF_IMAGES
-    given = [name for name in foreign if getattr(args, name) != args.defaults[name]]
-    if given:
-        option = f"--{given[0].replace('_', '-')}"
+    foreign_options = [name for name in foreign if getattr(args, name) != args.defaults[name]]
+    if foreign_options:
+        option = f"--{foreign_options[0].replace('_', '-')}"
         raise UsageError(
             f"{option} is for points; images have --grey-noise and --exposure"
             if args.images
@@ -346,15 +346,15 @@ def run(args: argparse.Namespace) -> None:
 
 def _write_points(args: argparse.Namespace) -> None:
     camera, motion = camera_of(args), motion_of(args)
-    seen = FrameSettings(args.points, args.noise, args.outliers, args.rate)
+    frame_settings = FrameSettings(args.points, args.noise, args.outliers, args.rate)
     stamps = stamps_of(args, camera, motion)
     rng = np.random.default_rng(args.seed)
-    landmarks = described(room(_way(motion), rng), MAP_FRAME, rng)
+    landmarks = described(room(_positions(motion), rng), MAP_FRAME, rng)
     counts: list[int] = []
     with atomic_directory(args.out, replaced(args, "metadata.yaml")) as built:
         with bag_of(args, built, motion) as bag:
             frames = simulate_frames(
-                camera, motion, landmarks.points, seen, stamps_ns=stamps, seed=args.seed
+                camera, motion, landmarks.points, frame_settings, stamps_ns=stamps, seed=args.seed
             )
             total = len(stamps)
             for frame in tqdm(frames, total=total, unit="frame", desc="simulate", disable=None):
@@ -376,10 +376,10 @@ def _write_points(args: argparse.Namespace) -> None:
     )
     out = shlex.quote(str(args.out))
     poses = shlex.quote(f"{args.out}_poses")
-    given = f"--params {out}/{PARAMETERS}"
+    settings_words = f"--params {out}/{PARAMETERS}"
     if args.keypoints:
-        given += f" --map {out}/{MAP}"
-    print(f"next: rs_localizer replay {out} {given} --out {poses}")
+        settings_words += f" --map {out}/{MAP}"
+    print(f"next: rs_localizer replay {out} {settings_words} --out {poses}")
 
 
 def _write_images(args: argparse.Namespace) -> None:
@@ -403,8 +403,8 @@ def _write_images(args: argparse.Namespace) -> None:
         return
     print(f"{said}, {len(scene.marker_map.markers)} markers on the walls")
     out = shlex.quote(str(args.out))
-    found = shlex.quote(f"{args.out}_markers")
-    print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {found}")
+    markers = shlex.quote(f"{args.out}_markers")
+    print(f"next: rs_localizer detect {out} --map {out}/{MARKER_MAP} --out {markers}")
 
 
 def _shutter(args: argparse.Namespace) -> dict[str, object]:
@@ -419,7 +419,7 @@ def _fewer(counts: list[int], wanted: int) -> str:
     return f" (of {wanted} asked for; {few} frames see fewer, {none} of them none)"
 
 
-def _way(motion: TrueMotion) -> Array:
+def _positions(motion: TrueMotion) -> Array:
     """Camera positions (n,3) all along a motion, for the room to be built around."""
     return np.concatenate(
         [

@@ -17,7 +17,7 @@ def path(name: str) -> Path:
     Raises:
         FileNotFoundError: when the package was installed without it.
     """
-    found = Path(str(files(__name__) / name))
-    if not found.exists():
-        raise FileNotFoundError(f"{found} is missing: rs_localizer was installed without its data")
-    return found
+    file = Path(str(files(__name__) / name))
+    if not file.exists():
+        raise FileNotFoundError(f"{file} is missing: rs_localizer was installed without its data")
+    return file

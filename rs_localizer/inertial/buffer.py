@@ -44,7 +44,7 @@ class Lack(StrEnum):
     TOO_LATE = "too_late"  # the oldest that is remembered is of after its beginning
     GAP = "gap"  # some have been lost
     TOO_SLOW = "too_slow"  # they come at too low a rate
-    SATURATED = "saturated"  # the camera turns faster than the gyroscope can tell
+    SATURATED = "saturated"  # the turn rate exceeds the gyroscope's range
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,9 +182,9 @@ class BagReader:
 
     def _check_types(self, names: Collection[str]) -> None:
         """Refuse types that a recording describes otherwise than ROS: fields would be missed."""
-        own, known = self._reader.typestore.fielddefs, typestore().fielddefs
-        for name in (set(names) & set(known)) - set(DEFINITIONS) if self._reader.is2 else ():
-            if _fields_of(name, own) != _fields_of(name, known):
+        own, standard = self._reader.typestore.fielddefs, typestore().fielddefs
+        for name in (set(names) & set(standard)) - set(DEFINITIONS) if self._reader.is2 else ():
+            if _fields_of(name, own) != _fields_of(name, standard):
                 raise BagError(f"{self._path} describes {name} otherwise than ROS 2 Jazzy does")
 
 

@@ -61,9 +61,9 @@ def choose(cameras: Mapping[str, T], name: str | None) -> T:
     if not cameras:
         raise ValueError("it has no camera")
     if name is None or name not in cameras:
-        known = ", ".join(cameras)
+        names = ", ".join(cameras)
         raise ValueError(
-            f"it has the cameras {known}: choose one with #{next(iter(cameras))} behind the file"
+            f"it has the cameras {names}: choose one with #{next(iter(cameras))} behind the file"
         )
     return cameras[name]
 
@@ -132,8 +132,8 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     Raises:
         ValueError: when there are several, or for a model that is not supported.
     """
-    found = {match[1]: (match[2], match[3].split()) for match in _LINE.finditer(text)}
-    model, words = choose(found, chosen)
+    cameras = {match[1]: (match[2], match[3].split()) for match in _LINE.finditer(text)}
+    model, words = choose(cameras, chosen)
     if model not in _COLMAP_MODELS:
         raise ValueError(f"model must be one of {', '.join(_COLMAP_MODELS)}; found {model}")
     names, distortion = _COLMAP_MODELS[model]
@@ -234,9 +234,7 @@ def _size(tree: dict[str, Any]) -> tuple[int, int]:
     if width is None and height is None:
         both = _first(tree, _SIZE)
         if both is None:
-            raise ValueError(
-                "it does not say for which size of images: add image_width and image_height"
-            )
+            raise ValueError("it has no image size: add image_width and image_height")
         width, height = _values(both).tolist()
     if width is None or height is None:
         raise KeyError((_WIDTH if width is None else _HEIGHT)[0])
@@ -256,15 +254,15 @@ def _distortion(tree: dict[str, Any]) -> Array:
     item = _first(tree, _DISTORTION)
     if item is not None:
         return _values(item)
-    given = [name in tree for name in _NAMED]
-    if not any(given):
+    present = [name in tree for name in _NAMED]
+    if not any(present):
         if _first(tree, _MATRIX) is not None:  # which writers have before the coefficients
             raise ValueError(
                 "it has a camera matrix and no distortion coefficients: is it cut off? A lens "
                 "without distortion says so: distortion_coefficients: {data: []}"
             )
         return np.zeros(0)
-    last = len(given) - given[::-1].index(True)
+    last = len(present) - present[::-1].index(True)
     count = 4 if last <= 4 else 5 if last == 5 else _RATIONAL
     return np.array([float(tree.get(name, 0.0)) for name in _NAMED[:count]])
 
@@ -319,7 +317,7 @@ def read_calibration(path: Path | str) -> Camera:
         raise CalibrationError(f"{path} is not a usable calibration: {fault}") from error
     if camera is None:
         raise CalibrationError(
-            f"{path} is not a calibration: expected a {CALIBRATION_KINDS}; {_found(text)}"
+            f"{path} is not a calibration: expected a {CALIBRATION_KINDS}; {_fields_in_words(text)}"
         )
     x, y = camera.K[:2, 2]
     if not (0.0 < x < camera.width and 0.0 < y < camera.height):
@@ -357,7 +355,7 @@ def _camera(text: str, chosen: str | None) -> Camera | None:
     return next((reader(tree) for fits, reader in readers if fits), None)
 
 
-def _found(text: str) -> str:
+def _fields_in_words(text: str) -> str:
     try:
         tree = load_tree(text)
     except YamlError:

@@ -94,16 +94,16 @@ def _distortion_model(name: str, D: tuple[float, ...]) -> str:
 
 
 def _roi(roi: Any, width: int, height: int) -> Roi | None:
-    found = Roi(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height))
-    if found == Roi(0, 0, 0, 0):
+    region = Roi(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height))
+    if region == Roi(0, 0, 0, 0):
         return None
     if (
-        min(found.width, found.height) < 1
-        or found.x_offset + found.width > width
-        or found.y_offset + found.height > height
+        min(region.width, region.height) < 1
+        or region.x_offset + region.width > width
+        or region.y_offset + region.height > height
     ):
         raise MessageError(
-            f"the region of interest, {found.width} x {found.height} at ({found.x_offset}, "
-            f"{found.y_offset}), does not lie in the image of {width} x {height}"
+            f"the region of interest, {region.width} x {region.height} at ({region.x_offset}, "
+            f"{region.y_offset}), does not lie in the image of {width} x {height}"
         )
-    return found
+    return region

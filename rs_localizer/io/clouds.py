@@ -199,8 +199,8 @@ def _row_type(fields: tuple[Field, ...], point_step: int, big_endian: bool) -> n
             raise MessageError(f"the cloud has {names.count(name)} fields {name!r}")
         if number not in _TYPES[name]:
             allowed = ", ".join(_NAMES[allowed] for allowed in _TYPES[name])
-            found = _NAMES.get(number, f"the unknown type {number}")
-            raise MessageError(f"field {name!r} must be one of {allowed}; found {found}")
+            actual = _NAMES.get(number, f"the unknown type {number}")
+            raise MessageError(f"field {name!r} must be one of {allowed}; found {actual}")
         count = count or 1  # 0 is an old way to write 1
         if count > 1 and name not in _ARRAYS:
             raise MessageError(f"field {name!r} must hold one value, found {count}")

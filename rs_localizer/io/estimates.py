@@ -70,13 +70,13 @@ def read_motions(
 
 
 def _topic(
-    bag: BagReader, type_name: str, given: str | None, option: str, *, required: bool
+    bag: BagReader, type_name: str, chosen: str | None, option: str, *, required: bool
 ) -> Any:
     candidates = sorted(topic for topic, kind in bag.topics.items() if kind == type_name)
-    if given is not None:
-        if given not in candidates:
-            raise BagError(_sentence(bag, f"no {type_name} on {given}", candidates))
-        return given
+    if chosen is not None:
+        if chosen not in candidates:
+            raise BagError(_sentence(bag, f"no {type_name} on {chosen}", candidates))
+        return chosen
     if len(candidates) > 1:
         raise BagError(_sentence(bag, f"several {type_name}; choose with {option}", candidates))
     if required and not candidates:
@@ -84,8 +84,8 @@ def _topic(
     return candidates[0] if candidates else None
 
 
-def _sentence(bag: BagReader, fault: str, found: Collection[str]) -> str:
-    return f"{bag.path} has {fault}; found {', '.join(sorted(found)) or 'none'}"
+def _sentence(bag: BagReader, fault: str, topics: Collection[str]) -> str:
+    return f"{bag.path} has {fault}; found {', '.join(sorted(topics)) or 'none'}"
 
 
 def _by_stamp(bag: BagReader, topic: str) -> dict[int, Any]:

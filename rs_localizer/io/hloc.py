@@ -103,13 +103,13 @@ class H5File:
         Raises:
             HlocError: when the pair has none.
         """
-        found = self._pair(one, other)
-        if found is None:
+        pair = self._pair(one, other)
+        if pair is None:
             raise HlocError(
                 f"{self._path} has no matches of {one} and {other}: was it made with another list "
                 "of pairs?"
             )
-        matches, turned = found
+        matches, turned = pair
         rows = np.flatnonzero(matches != _NONE)
         pairs = np.column_stack([rows, matches[rows]])
         return pairs[:, ::-1] if turned else pairs

@@ -77,8 +77,8 @@ class ImageClock:
         span = self._last_ns - self._first_ns
         return (self._timed - 1) * 1e9 / span if span > 0 else None
 
-    def told(self) -> str:
-        """What the stamps are, in one sentence."""
+    def description(self) -> str:
+        """Where the stamps come from, in one sentence."""
         own = "the names of the files" if self._absolute else "the presentation times of the video"
         source = own if self.rate is None else f"--rate {self.rate:g}"
         own_rate = self.own_rate

@@ -154,13 +154,13 @@ def decode(packed: bytes, format_: str) -> Gray:
     """
     data = np.frombuffer(packed, np.uint8)
     start = data[:8].tobytes()
-    found = [item for item in _FORMATS if start.startswith(item[1])]
-    if not found:
+    formats = [item for item in _FORMATS if start.startswith(item[1])]
+    if not formats:
         raise MessageError(
             f"the compressed image is neither JPEG nor PNG: its format is {format_!r} "
             f"and its {len(data)} bytes start with {start.hex(' ') or 'nothing'}"
         )
-    name, _, end = found[0]
+    name, _, end = formats[0]
     # OpenCV fills what is missing with gray and says nothing.
     if not _ends_with(data, end):
         raise MessageError(f"the {name} image is truncated: its {len(data)} bytes have no end mark")

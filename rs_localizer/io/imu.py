@@ -107,8 +107,10 @@ def read_imu(message: Any) -> ImuReading:
     turn = _vector(message.angular_velocity, "angular_velocity", "rad/s", _FASTEST)
     force = None
     if float(forces[0]) != _ABSENT and _is_finite(message.linear_acceleration):
-        found = _vector(message.linear_acceleration, "linear_acceleration", "m/s^2", _HARDEST)
-        force = found if any(found) else None
+        acceleration = _vector(
+            message.linear_acceleration, "linear_acceleration", "m/s^2", _HARDEST
+        )
+        force = acceleration if any(acceleration) else None
     return ImuReading(
         stamp_ns=stamp_ns(message),
         frame=frame,
@@ -123,11 +125,11 @@ def _is_finite(vector: Any) -> bool:
 
 
 def _vector(vector: Any, name: str, unit: str, most: float) -> Vector:
-    found = (float(vector.x), float(vector.y), float(vector.z))
-    if not all(map(math.isfinite, found)):
-        raise MessageError(f"{name} is not finite: {found}")
-    if max(map(abs, found)) > most:
+    values = (float(vector.x), float(vector.y), float(vector.z))
+    if not all(map(math.isfinite, values)):
+        raise MessageError(f"{name} is not finite: {values}")
+    if max(map(abs, values)) > most:
         raise MessageError(
-            f"{name} is {found} {unit}, more than any IMU measures ({most:g}); is it in {unit}?"
+            f"{name} is {values} {unit}, more than any IMU measures ({most:g}); is it in {unit}?"
         )
-    return found
+    return values

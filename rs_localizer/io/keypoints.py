@@ -59,8 +59,8 @@ def read_map(message: Any) -> Map:
     rows = read_rows(message, ("x", "y", "z"), ("id", "descriptor"))
     ids, descriptors = _marks(rows, message)
     try:
-        found = make_map(rows.columns("x", "y", "z"), ids, descriptors, frame)
-        return Map(found.points, found.ids, found.descriptors, frame, rows.dropped)
+        landmarks = make_map(rows.columns("x", "y", "z"), ids, descriptors, frame)
+        return Map(landmarks.points, landmarks.ids, landmarks.descriptors, frame, rows.dropped)
     except MapError as error:
         raise MessageError(str(error)) from error
 
@@ -73,7 +73,7 @@ def _marks(rows: Rows, message: Any) -> tuple[Ids | None, Descriptors | None]:
     ids = rows.table["id"].astype(np.int64) if rows.has("id") else None
     if not rows.has("descriptor"):
         return ids, None
-    found = rows.table["descriptor"]
-    native = found.dtype.newbyteorder("=")
-    width = math.prod(found.shape[1:])  # also without a row left
-    return ids, np.ascontiguousarray(found.reshape(len(found), width), dtype=native)
+    descriptors = rows.table["descriptor"]
+    native = descriptors.dtype.newbyteorder("=")
+    width = math.prod(descriptors.shape[1:])  # also without a row left
+    return ids, np.ascontiguousarray(descriptors.reshape(len(descriptors), width), dtype=native)

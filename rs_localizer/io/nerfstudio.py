@@ -75,7 +75,7 @@ def transforms(camera: Camera, views: Sequence[View]) -> dict[str, Any]:
         )
     if camera.readout_time > 0.0 and camera.scan_direction != ScanDirection.TOP_TO_BOTTOM:
         raise NerfstudioError(
-            "transforms.json only knows shutters that move from top to bottom, this one moves "
+            "transforms.json only has shutters that move from top to bottom, this one moves "
             f"{camera.scan_direction}: turn the images"
         )
     name, coefficients = _MODELS[model]

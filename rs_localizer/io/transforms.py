@@ -332,18 +332,18 @@ class TransformTree:
     def _latest(self, target: str, source: str) -> int | None:
         """The last time (ns) at which all links are known; None: they are all static."""
         self._check(target, source)
-        ways = [self._frames_above(name) for name in (target, source)]
-        meeting = next((name for name in ways[0] if name in ways[1]), None)
+        chains = [self._frames_above(name) for name in (target, source)]
+        meeting = next((name for name in chains[0] if name in chains[1]), None)
         if meeting is None:
             raise _unconnected(target, source)
-        tracks = [self._tracks[name] for way in ways for name in way[: way.index(meeting)]]
+        tracks = [self._tracks[name] for chain in chains for name in chain[: chain.index(meeting)]]
         return min((t.stamps[-1] for t in tracks if t.static is None), default=None)
 
     def _check(self, *names: str) -> None:
         for name in names:
             if name not in self._tracks and name not in self._parents:
-                known = ", ".join(sorted(self._parents | set(self._tracks))) or "none"
-                raise TransformError(f"frame {name!r} does not exist; there are {known}")
+                frames = ", ".join(sorted(self._parents | set(self._tracks))) or "none"
+                raise TransformError(f"frame {name!r} does not exist; there are {frames}")
 
     def _frames_above(self, name: str) -> list[str]:
         """A frame and all that it hangs on, by the latest links."""

@@ -52,11 +52,11 @@ def read_video(path: Path | str) -> Iterator[VideoImage]:
         raise VideoError(f"{path} does not exist")
     with path.open("rb") as file:
         is_stream = file.read(2) == _JPEG_START
-    found = False
+    any_image = False
     for item in _from_stream(path) if is_stream else _from_container(path):
-        found = True
+        any_image = True
         yield item
-    if not found:
+    if not any_image:
         raise VideoError(f"{path} holds no image that OpenCV can read")
 
 
@@ -92,9 +92,11 @@ def _from_container(path: Path) -> Iterator[VideoImage]:
             # Of the image just read. OpenCV 4.6 says 0 for those last images that a decoder with
             # B frames holds back, and for all images of a raw stream.
             seconds = 1e-3 * float(video.get(cv2.CAP_PROP_POS_MSEC))
-            known = seconds > last
+            is_new = seconds > last
             last = max(last, seconds)
-            yield VideoImage(jpeg.tobytes(), np.asarray(grey, np.uint8), seconds if known else None)
+            yield VideoImage(
+                jpeg.tobytes(), np.asarray(grey, np.uint8), seconds if is_new else None
+            )
     finally:
         video.release()
 

@@ -201,10 +201,10 @@ class Matcher:
         chosen = _best(keypoints, settings.max_keypoints)
         queries, pixels = queries[chosen], keypoints.pixels[chosen]
         if settings.gate > 0.0 and camera is not None and prior is not None:
-            found, mutual = self._predicted(queries, pixels, settings, camera, prior)
+            matches, mutual = self._predicted(queries, pixels, settings, camera, prior)
         else:
-            found, mutual = self._anywhere(queries, settings)
-        return _accepted(found, mutual, chosen, settings.ratio)
+            matches, mutual = self._anywhere(queries, settings)
+        return _accepted(matches, mutual, chosen, settings.ratio)
 
     def choose(self, keypoints: Keypoints, settings: Matching) -> MatchBy:
         """By what they are compared; descriptors say more than the numbers of a tracker.
@@ -244,12 +244,12 @@ class Matcher:
         assert self._order is not None
         places = np.searchsorted(self._sorted, keypoints.ids)
         places[places == len(self._sorted)] = 0
-        known = np.flatnonzero(self._sorted[places] == keypoints.ids)
+        common = np.flatnonzero(self._sorted[places] == keypoints.ids)
         # An id that comes twice shows the landmark where the score is best, or first.
         if keypoints.scores is not None:
-            known = known[np.argsort(-keypoints.scores[known], kind="stable")]
-        _, firsts = np.unique(keypoints.ids[known], return_index=True)
-        rows = np.sort(known[firsts])
+            common = common[np.argsort(-keypoints.scores[common], kind="stable")]
+        _, firsts = np.unique(keypoints.ids[common], return_index=True)
+        rows = np.sort(common[firsts])
         scores = None if keypoints.scores is None else keypoints.scores[rows]
         return Matches(rows, self._order[places[rows]], scores, MatchBy.ID)
 
@@ -257,16 +257,16 @@ class Matcher:
         """The two nearest of all landmarks, and for each query its rival (q,)."""
         assert self._index is not None
         assert self.map.descriptors is not None
-        found = self._index.nearest(queries)
+        nearest = self._index.nearest(queries)
         owners = np.arange(len(queries))
         if settings.mutual and len(queries):
-            firsts = found.landmarks[:, 0]
+            firsts = nearest.landmarks[:, 0]
             there = np.flatnonzero(firsts >= 0)
             # As the map's: its bytes are bits, those of keypoints may stand for numbers.
             index = make_index(queries, binary=self.map.descriptors.dtype == np.uint8)
             back = index.nearest(self.map.descriptors[firsts[there]])
             owners[there] = back.landmarks[:, 0]
-        return found, owners
+        return nearest, owners
 
     def _predicted(
         self,
@@ -288,12 +288,12 @@ class Matcher:
             return self._anywhere(queries, settings)
         view = find_view(camera, prior, self.map.points, settings.gate)
         visible = predict(camera, prior, self.map.points, view)
-        found, owners = self._index.nearest_within(queries, pixels, visible)
+        nearest, owners = self._index.nearest_within(queries, pixels, visible)
         if not settings.mutual:
-            return found, np.arange(len(queries))
+            return nearest, np.arange(len(queries))
         owner_of = np.full(len(self.map), -1, np.int64)
         owner_of[visible.landmarks] = owners
-        return found, owner_of[found.landmarks[:, 0]]
+        return nearest, owner_of[nearest.landmarks[:, 0]]
 
 
 def correspondences(matches: Matches, keypoints: Keypoints, landmarks: Map) -> Correspondences:
@@ -332,8 +332,8 @@ def warm_up() -> None:
     for descriptors in (np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.float32)):
         matcher = Matcher(Map(np.zeros((1, 3)), None, descriptors, "map"))
         keypoints = Keypoints(0, np.zeros((1, 2)), None, descriptors, None, 0)
-        for known in (None, prior):
-            matcher.match(keypoints, Matching(), camera, known)
+        for tracked in (None, prior):
+            matcher.match(keypoints, Matching(), camera, tracked)
 
 
 def _best(keypoints: Keypoints, most: int) -> IntArray:
@@ -346,9 +346,9 @@ def _best(keypoints: Keypoints, most: int) -> IntArray:
     return np.sort(np.argsort(-keypoints.scores, kind="stable")[:most])
 
 
-def _accepted(found: Nearest, owners: IntArray, rows: IntArray, ratio: float) -> Matches:
+def _accepted(nearest: Nearest, owners: IntArray, rows: IntArray, ratio: float) -> Matches:
     """Matches that pass; the score is how much nearer the first landmark is than the second."""
-    first, second = found.distances[:, 0], found.distances[:, 1].copy()
+    first, second = nearest.distances[:, 0], nearest.distances[:, 1].copy()
     rivals = np.isfinite(second)
     if np.any(rivals):
         # Where nothing else competes, nearer than others' second ones is near.
@@ -358,10 +358,10 @@ def _accepted(found: Nearest, owners: IntArray, rows: IntArray, ratio: float) ->
     queries = np.flatnonzero(good)
     # Without the mutual check several may remain for one landmark: the nearest.
     queries = queries[np.argsort(first[queries], kind="stable")]
-    _, firsts = np.unique(found.landmarks[queries, 0], return_index=True)
+    _, firsts = np.unique(nearest.landmarks[queries, 0], return_index=True)
     queries = np.sort(queries[firsts])
     scores = 1.0 - first[queries] / second[queries]
-    return Matches(rows[queries], found.landmarks[queries, 0], scores, MatchBy.DESCRIPTOR)
+    return Matches(rows[queries], nearest.landmarks[queries, 0], scores, MatchBy.DESCRIPTOR)
 
 
 def _marks(ids: Ids | None, descriptors: Descriptors | None) -> str:

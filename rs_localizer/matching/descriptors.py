@@ -77,9 +77,9 @@ class BinaryIndex:
         self._columns = np.ascontiguousarray(self._rows.T)
 
     def nearest(self, queries: Descriptors) -> Nearest:
-        found = Nearest.none(len(queries))
-        nearest_binary(_words(queries), self._columns, found.distances, found.landmarks)
-        return found
+        result = Nearest.none(len(queries))
+        nearest_binary(_words(queries), self._columns, result.distances, result.landmarks)
+        return result
 
     def nearest_within(
         self, queries: Descriptors, pixels: Array, visible: Visible
@@ -99,7 +99,7 @@ class RealIndex:
 
     def nearest(self, queries: Descriptors) -> Nearest:
         queries = np.asarray(queries, np.float32)
-        found = Nearest.none(len(queries))
+        result = Nearest.none(len(queries))
         block = max(1, _MOST_PRODUCTS // len(self._rows))
         # What overflows is far away, or nowhere.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -111,14 +111,14 @@ class RealIndex:
                 for column in range(min(2, len(self._rows))):
                     best = products.argmin(axis=1)
                     offsets = queries[part].astype(np.float64) - self._rows[best]
-                    found.landmarks[part, column] = best
-                    found.distances[part, column] = np.sqrt(np.square(offsets).sum(axis=1))
+                    result.landmarks[part, column] = best
+                    result.distances[part, column] = np.sqrt(np.square(offsets).sum(axis=1))
                     products[np.arange(len(best)), best] = np.inf
         # Rounding of the products may have swapped them.
-        order = np.argsort(found.distances, axis=1, kind="stable")
+        order = np.argsort(result.distances, axis=1, kind="stable")
         return Nearest(
-            np.take_along_axis(found.distances, order, 1),
-            np.take_along_axis(found.landmarks, order, 1),
+            np.take_along_axis(result.distances, order, 1),
+            np.take_along_axis(result.landmarks, order, 1),
         )
 
     def nearest_within(
@@ -136,14 +136,14 @@ def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
 def _within(
     search: Any, rows: NDArray[Any], queries: NDArray[Any], pixels: Array, visible: Visible
 ) -> tuple[Nearest, IntArray]:
-    found = Nearest.none(len(queries))
+    result = Nearest.none(len(queries))
     rivals = np.full(len(visible.landmarks), np.inf)
     owners = np.full(len(visible.landmarks), -1, np.int64)
     search(
         queries, pixels, rows, visible.landmarks, visible.pixels, visible.gate,
-        found.distances, found.landmarks, rivals, owners,
+        result.distances, result.landmarks, rivals, owners,
     )  # fmt: skip
-    return found, owners
+    return result, owners
 
 
 def _words(descriptors: Descriptors) -> NDArray[np.uint64]:

@@ -42,7 +42,7 @@ def _insert(distance: float, index: int, distances: Any, indices: Any) -> None:
 
 
 @inlined
-def _hamming(query: Any, columns: Any, start: int, count: int, found: Any) -> None:
+def _hamming(query: Any, columns: Any, start: int, count: int, distances: Any) -> None:
     """Distances of one descriptor (w,) to ``count`` columns of (w,n)."""
     for word in range(0, len(query), 4):
         a, b, c, d = query[word], query[word + 1], query[word + 2], query[word + 3]
@@ -53,7 +53,7 @@ def _hamming(query: Any, columns: Any, start: int, count: int, found: Any) -> No
         four = columns[word + 3, start : start + count]
         if word == 0:
             for j in range(count):
-                found[j] = (
+                distances[j] = (
                     _count_bits(a ^ one[j])
                     + _count_bits(b ^ two[j])
                     + _count_bits(c ^ three[j])
@@ -61,7 +61,7 @@ def _hamming(query: Any, columns: Any, start: int, count: int, found: Any) -> No
                 )
         else:
             for j in range(count):
-                found[j] += (
+                distances[j] += (
                     _count_bits(a ^ one[j])
                     + _count_bits(b ^ two[j])
                     + _count_bits(c ^ three[j])
@@ -72,19 +72,19 @@ def _hamming(query: Any, columns: Any, start: int, count: int, found: Any) -> No
 @kernel
 def nearest_binary(queries: Any, columns: Any, distances: Array, indices: Any) -> None:
     """Among all landmarks (w,n), for queries (q,w)."""
-    found = np.empty(_BLOCK, np.int64)
+    block = np.empty(_BLOCK, np.int64)
     for start in range(0, columns.shape[1], _BLOCK):
         count = min(columns.shape[1] - start, _BLOCK)
         for q in range(len(queries)):
-            _hamming(queries[q], columns, start, count, found)
+            _hamming(queries[q], columns, start, count, block)
             nearest = np.int64(_FAR)
             for j in range(count):
-                nearest = min(nearest, found[j])
+                nearest = min(nearest, block[j])
             second = distances[q, 1]
             if nearest < second:  # seldom, once some blocks have been seen
                 for j in range(count):
-                    if found[j] < second:
-                        _insert(float(found[j]), start + j, distances[q], indices[q])
+                    if block[j] < second:
+                        _insert(float(block[j]), start + j, distances[q], indices[q])
                         second = distances[q, 1]
 
 

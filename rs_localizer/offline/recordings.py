@@ -56,7 +56,7 @@ def read_recording(
                 read = read_camera_info(message)
                 if calibration is not None and read != calibration:
                     raise RecordingError(
-                        f"{bag.path}: camera_info changes on the way; cut the recording there"
+                        f"{bag.path}: camera_info changes within the recording; cut it there"
                     )
                 calibration = read
             elif name == MAP_POINTS:

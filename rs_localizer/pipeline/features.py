@@ -33,12 +33,12 @@ class Extracted:
 
 def keypoints(extracted: Extracted, make: Make) -> Any:
     """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
-    found = extracted.features
-    width = found.descriptors.shape[1]
+    features = extracted.features
+    width = features.descriptors.shape[1]
     numbers = [(name, "<f4") for name in ("u", "v", "score")]
-    rows = np.empty(len(found), np.dtype([*numbers, ("descriptor", "u1", (width,))]))
-    rows["u"], rows["v"] = found.pixels.T
-    rows["score"], rows["descriptor"] = found.scores, found.descriptors
+    rows = np.empty(len(features), np.dtype([*numbers, ("descriptor", "u1", (width,))]))
+    rows["u"], rows["v"] = features.pixels.T
+    rows["score"], rows["descriptor"] = features.scores, features.descriptors
     return make_cloud(make, extracted.image.stamp_ns, extracted.image.frame, rows)
 
 
@@ -67,6 +67,6 @@ class FrameExtractor:
     def extract(self, image: Image) -> Extracted:
         """Look for keypoints in an image."""
         start = time.perf_counter()
-        found = self._extractor.extract(image.pixels)
+        features = self._extractor.extract(image.pixels)
         self.seconds += time.perf_counter() - start
-        return Extracted(image, found)
+        return Extracted(image, features)

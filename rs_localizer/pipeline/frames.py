@@ -134,18 +134,18 @@ def read_landmarks(file: str, frame: str) -> Map:
 
 def oddities_of_map(landmarks: Map, previous: Map | None) -> dict[Notice, str]:
     """What is worth telling of a map that takes the place of another, or of none."""
-    found: dict[Notice, str] = {}
+    notices: dict[Notice, str] = {}
     if landmarks.dropped:
-        found[Notice.MAP_INCOMPLETE] = (
+        notices[Notice.MAP_INCOMPLETE] = (
             f"{landmarks.dropped} landmarks are left out: they hold NaN or infinity, or no "
             "descriptor"
         )
     if previous is not None:
-        found[Notice.MAP_REPLACED] = (
+        notices[Notice.MAP_REPLACED] = (
             f"a map of {len(landmarks)} landmarks in frame {landmarks.frame!r} replaces the "
             f"one of {len(previous)} in frame {previous.frame!r}"
         )
-    return found
+    return notices
 
 
 # Coordinates in single precision shall tell millimetres, in m: they do as far as 8 km.
@@ -162,12 +162,12 @@ def oddities(cloud: Correspondences, camera: Camera, camera_frame: str) -> dict[
         camera: that ``camera_info`` describes.
         camera_frame: its optical frame.
     """
-    found = {
+    notices = {
         Notice.MAP_IS_CAMERA: _frame(cloud.frame, camera_frame),
         Notice.COARSE_COORDINATES: _coordinates(cloud),
         Notice.PIXELS_OUTSIDE: _pixels(cloud, camera),
     }
-    return {name: text for name, text in found.items() if text}
+    return {name: text for name, text in notices.items() if text}
 
 
 def _frame(frame: str, camera_frame: str) -> str:
@@ -234,18 +234,18 @@ class StreamResets:
         if last is None:
             return {}
         last_ns, last_frame = last
-        found: dict[Notice, str] = {}
+        notices: dict[Notice, str] = {}
         if stamp_ns < last_ns:
-            found[Notice.TIME_WENT_BACK] = (
+            notices[Notice.TIME_WENT_BACK] = (
                 f"the stamp {stamp_ns * 1e-9:.3f} s lies {(last_ns - stamp_ns) * 1e-9:.3f} s "
                 "before the last one; the previous frames are forgotten"
             )
         if frame != last_frame:
-            found[Notice.MAP_CHANGED] = (
+            notices[Notice.MAP_CHANGED] = (
                 f"the points are in frame {frame!r}, the last ones were in {last_frame!r}; "
                 "the previous frames are forgotten"
             )
-        return found
+        return notices
 
 
 ANY_CALIBRATION = Calibration(

@@ -45,12 +45,12 @@ class Detected:
 
 def correspondences(detected: Detected, make: Make) -> Any:
     """The sensor_msgs/PointCloud2 of an image: the same for node and bag."""
-    found = detected.detections
-    rows = np.empty(len(found.ids), detected.row)
+    detections = detected.detections
+    rows = np.empty(len(detections.ids), detected.row)
     for column, name in enumerate("xyz"):
-        rows[name] = found.points[:, column]
-    rows["u"], rows["v"] = found.pixels[:, 0], found.pixels[:, 1]
-    rows["score"], rows["id"] = found.scores, found.ids
+        rows[name] = detections.points[:, column]
+    rows["u"], rows["v"] = detections.pixels[:, 0], detections.pixels[:, 1]
+    rows["score"], rows["id"] = detections.scores, detections.ids
     return make_cloud(make, detected.image.stamp_ns, detected.map.map_frame, rows)
 
 
@@ -105,20 +105,20 @@ class FrameDetector:
 
     def detect(self, image: Image) -> Detected:
         """Look for markers in an image."""
-        found = self._detector.detect(image.pixels, image.stamp_ns)
+        detections = self._detector.detect(image.pixels, image.stamp_ns)
         for name, markers, text in (
-            (Notice.UNKNOWN_MARKERS, found.unknown, "which the map does not have"),
-            (Notice.REPEATED_MARKERS, found.repeated, "more than once: not used"),
+            (Notice.UNKNOWN_MARKERS, detections.unknown, "which the map does not have"),
+            (Notice.REPEATED_MARKERS, detections.repeated, "more than once: not used"),
         ):
             if markers:
                 shown = ", ".join(markers[:8]) + (", ..." if len(markers) > 8 else "")
                 self._notice(name, f"the image shows {shown}, {text}")
         self._images += 1
         if self._agreed < _AGREED or self._images % _ONE_IN == 0:
-            fault = self._check.fault(found)
+            fault = self._check.fault(detections)
             if fault is not None:
                 self._agreed = 0
                 self._notice(Notice.WRONG_MAP, fault)
-            elif len(found.ids):
+            elif len(detections.ids):
                 self._agreed += 1
-        return Detected(image, found, self.map, self._row)
+        return Detected(image, detections, self.map, self._row)

@@ -114,7 +114,7 @@ class ImuInput:
         self._unused: Unused | None = None
         self._reasons: Counter[str] = Counter()
         self._in_a_row: deque[ImuReason] = deque(maxlen=_LONG)
-        self._told: ImuReason | None = None
+        self._reported: ImuReason | None = None
         self._status: InertialStatus | None = None
         self._given_offset = 0.0
 
@@ -136,7 +136,7 @@ class ImuInput:
         recently = tuple(self._recently)
         if not recently:
             return None
-        left = math.nan if self._status is None else self._status.time_offset
+        estimated = math.nan if self._status is None else self._status.time_offset
         reasons = [unused.reason for unused in recently if unused is not None]
         usual = max(reasons, key=reasons.count, default=None)
         return ImuState(
@@ -147,7 +147,7 @@ class ImuInput:
             next((u for u in reversed(recently) if u is not None and u.reason == usual), None),
             dict(self._reasons),
             self._buffer.rate(),
-            self._given_offset + left,
+            self._given_offset + estimated,
             self._status,
             self._gravity,
         )
@@ -167,7 +167,7 @@ class ImuInput:
         time_ns: int,
         camera_frame: str,
         transforms: Transforms,
-        given: tuple[ArrayLike, ArrayLike, ArrayLike | None],
+        matches: tuple[ArrayLike, ArrayLike, ArrayLike | None],
     ) -> Estimate | Failure:
         """Localize the frame whose middle row was exposed at ``time_ns``, with its readings.
 
@@ -180,20 +180,20 @@ class ImuInput:
             given: points, pixels and scores, as :meth:`Tracker.localize` takes them.
         """
         if not self._wanted(config):
-            return tracker.localize(time_ns, *given)
+            return tracker.localize(time_ns, *matches)
         if tracker.inertial is None:
             unknown = config.readout_time == 0.0
             reason = ImuReason.NO_READOUT_TIME if unknown else ImuReason.NOT_TRACKING
             self._count(config, None, Unused(reason))
-            return tracker.localize(time_ns, *given)
-        found = self._samples(tracker, config, time_ns, camera_frame, transforms)
-        if isinstance(found, Unused):
-            result = tracker.localize(time_ns, *given)
-            self._count(config, tracker, found)
+            return tracker.localize(time_ns, *matches)
+        samples = self._samples(tracker, config, time_ns, camera_frame, transforms)
+        if isinstance(samples, Unused):
+            result = tracker.localize(time_ns, *matches)
+            self._count(config, tracker, samples)
         else:
-            result = tracker.localize(time_ns, *given, imu=found)
+            result = tracker.localize(time_ns, *matches, imu=samples)
             self._count(config, tracker, _why(tracker.inertial))
-            self._compare_gravity(config, found, result)
+            self._compare_gravity(config, samples, result)
         return result
 
     def _compare_gravity(
@@ -227,17 +227,19 @@ class ImuInput:
         if (two := self._two_frames()) is not None:
             return two
         start_ns, end_ns = _exposure(config, time_ns, tracker)
-        found = self._buffer.between(start_ns, end_ns, start_ns - _BEFORE_NS, end_ns + _AROUND_NS)
-        if isinstance(found, Lacking):
-            slow = found.lack is Lack.NOT_YET and self._buffer.rate() < _LEAST_RATE
+        readings = self._buffer.between(
+            start_ns, end_ns, start_ns - _BEFORE_NS, end_ns + _AROUND_NS
+        )
+        if isinstance(readings, Lacking):
+            slow = readings.lack is Lack.NOT_YET and self._buffer.rate() < _LEAST_RATE
             if slow:  # which is why they are late, and what is to be said of them
                 return Unused(ImuReason.TOO_SLOW, f"{self._buffer.rate():.0f} Hz")
-            return Unused(_OF_LACK[found.lack], found.detail)
+            return Unused(_OF_LACK[readings.lack], readings.detail)
         half_ns = round(0.5e9 * config.readout_time)
-        times_ns = found.stamps_ns + round(1e9 * config.imu.time_offset)
+        times_ns = readings.stamps_ns + round(1e9 * config.imu.time_offset)
         frames, rows_ns = (camera_frame, self.frame), (time_ns - half_ns, time_ns + half_ns)
         try:
-            return in_camera_axes(found, times_ns, transforms, frames, rows_ns, _AROUND_NS)
+            return in_camera_axes(readings, times_ns, transforms, frames, rows_ns, _AROUND_NS)
         except TransformError as error:
             text = f"from the IMU {self.frame!r} to the camera {camera_frame!r}: {error}"
             return Unused(ImuReason.NO_TRANSFORM, text)
@@ -258,12 +260,12 @@ class ImuInput:
         self._given_offset = config.imu.time_offset
         if unused is None:
             self._in_a_row.clear()
-            self._told = None
+            self._reported = None
             return
         self._reasons[unused.reason] += 1
         self._in_a_row.append(unused.reason)
-        if self._in_a_row.count(unused.reason) == _LONG and self._told != unused.reason:
-            self._told = unused.reason
+        if self._in_a_row.count(unused.reason) == _LONG and self._reported != unused.reason:
+            self._reported = unused.reason
             self._notice(unused.reason, f"the IMU is not used: {unused}")
 
 
@@ -282,8 +284,8 @@ def inertial_settings(config: NodeConfig) -> InertialSettings | None:
 def _exposure(config: NodeConfig, time_ns: int, tracker: Tracker) -> tuple[int, int]:
     """First and last row by the clock of the IMU, as far as that is known."""
     status = tracker.inertial
-    left = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset
-    middle_ns = time_ns - round(1e9 * (config.imu.time_offset + left))
+    estimated = 0.0 if status is None or math.isnan(status.time_offset) else status.time_offset
+    middle_ns = time_ns - round(1e9 * (config.imu.time_offset + estimated))
     half_ns = round(0.5e9 * config.readout_time)
     return middle_ns - half_ns, middle_ns + half_ns
 

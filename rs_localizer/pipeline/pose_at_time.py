@@ -98,9 +98,9 @@ def with_timing(
 
 def either(pose: Pose, other: Pose) -> Pose:
     """A pose with room for another that it may be as well."""
-    way = other.position - pose.position
+    displacement = other.position - pose.position
     turn = so3.log(np.ascontiguousarray(other.rotation @ pose.rotation.T))
-    step = np.concatenate([way, turn])
+    step = np.concatenate([displacement, turn])
     return replace(pose, covariance=pose.covariance + np.outer(step, step))
 
 
@@ -126,9 +126,9 @@ def _beyond_rows(estimate: Estimate, tau: float) -> tuple[float, float]:
         first, last = float(estimate.turn.tau[0]), float(estimate.turn.tau[-1])
         unknown = abs(tau - min(max(tau, first), last))
         if unknown > 0.0:
-            known = estimate.turn.at_rows(_ROWS)[1]
+            rates_of_turn = estimate.turn.at_rows(_ROWS)[1]
             # Of a rate that goes on as it changes, the distance from the mean at this row.
-            variance = float(np.mean((known - known.mean(axis=0)) ** 2))
+            variance = float(np.mean((rates_of_turn - rates_of_turn.mean(axis=0)) ** 2))
             variance *= 3.0 * (1.0 + 2.0 * beyond) ** 2
             turn, rate = turn + variance * unknown**2, rate + variance
     return turn, rate

@@ -156,7 +156,7 @@ def of_camera(
     config: NodeConfig,
     camera: Camera,
     frame: str,
-    known: ReadoutKnown,
+    readout: ReadoutKnown,
 ) -> Localized:
     """Pose and twist of the camera's optical frame, of this name, at the published moment.
 
@@ -166,12 +166,12 @@ def of_camera(
     readout_time = config.readout_time
     stamp_ns, tau = published_moment(config, camera, cloud.stamp_ns)
     moving = readout_time > 0.0 and find_solver(config.solver).rolling_shutter
-    if known.global_shutter and estimate.turn is None:
+    if readout.global_shutter and estimate.turn is None:
         moving = False  # an image says nothing of velocities
     pose = pose_at(estimate, tau)
     twist = twist_at(estimate, tau, readout_time) if moving else None
-    deviation = known.deviation
-    if twist is not None and known.may_be_reversed:
+    deviation = readout.deviation
+    if twist is not None and readout.may_be_reversed:
         other = pose_at(estimate, -tau)
         pose, twist = either(pose, other), backwards(twist)
     if twist is not None and deviation > 0.0:
@@ -196,10 +196,10 @@ def of_body(
     localized: Localized, config: NodeConfig, transforms: Transforms
 ) -> Localized | Refusal:
     """The same of ``base_frame``, from that of the camera, with the covariance that is wanted."""
-    found = _mounted(localized, config, transforms)
-    if found and config.orientation_covariance == OrientationCovariance.ROLL_PITCH_YAW:
-        return replace(found, pose=about_angles(found.pose))
-    return found
+    body = _mounted(localized, config, transforms)
+    if body and config.orientation_covariance == OrientationCovariance.ROLL_PITCH_YAW:
+        return replace(body, pose=about_angles(body.pose))
+    return body
 
 
 def _mounted(

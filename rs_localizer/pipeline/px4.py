@@ -124,10 +124,10 @@ class Jumps:
         config = self._config()
         twist = last.twist or _unknown(config)
         orientation = last.pose.rotation
-        way = orientation @ twist.linear * seconds
+        displacement = orientation @ twist.linear * seconds
         turn = orientation @ so3.exp(twist.angular * seconds) @ frame.pose.rotation.T
         steps = (
-            frame.pose.position - last.pose.position - way,
+            frame.pose.position - last.pose.position - displacement,
             so3.log(np.ascontiguousarray(turn)),
         )
         both = last.pose.covariance + frame.pose.covariance

@@ -135,12 +135,12 @@ class ScanAxis:
         if self._localizer is None:
             other = _OTHER_AXIS[ScanDirection(config.scan_direction)]
             self._localizer = Localizer(replace(camera, scan_direction=other), config)
-        found = self._localizer.find(cloud.points, cloud.pixels, cloud.scores)
-        ratio = _log_ratio(result, found, _TRUNCATED * config.inlier_threshold)
+        other_result = self._localizer.find(cloud.points, cloud.pixels, cloud.scores)
+        ratio = _log_ratio(result, other_result, _TRUNCATED * config.inlier_threshold)
         ratio = min(max(ratio, -_MOST_OF_A_FRAME), _MOST_OF_A_FRAME)
         self._evidence = max(_MEMORY * self._evidence + ratio, _LEAST)
-        if found and self._leans:
-            self._measure(time_ns, found, cloud)
+        if other_result and self._leans:
+            self._measure(time_ns, other_result, cloud)
 
     def _measure(self, time_ns: int, estimate: Estimate, cloud: Correspondences) -> None:
         assert self._localizer is not None
@@ -177,13 +177,13 @@ def _log_ratio(ours: Estimate | Failure, other: Estimate | Failure, most: float)
     count = len(of_both[0].inliers)
     noise = max(min(result.residual_rms for result in of_both) / np.sqrt(2.0), _LEAST_NOISE)
 
-    def left(result: Estimate | Failure) -> float:
+    def cost(result: Estimate | Failure) -> float:
         if not result:
             return count * most**2
         cut = np.fmin(result.residuals, most)  # NaN: unusable by either
         return float(cut @ cut)
 
-    return float((left(ours) - left(other)) / (2.0 * noise**2))
+    return float((cost(ours) - cost(other)) / (2.0 * noise**2))
 
 
 # Frames from one measurement to the next: few at first, more when there is more to compute.
@@ -311,18 +311,18 @@ class ReadoutWatch:
         lens = result.lens
         camera = camera if lens is None else lens.mended(camera)
         try:
-            found = self._measure(camera, time_ns, result, cloud)
+            measured = self._measure(camera, time_ns, result, cloud)
         except np.linalg.LinAlgError:  # a frame that says nothing must not stop the next ones
             self._monitor.reset()
             self._under_way, self.doubtful = None, False
             return config
         if self._axis.doubtful:
             return config
-        if found is not None:
-            self.measured = found
+        if measured is not None:
+            self.measured = measured
             if estimates:
-                return self._adopt(config, found, ScanDirection(config.scan_direction))
-            self._judge(config, found, _wrong(config, found))
+                return self._adopt(config, measured, ScanDirection(config.scan_direction))
+            self._judge(config, measured, _wrong(config, measured))
         self._doubt(config)
         if _is_some(config, self.measured):
             self._axis.confirm()
@@ -332,16 +332,16 @@ class ReadoutWatch:
 
     def _other_axis(self, config: NodeConfig, estimates: bool) -> NodeConfig:
         """Say that the shutter moves along the other axis, or adopt it."""
-        found, direction = self._axis.measured, self._axis.direction
-        assert found is not None
+        measured, direction = self._axis.measured, self._axis.direction
+        assert measured is not None
         assert direction is not None
-        value = _milliseconds(abs(found.readout_time), found.deviation)
+        value = _milliseconds(abs(measured.readout_time), measured.deviation)
         self._contradict(
             _Kind.AXIS,
             f"the image shows a shutter that moves {direction} in {value}, not "
             f"{config.scan_direction}; no poses are published until scan_direction is {direction}",
         )
-        return self._adopt(config, found, direction) if estimates else config
+        return self._adopt(config, measured, direction) if estimates else config
 
     def _doubt(self, config: NodeConfig) -> None:
         """What a few frames tell, as long as a measurement says nothing else."""
@@ -353,20 +353,20 @@ class ReadoutWatch:
             self.doubtful = False
             self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
 
-    def _judge(self, config: NodeConfig, found: MeasuredReadout, wrong: _Kind | None) -> None:
+    def _judge(self, config: NodeConfig, measured: MeasuredReadout, wrong: _Kind | None) -> None:
         sure = self._monitor.odds.certain  # of a global one, whatever errors of the map look like
         if wrong is None:
             self.fault = ""
         elif sure:
             self._contradict(_Kind.GLOBAL, _sentence(_Kind.GLOBAL, config, None))
         else:
-            self._contradict(wrong, _sentence(wrong, config, found))
-        off = math.hypot(found.readout_time - config.readout_time, found.deviation)
+            self._contradict(wrong, _sentence(wrong, config, measured))
+        off = math.hypot(measured.readout_time - config.readout_time, measured.deviation)
         shorter = config.readout_time / max(
-            abs(found.readout_time), _GLOBAL * config.readout_time, found.deviation
+            abs(measured.readout_time), _GLOBAL * config.readout_time, measured.deviation
         )
         self.error = 0.0 if wrong is None else off * max(shorter, 1.0)
-        may_be = _may_be_none(config, found)
+        may_be = _may_be_none(config, measured)
         self.far_off = may_be and (self.far_off or wrong is not None)
         self.global_shutter = self.far_off and (
             self.global_shutter if wrong is None else sure or wrong is _Kind.GLOBAL
@@ -393,67 +393,68 @@ class ReadoutWatch:
         self._under_way.advance(_SHARE)
         if not self._under_way.done:
             return None
-        found, self._under_way = self._under_way.found, None
-        return found
+        measured, self._under_way = self._under_way.found, None
+        return measured
 
     def _adopt(
-        self, config: NodeConfig, found: MeasuredReadout, along: ScanDirection
+        self, config: NodeConfig, measured: MeasuredReadout, along: ScanDirection
     ) -> NodeConfig:
         """The settings with a measured readout time, once it is well known.
 
         Args:
             along: the direction in which it would be positive.
         """
-        value = abs(found.readout_time)
-        known = found.relative_deviation < _WELL_KNOWN and found.triples >= _ENOUGH
-        if not known or value > LONGEST_READOUT_TIME:
+        value = abs(measured.readout_time)
+        sure = measured.relative_deviation < _WELL_KNOWN and measured.triples >= _ENOUGH
+        if not sure or value > LONGEST_READOUT_TIME:
             return config
-        direction = along if found.readout_time > 0.0 else REVERSED[along]
+        direction = along if measured.readout_time > 0.0 else REVERSED[along]
         self._notice(
             Notice.READOUT_TIME,
-            f"estimated: {_milliseconds(value, found.deviation)}, {direction}; set readout_time to "
-            f"{value:.5f} and scan_direction to {direction} to have it from the start",
+            f"estimated: {_milliseconds(value, measured.deviation)}, {direction}; set readout_time "
+            f"to {value:.5f} and scan_direction to {direction} to have it from the start",
         )
         return replace(
             config,
             readout_time=value,
-            readout_time_deviation=min(found.deviation, LONGEST_READOUT_TIME),
+            readout_time_deviation=min(measured.deviation, LONGEST_READOUT_TIME),
             scan_direction=direction.value,
         )
 
 
-def _may_be_none(config: NodeConfig, found: MeasuredReadout) -> bool:
+def _may_be_none(config: NodeConfig, measured: MeasuredReadout) -> bool:
     """Whether the readout time may be so far off that a global shutter is no worse."""
-    return found.readout_time < _FAR_OFF * config.readout_time
+    return measured.readout_time < _FAR_OFF * config.readout_time
 
 
-def _is_some(config: NodeConfig, found: MeasuredReadout | None) -> bool:
+def _is_some(config: NodeConfig, measured: MeasuredReadout | None) -> bool:
     """Whether the readout time was measured, and nearer to the one that is set than to none."""
-    if found is None:
+    if measured is None:
         return False
-    return found.readout_time - _SURELY * found.deviation > _FAR_OFF * config.readout_time
+    return measured.readout_time - _SURELY * measured.deviation > _FAR_OFF * config.readout_time
 
 
-def _wrong(config: NodeConfig, found: MeasuredReadout) -> _Kind | None:
-    if not found.contradicts(config.readout_time):
+def _wrong(config: NodeConfig, measured: MeasuredReadout) -> _Kind | None:
+    if not measured.contradicts(config.readout_time):
         return None
-    if abs(found.readout_time) < _GLOBAL * config.readout_time:
+    if abs(measured.readout_time) < _GLOBAL * config.readout_time:
         return _Kind.GLOBAL
-    reversed_ = found.readout_time < -_SURELY * found.deviation
+    reversed_ = measured.readout_time < -_SURELY * measured.deviation
     return _Kind.REVERSED if reversed_ else _Kind.DURATION
 
 
-def _sentence(kind: _Kind, config: NodeConfig, found: MeasuredReadout | None) -> str:
-    if kind is _Kind.REVERSED and found is not None:
-        given = ScanDirection(config.scan_direction)
+def _sentence(kind: _Kind, config: NodeConfig, measured: MeasuredReadout | None) -> str:
+    if kind is _Kind.REVERSED and measured is not None:
+        direction = ScanDirection(config.scan_direction)
+        duration = _milliseconds(-measured.readout_time, measured.deviation)
         return (
-            f"the shutter moves against scan_direction {given}, in "
-            f"{_milliseconds(-found.readout_time, found.deviation)}: is it {REVERSED[given]}?"
+            f"the shutter moves against scan_direction {direction}, in {duration}: is it "
+            f"{REVERSED[direction]}?"
         )
     estimated = (
         "estimated readout time 0 ms (a global shutter)"
-        if found is None
-        else f"estimated readout time {_milliseconds(found.readout_time, found.deviation)}"
+        if measured is None
+        else f"estimated readout time {_milliseconds(measured.readout_time, measured.deviation)}"
         + (" (a global shutter)" if kind is _Kind.GLOBAL else "")
     )
     return f"{estimated} differs from readout_time = {1e3 * config.readout_time:g} ms"

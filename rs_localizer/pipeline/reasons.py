@@ -115,7 +115,7 @@ REASONS: dict[str, Meaning] = {
         "a fault of this program, which continues with the next frame", "please report the message"
     ),
     Reason.NO_TRANSFORM: Meaning(
-        "TF does not say where the camera is on base_frame",
+        "TF has no transform from the camera to base_frame",
         "record /tf and /tf_static, too; a robot_state_publisher has to run",
     ),
 }
@@ -149,7 +149,7 @@ IMU_REASONS: dict[str, Meaning] = {
         "two IMUs, or two drivers, publish on one topic: remap one of them",
     ),
     ImuReason.NO_TRANSFORM: Meaning(
-        "TF does not say how the IMU is turned against the camera",
+        "TF has no transform from the IMU to the camera",
         "publish, or record, their transform on /tf_static; ROS needs tf2_ros for it",
     ),
     ImuReason.NO_READOUT_TIME: Meaning(
@@ -157,7 +157,7 @@ IMU_REASONS: dict[str, Meaning] = {
         "set readout_time; rs_localizer calibrate finds it",
     ),
     ImuReason.NOT_TRACKING: Meaning(
-        "solver knows no rolling shutter",
+        "the solver is for global shutters",
         "another solver",
     ),
     ImuReason.DOUBTED: Meaning(
@@ -165,11 +165,11 @@ IMU_REASONS: dict[str, Meaning] = {
         "nothing, if it is rare; otherwise imu.gyroscope_noise, imu.time_offset",
     ),
     ImuReason.DISAGREES: Meaning(
-        "the gyroscope does not turn as the camera does",
+        "the gyroscope's rates disagree with the camera's motion",
         "is it on the same body; imu.time_offset, the frame_id of its messages, their units",
     ),
     ImuReason.TURNED: Meaning(
-        "the gyroscope turns as the camera does, but about other axes than TF says",
+        "the gyroscope's axes disagree with TF",
         "the transform between the two frame_ids; the angle is in the diagnostics",
     ),
 }

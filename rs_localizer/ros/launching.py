@@ -54,7 +54,7 @@ def setting_arguments(kind: Kind = NodeConfig) -> list[DeclareLaunchArgument]:
     ]
 
 
-def given(configurations: Mapping[str, str], kind: Kind = NodeConfig) -> dict[str, Any]:
+def chosen_parameters(configurations: Mapping[str, str], kind: Kind = NodeConfig) -> dict[str, Any]:
     """The parameters of a node that were given as arguments, ``use_sim_time`` among them.
 
     What cannot be read as the setting's type goes on as text: the node says what is wrong with it.
@@ -125,8 +125,8 @@ def need_files(configurations: Mapping[str, str]) -> None:
     files = {name: text for name, text in configurations.items() if name.endswith("params_file")}
     for params_file, kind, name in _FILES:
         if params_file in configurations:
-            known = read_params(configurations[params_file], kind)
-            files[name] = configurations.get(name) or known.get(name, "")
+            parameters = read_params(configurations[params_file], kind)
+            files[name] = configurations.get(name) or parameters.get(name, "")
     for name, text in files.items():
         if text and not Path(text).expanduser().exists():
             raise RuntimeError(f"{name}: {text} does not exist")
@@ -162,7 +162,7 @@ def localizer(
         namespace=LaunchConfiguration("namespace"),
         parameters=[
             LaunchConfiguration("params_file"),
-            {**(of_map or {}), **given(configurations)},
+            {**(of_map or {}), **chosen_parameters(configurations)},
         ],
         remappings=list(remappings),
         arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
@@ -209,7 +209,7 @@ def from_camera(kind: Kind, params_argument: str, nodes: Callable[[Any], list[No
         nodes: to start, when the launch context knows the arguments.
     """
     common = common_arguments()
-    known = {item.name for item in common}
+    declared = {item.name for item in common}
     name = NODES[kind]
     arguments = [
         argument(
@@ -222,7 +222,7 @@ def from_camera(kind: Kind, params_argument: str, nodes: Callable[[Any], list[No
         argument("camera_info", "camera_info", "topic of the calibration"),
         argument(params_argument, share("config", f"{name}.yaml"), f"parameters of {name}"),
         *common,
-        *(item for item in setting_arguments(kind) if item.name not in known),
+        *(item for item in setting_arguments(kind) if item.name not in declared),
     ]
     return starting(arguments, nodes)
 
@@ -236,7 +236,11 @@ def camera_driver(configurations: Mapping[str, str]) -> list[Node]:
         raise RuntimeError(f"camera must be one of none, {', '.join(DRIVERS)}; got {package!r}")
     need_package(package, f"camera:={package}")
     url = ParameterValue(configurations["calibration"], value_type=str)
-    time = {key: value for key, value in given(configurations).items() if key == "use_sim_time"}
+    time = {
+        key: value
+        for key, value in chosen_parameters(configurations).items()
+        if key == "use_sim_time"
+    }
     return [
         Node(
             package=package,

@@ -192,12 +192,12 @@ def _visible(
         if len(ids) >= settings.points:
             break
         block = candidates[start : start + 2 * settings.points]
-        seen, tau = project_rolling(camera, poses_at, map_points[block])
-        inside = np.all((seen > border - 0.5) & (seen < size - 0.5 - border), axis=1)
-        block, seen, tau = block[inside], seen[inside], tau[inside]
+        projected, tau = project_rolling(camera, poses_at, map_points[block])
+        inside = np.all((projected > border - 0.5) & (projected < size - 0.5 - border), axis=1)
+        block, projected, tau = block[inside], projected[inside], tau[inside]
         rotations, translations = poses_at(tau)
         local = np.einsum("nij,nj->ni", rotations, map_points[block]) + translations
-        folded = np.abs(camera.rays(seen) - local[:, :2] / local[:, 2:]).max(axis=1)
+        folded = np.abs(camera.rays(projected) - local[:, :2] / local[:, 2:]).max(axis=1)
         kept = (local[:, 2] > _NEAREST) & (folded < _FOLD_TOLERANCE)
-        ids, pixels = np.concatenate([ids, block[kept]]), np.concatenate([pixels, seen[kept]])
+        ids, pixels = np.concatenate([ids, block[kept]]), np.concatenate([pixels, projected[kept]])
     return ids[: settings.points], pixels[: settings.points]

@@ -76,11 +76,11 @@ class MarkerWalls:
 
     def _frame(self, stamp_ns: int) -> tuple[MarkerFrame, Image]:
         image = self._renderer.image(self.motion, stamp_ns, (self._seed, stamp_ns))
-        seen = self._detector.detect(image)
+        detections = self._detector.detect(image)
         middle_ns = middle_stamp(CAMERA, stamp_ns)
         state = self.motion.state(middle_ns, np.zeros(1))
         frame = MarkerFrame(
-            stamp_ns, middle_ns, seen.points, seen.pixels, self._visible(middle_ns),
+            stamp_ns, middle_ns, detections.points, detections.pixels, self._visible(middle_ns),
             state.positions[0], float(np.degrees(np.linalg.norm(state.angular[0]))),
         )  # fmt: skip
         return frame, image

@@ -114,9 +114,9 @@ def _boxes(
     low: Array, high: Array, positions: Array, count: int, rng: np.random.Generator
 ) -> Array:
     """Points on upright boxes that keep clear of the positions."""
-    way = positions[:: max(1, len(positions) // 500)]
+    path = positions[:: max(1, len(positions) // 500)]
     centres = rng.uniform(low, high, size=(20 * _BOXES, 3))
-    distances = np.linalg.norm(centres[:, None] - way[None], axis=2).min(axis=1)
+    distances = np.linalg.norm(centres[:, None] - path[None], axis=2).min(axis=1)
     centres = centres[distances > _CLEARANCE + 0.5 * _BOX_SIZE[1] * np.sqrt(3.0)][:_BOXES]
     if len(centres) == 0:
         return np.zeros((0, 3))

@@ -13,7 +13,7 @@ def test_presentation_times_from_one_second_on():
     clock = ImageClock()
     assert [clock.relative(ms * MS) for ms in OWN] == [10**9 + ms * MS for ms in OWN]
     assert clock.relative(None) is None
-    assert clock.told() == (
+    assert clock.description() == (
         "times: the presentation times of the video, 13.33 images/s on average; the first image at "
         "1 s (--start sets it)"
     )
@@ -24,7 +24,7 @@ def test_a_rate_overrides_and_is_compared():
     clock = ImageClock(rate=30.0, start_ns=5 * 10**9)
     stamps = [clock.relative(ms * MS) for ms in OWN]
     assert stamps == [5 * 10**9 + round(k * 1e9 / 30) for k in range(5)]
-    assert clock.told() == "times: --rate 30; the first image at 5 s (--start sets it)"
+    assert clock.description() == "times: --rate 30; the first image at 5 s (--start sets it)"
     fault = clock.fault()
     assert fault is not None
     assert "--rate 30 disagrees with the file, whose own times mean 13.33 images/s" in fault

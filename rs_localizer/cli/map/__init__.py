@@ -10,7 +10,7 @@ from types import ModuleType
 # help: what only its work needs is imported late.
 ACTIONS = {
     "build": "make a map from images",
-    "info": "say what a map holds",
+    "info": "describe a map",
     "convert": "write a map to another file",
     "align": "bring a map to metres, to z up, to an origin",
     "survey": "find where markers are, from a recording that shows them",

@@ -40,32 +40,32 @@ class Wishes:
     origin_at: Array | None = None  # (3,) m, in the map as it is
 
 
-def place_of(found: Map | MarkerMap) -> Place:
+def place_of(any_map: Map | MarkerMap) -> Place:
     """Where the landmarks, or the middles of the markers, of a map are."""
-    if isinstance(found, MarkerMap):
-        known = {marker.id: marker.pose.position for marker in found.markers}
-    elif found.ids is None:
-        known = {}
+    if isinstance(any_map, MarkerMap):
+        places = {marker.id: marker.pose.position for marker in any_map.markers}
+    elif any_map.ids is None:
+        places = {}
     else:
-        known = dict(zip(found.ids.tolist(), found.points, strict=True))
+        places = dict(zip(any_map.ids.tolist(), any_map.points, strict=True))
 
     def place(number: int) -> Array:
-        if number not in known:
-            what = "marker" if isinstance(found, MarkerMap) else "landmark"
+        if number not in places:
+            what = "marker" if isinstance(any_map, MarkerMap) else "landmark"
             raise ValueError(f"the map has no {what} {number}")
-        return np.asarray(known[number])
+        return np.asarray(places[number])
 
     return place
 
 
-def alignment(found: Map | MarkerMap, wishes: Wishes) -> Similarity:
+def alignment(any_map: Map | MarkerMap, wishes: Wishes) -> Similarity:
     """What brings a map to where it is wanted.
 
     Raises:
         ValueError: for ids that the map does not have, or points that tell no direction or size.
     """
-    place = place_of(found)
-    turn = upright(-_up(found, wishes, place))
+    place = place_of(any_map)
+    turn = upright(-_up(any_map, wishes, place))
     scale = wishes.scale or 1.0
     if wishes.distance is not None:
         one, other, wanted = wishes.distance
@@ -81,20 +81,20 @@ def alignment(found: Map | MarkerMap, wishes: Wishes) -> Similarity:
     return Similarity(scale, turn, -scale * turn @ origin)
 
 
-def _up(found: Map | MarkerMap, wishes: Wishes, place: Place) -> Array:
+def _up(any_map: Map | MarkerMap, wishes: Wishes, place: Place) -> Array:
     """The direction (3,) that shall point up."""
     if wishes.up is not None:
         if not np.linalg.norm(wishes.up) > 0.0:
             raise ValueError("the direction of up must not be 0 0 0")
         return wishes.up
     if wishes.upright is not None:
-        if not isinstance(found, MarkerMap):
+        if not isinstance(any_map, MarkerMap):
             raise ValueError("only markers stand upright; landmarks have no axes")
         place(wishes.upright)
-        marker = next(marker for marker in found.markers if marker.id == wishes.upright)
+        marker = next(marker for marker in any_map.markers if marker.id == wishes.upright)
         return np.asarray(marker.pose.rotation[:, 1])
     if wishes.floor:
-        return _normal(np.array([place(number) for number in wishes.floor]), found.points)
+        return _normal(np.array([place(number) for number in wishes.floor]), any_map.points)
     return _UP
 
 
@@ -105,44 +105,48 @@ def _normal(floor: Array, points: Array) -> Array:
     middle = floor.mean(axis=0)
     _, extents, axes = np.linalg.svd(floor - middle)
     if not extents[1] > _LINE * extents[0]:
-        raise ValueError("the ids of the floor lie on a line: they do not say what is level")
+        raise ValueError("the ids of the floor lie on a line, which determines no level")
     normal = axes[2]
     return np.asarray(normal if (points.mean(axis=0) - middle) @ normal >= 0.0 else -normal)
 
 
-def moved(found: Map, by: Similarity) -> Map:
+def moved(landmarks: Map, by: Similarity) -> Map:
     """A map of landmarks after a similarity."""
-    covariances = found.covariances
+    covariances = landmarks.covariances
     if covariances is not None:
         covariances = by.covariances(covariances)
-    return replace(found, points=by(found.points), covariances=covariances)
+    return replace(landmarks, points=by(landmarks.points), covariances=covariances)
 
 
-def moved_markers(found: MarkerMap, by: Similarity) -> MarkerMap:
+def moved_markers(marker_map: MarkerMap, by: Similarity) -> MarkerMap:
     """A marker map after a similarity, which changes the markers' sizes with the scale.
 
     Raises:
         ValueError: when boards would change their size.
     """
-    if found.boards and by.scale != 1.0:
+    if marker_map.boards and by.scale != 1.0:
         raise ValueError("a map with boards cannot be scaled: their squares have a size")
     boards = tuple(
         replace(
             board,
             pose=Pose(by(board.pose.position[None])[0], by.rotation @ board.pose.rotation),
         )
-        for board in found.boards
+        for board in marker_map.boards
     )
-    return MarkerMap(tuple(_moved(marker, by) for marker in found.markers), boards, found.map_frame)
+    return MarkerMap(
+        tuple(_moved(marker, by) for marker in marker_map.markers), boards, marker_map.map_frame
+    )
 
 
 def _moved(marker: Marker, by: Similarity) -> Marker:
-    known = marker.deviations
-    if known is not None:
+    deviations = marker.deviations
+    if deviations is not None:
         # Correlations are not kept: as if there were none.
-        place, turn = (np.sqrt(by.rotation**2 @ part**2) for part in (known[:3], known[3:]))
-        known = np.concatenate([by.scale * place, turn])
-    return Marker(marker.family, marker.id, by(marker.corners), known)
+        place, turn = (
+            np.sqrt(by.rotation**2 @ part**2) for part in (deviations[:3], deviations[3:])
+        )
+        deviations = np.concatenate([by.scale * place, turn])
+    return Marker(marker.family, marker.id, by(marker.corners), deviations)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -183,13 +187,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     either.check_output(args)
     wishes = _wishes(args)
-    found, _ = either.read(args)
-    by = alignment(found, wishes)
-    result = moved_markers(found, by) if isinstance(found, MarkerMap) else moved(found, by)
+    any_map, _ = either.read(args)
+    by = alignment(any_map, wishes)
+    result = moved_markers(any_map, by) if isinstance(any_map, MarkerMap) else moved(any_map, by)
     turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(by.rotation) - 1.0), -1.0, 1.0)))
     shift = ", ".join(f"{value:.4f}" for value in by.translation)
     print(f"scaled by {by.scale:.6g}, turned by {turn:.3f} deg, shifted by ({shift}) m")
-    if isinstance(found, MarkerMap) and by.scale != 1.0:
+    if isinstance(any_map, MarkerMap) and by.scale != 1.0:
         print("the sizes of the markers are scaled as well")
     either.write(args, result)
 

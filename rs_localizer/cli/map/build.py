@@ -82,11 +82,11 @@ class Shutter:
 def shutter_of(args: argparse.Namespace) -> Shutter:
     """As given, or as it stands beside the images of a recording."""
     values = shutter_values(args)
-    known = build(values)
+    settings = build(values)
     # 0 is a global shutter where the user says so, and unknown in a file.
-    unknown = args.readout_time is None and not known.readout_time
-    readout_time = None if unknown else known.readout_time
-    return Shutter(readout_time, known.scan_direction if "scan_direction" in values else None)
+    unknown = args.readout_time is None and not settings.readout_time
+    readout_time = None if unknown else settings.readout_time
+    return Shutter(readout_time, settings.scan_direction if "scan_direction" in values else None)
 
 
 def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
@@ -111,7 +111,7 @@ def look_at_images(args: argparse.Namespace, looker: Looker) -> Looked:
                 continue
             seen_by = None if shot.camera_info is None else cameras.of(shot, image)
             if size not in (None, image.pixels.shape) or (views and seen_by is not camera):
-                raise ValueError("the camera changes on the way; cut the recording there")
+                raise ValueError("the camera changes within the recording; cut it there")
             camera, size = seen_by, image.pixels.shape
             stamps.append(image.stamp_ns)
             asked = [s for s in wanted if s not in named and _time(image, stamps) >= s - 1e-3]
@@ -190,12 +190,12 @@ def _of_bag(args: argparse.Namespace) -> GivenImu | None:
     with open_bag(args.images) as bag:
         topics = imu_topics(bag)
         named = [topic for topic in topics if topic.split("/")[-1] == IMU]
-        found = named if len(named) == 1 else topics
-        if args.imu is None and len(found) != 1:
-            if found:
-                print(f"no IMU is used: choose {' or '.join(found)} with --imu")
+        candidates = named if len(named) == 1 else topics
+        if args.imu is None and len(candidates) != 1:
+            if candidates:
+                print(f"no IMU is used: choose {' or '.join(candidates)} with --imu")
             return None
-        topic = args.imu or (found[0] if len(found) == 1 else None)
+        topic = args.imu or (candidates[0] if len(candidates) == 1 else None)
         frame = optical_frame(bag, args.camera_info, args.image)
         try:
             return GivenImu(read_imu_recording(bag, topic, frame), asked=args.imu is not None)
@@ -279,27 +279,27 @@ def run(args: argparse.Namespace) -> None:
         with TemporaryDirectory(dir=out) as images:
             looked = look_at_images(args, Looker(args.max_keypoints, Path(images), markers))
             anchors = Anchors(markers, looked.points, tuple(args.distance))
-            given = Given(
+            inputs = Given(
                 looked.views, looked.camera, anchors, shutter.readout_time,
                 shutter.scan_direction, MAP_FRAME if markers is None else markers.map_frame, imu,
             )  # fmt: skip
             folder = out / COLMAP
             folder.mkdir()
-            built = build_map(given, Workshop(folder, Effort(args.threads, args.seed), _stage))
+            built = build_map(inputs, Workshop(folder, Effort(args.threads, args.seed), _stage))
         _write(out, built, looked)
     _tell(args, built, looked)
 
 
 def _check_points(args: argparse.Namespace) -> None:
     """Before minutes of work: that each point of a distance is given in two images."""
-    given = [name for name, *_ in args.point]
-    if given and not args.distance:
-        raise UsageError("--point says nothing without a --distance")
+    names = [name for name, *_ in args.point]
+    if names and not args.distance:
+        raise UsageError("--point needs --distance")
     for name in (end for distance in args.distance for end in (distance.one, distance.other)):
-        if given.count(name) < 2:
+        if names.count(name) < 2:
             raise UsageError(
                 f"--distance: the point {name} must be given by --point in two images or more, "
-                f"it is in {given.count(name)}"
+                f"it is in {names.count(name)}"
             )
 
 
@@ -323,8 +323,8 @@ def _write(out: Path, built: Built, looked: Looked) -> None:
         "scan_direction": str(built.camera.scan_direction),
         "imu.time_offset": built.place.time_offset,
     }
-    known = {name: value for name, value in shutter.items() if value is not None}
-    write_parameters(out / PARAMETERS, known)
+    values = {name: value for name, value in shutter.items() if value is not None}
+    write_parameters(out / PARAMETERS, values)
     stamps, positions, quaternions = built.middle_rows([view.stamp_ns for view in looked.views])
     write_tum(out / POSES, Trajectory(stamps, positions, quaternions), ["of the middle rows"])
     if looked.camera is None:
@@ -364,8 +364,8 @@ class _Point(argparse.Action):
 
     def __call__(self, parser: Any, namespace: Any, values: Any, _: Any = None) -> None:
         name, *numbers = values
-        given = (name, *(_number(self, text) for text in numbers))
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), given])
+        point = (name, *(_number(self, text) for text in numbers))
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), point])
 
 
 class _Distance(argparse.Action):
@@ -376,8 +376,8 @@ class _Distance(argparse.Action):
         metres = _number(self, text)
         if not metres > 0.0 or one == other:
             raise argparse.ArgumentError(self, f"must be two points and metres, got {values}")
-        given = Distance(one, other, metres)
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), given])
+        distance = Distance(one, other, metres)
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), distance])
 
 
 def _number(action: argparse.Action, text: str) -> float:

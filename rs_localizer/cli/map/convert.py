@@ -14,6 +14,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     either.check_output(args)
-    found, kind = either.read(args)
-    info.describe(args.file, found, kind)
-    either.write(args, found)
+    any_map, kind = either.read(args)
+    info.describe(args.file, any_map, kind)
+    either.write(args, any_map)

@@ -42,7 +42,7 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         help="COLMAP's, for the descriptors (default: database.db, or the only database of any "
         "name, in the folder or one of the two above)",
     )
-    foreign = parser.add_argument_group("markers: what files of other programs do not say")
+    foreign = parser.add_argument_group("markers: what files of other programs omit")
     foreign.add_argument("--family", help=f"(default: that of the file, or {USUAL_FAMILY.name})")
     foreign.add_argument("--size", type=number(0.0, above=True), metavar="M", help="of all markers")
     foreign.add_argument("--map-frame", metavar="NAME", help="(default: map)")
@@ -68,12 +68,12 @@ def read(args: argparse.Namespace) -> tuple[Map | MarkerMap, str]:
 
 
 def _unsaid(args: argparse.Namespace) -> Unsaid:
-    known = Unsaid()
+    defaults = Unsaid()
     try:
         kind = None if args.family is None else family(args.family)
     except ValueError as error:
         raise UsageError(f"--family: {error}") from error
-    return Unsaid(kind, args.size, args.map_frame or known.map_frame, args.part or "")
+    return Unsaid(kind, args.size, args.map_frame or defaults.map_frame, args.part or "")
 
 
 def check_output(args: argparse.Namespace) -> None:
@@ -91,18 +91,18 @@ def check_output(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
 
 
-def write(args: argparse.Namespace, found: Map | MarkerMap) -> None:
+def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:
     """Write the map to OUT: markers to a file of landmarks as their corners, whose ids are those
     of ``detect``.
     """
     path: Path = args.out
-    if isinstance(found, Map) and path.suffix not in WRITERS:
+    if isinstance(any_map, Map) and path.suffix not in WRITERS:
         raise UsageError(f"{args.file} holds landmarks, which go to {' or '.join(WRITERS)}")
     with atomic_files(path) as (part,):
-        if isinstance(found, MarkerMap) and path.suffix in SUFFIXES:
-            write_any(part, found, args.to or ("wpilib" if path.suffix == ".json" else OWN))
+        if isinstance(any_map, MarkerMap) and path.suffix in SUFFIXES:
+            write_any(part, any_map, args.to or ("wpilib" if path.suffix == ".json" else OWN))
         else:
-            landmarks = corners(found) if isinstance(found, MarkerMap) else found
+            landmarks = corners(any_map) if isinstance(any_map, MarkerMap) else any_map
             if args.text:
                 write_ply(part, landmarks, binary=False)
             else:

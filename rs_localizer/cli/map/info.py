@@ -19,14 +19,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> dict[str, str]:
-    found, kind = either.read(args)
-    return describe(args.file, found, kind)
+    any_map, kind = either.read(args)
+    return describe(args.file, any_map, kind)
 
 
-def describe(file: Path, found: Map | MarkerMap, kind: str) -> dict[str, str]:
+def describe(file: Path, any_map: Map | MarkerMap, kind: str) -> dict[str, str]:
     """Print the table of a map, and return it."""
-    rows = _of_markers(found, kind) if isinstance(found, MarkerMap) else _of_landmarks(found)
-    rows += _extents(found.points)
+    rows = _of_markers(any_map, kind) if isinstance(any_map, MarkerMap) else _of_landmarks(any_map)
+    rows += _extents(any_map.points)
     print(file)
     for name, text in rows:
         print(f"  {name:40} {text}")
@@ -41,9 +41,9 @@ def _of_landmarks(landmarks: Map) -> list[tuple[str, str]]:
     rows.append(("descriptors", _descriptors(landmarks)))
     if landmarks.covariances is not None:
         spread = np.sqrt(np.trace(landmarks.covariances, axis1=1, axis2=2))
-        known = spread[np.isfinite(spread)]
-        middle = f"{1e3 * np.median(known):.2f} mm (median)" if len(known) else "none"
-        rows.append(("deviations known", f"{len(known)}, {middle}"))
+        finite = spread[np.isfinite(spread)]
+        middle = f"{1e3 * np.median(finite):.2f} mm (median)" if len(finite) else "none"
+        rows.append(("deviations known", f"{len(finite)}, {middle}"))
     return rows
 
 
@@ -56,11 +56,11 @@ def _of_markers(marker_map: MarkerMap, kind: str) -> list[tuple[str, str]]:
     sizes = sorted({round(marker.size, 6) for marker in marker_map.markers})
     if sizes:
         rows.append(("sizes (m)", ", ".join(f"{size:g}" for size in sizes[:6])))
-    known = [m.deviations for m in marker_map.markers if m.deviations is not None]
-    if known:
-        spread = np.linalg.norm(np.array(known)[:, :3], axis=1)
+    deviations = [m.deviations for m in marker_map.markers if m.deviations is not None]
+    if deviations:
+        spread = np.linalg.norm(np.array(deviations)[:, :3], axis=1)
         rows.append(
-            ("deviations known", f"{len(known)}, {1e3 * np.median(spread):.2f} mm (median)")
+            ("deviations known", f"{len(deviations)}, {1e3 * np.median(spread):.2f} mm (median)")
         )
     if marker_map.boards:
         rows.append(("boards", ", ".join(board.name for board in marker_map.boards)))

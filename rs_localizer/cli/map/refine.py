@@ -33,7 +33,7 @@ _HOLD = 0.001
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Bundle adjustment in continuous time: landmarks are free, the motion is a spline, each "
-        "keypoint is seen when its own row was exposed."
+        "keypoint is observed when its own row was exposed."
     )
     parser.add_argument(
         "recording", type=Path, metavar="RECORDING", help="a bag of correspondences or keypoints"
@@ -91,20 +91,25 @@ def run(args: argparse.Namespace) -> None:
     readout_time = 0.0 if shutter == _GLOBAL else config.readout_time
     camera = recorded.calibration.camera(readout_time, config.scan_direction)
     if args.calibration is not None:
-        given = read_calibration(args.calibration)
-        camera = replace(given, readout_time=readout_time, scan_direction=config.scan_direction)
-    known = _localized(camera, recorded, landmarks)
-    deviations = _deviations(args, known.landmarks, config.map_deviation)
+        lens = read_calibration(args.calibration)
+        camera = replace(lens, readout_time=readout_time, scan_direction=config.scan_direction)
+    localized = _localized(camera, recorded, landmarks)
+    deviations = _deviations(args, localized.landmarks, config.map_deviation)
     freedom = MapFreedom(shutter == _ESTIMATED, args.intrinsics, deviations)
-    found = refine(
-        camera, known.seen, known.start, freedom, stamp_offset=config.stamp_offset, done=_told
+    refined = refine(
+        camera,
+        localized.seen,
+        localized.start,
+        freedom,
+        stamp_offset=config.stamp_offset,
+        done=_print_step,
     )
-    _tell(known, found)
-    contradiction.check(args, found.readout_check, "see --shutter estimated")
-    _write(args, known.landmarks, found)
+    _tell(localized, refined)
+    contradiction.check(args, refined.readout_check, "see --shutter estimated")
+    _write(args, localized.landmarks, refined)
 
 
-def _told(step: str) -> None:
+def _print_step(step: str) -> None:
     print(f"adjusted: {step}", flush=True)
 
 
@@ -126,16 +131,16 @@ def _deviations(args: argparse.Namespace, landmarks: Map, map_deviation: float) 
     return np.where(np.isin(landmarks.ids, args.hold), args.hold_deviation, every)
 
 
-def _tell(known: RecordedMap, found: RefinedMap) -> None:
+def _tell(localized: RecordedMap, refined: RefinedMap) -> None:
     """The table of what changed."""
-    moved = np.linalg.norm(found.points - known.start.points, axis=1)[found.refined]
-    spread = np.sqrt(np.trace(found.covariances[found.refined], axis1=1, axis2=2))
+    moved = np.linalg.norm(refined.points - localized.start.points, axis=1)[refined.refined]
+    spread = np.sqrt(np.trace(refined.covariances[refined.refined], axis1=1, axis2=2))
     rows = [
-        ("images with a pose", f"{len(known.seen.stamps_ns)} of {known.images}"),
-        ("landmarks refined", f"{np.count_nonzero(found.refined)} of {len(found.points)}"),
-        ("noise before", f"{found.before:.3f} px"),
-        ("noise after", f"{found.after:.3f} px"),
-        ("keypoints that fit", f"{np.mean(found.inliers):.1%}"),
+        ("images with a pose", f"{len(localized.seen.stamps_ns)} of {localized.images}"),
+        ("landmarks refined", f"{np.count_nonzero(refined.refined)} of {len(refined.points)}"),
+        ("noise before", f"{refined.before:.3f} px"),
+        ("noise after", f"{refined.after:.3f} px"),
+        ("keypoints that fit", f"{np.mean(refined.inliers):.1%}"),
     ]
     if len(moved):
         rows += [
@@ -145,12 +150,12 @@ def _tell(known: RecordedMap, found: RefinedMap) -> None:
             ),
             ("deviation of a landmark", f"{1e3 * np.median(spread):.1f} mm (median)"),
         ]
-    deviation = found.readout_time_deviation
+    deviation = refined.readout_time_deviation
     spread_text = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
-    rows.append(("readout time", f"{1e3 * found.readout_time:.3f}{spread_text} ms"))
+    rows.append(("readout time", f"{1e3 * refined.readout_time:.3f}{spread_text} ms"))
     for name, text in rows:
         print(f"{name:26} {text}")
-    if found.readout_time < 0.0:
+    if refined.readout_time < 0.0:
         print("the readout time is negative: the scan direction is the reverse of what was set")
 
 
@@ -158,18 +163,18 @@ def _millimetres(lengths: Array) -> str:
     return f"{1e3 * np.median(lengths):.1f} mm (median)"
 
 
-def _write(args: argparse.Namespace, landmarks: Map, found: RefinedMap) -> None:
-    refined = replace(landmarks, points=found.points, covariances=found.covariances)
+def _write(args: argparse.Namespace, landmarks: Map, result: RefinedMap) -> None:
+    refined = replace(landmarks, points=result.points, covariances=result.covariances)
     lens = args.out.with_name(f"{args.out.stem}_camera_info.yaml")
     files = [args.out, lens] if args.intrinsics else [args.out]
     with atomic_files(*files) as (part, *lens_part):
         WRITERS[args.out.suffix](part, refined)
         if lens_part:
-            write_calibration(lens_part[0], found.camera)
+            write_calibration(lens_part[0], result.camera)
     print(f"written: {', '.join(map(str, files))}")
-    left = np.count_nonzero(~found.refined)
-    if left:
+    unchanged = np.count_nonzero(~result.refined)
+    if unchanged:
         print(
-            f"{left} landmarks stayed as they were: seen by fewer than two images, or from "
+            f"{unchanged} landmarks are unchanged: in fewer than two images, or from "
             "too few sides to be known better"
         )

@@ -94,13 +94,15 @@ def run(args: argparse.Namespace) -> None:
     if not args.recording.exists():
         raise ValueError(f"{args.recording} does not exist")
     camera, spotted = _spotted(args, config, Spotter(markers, args.min_side))
-    found = survey(camera, spotted, markers, origin=origin, stamp_offset=config.stamp_offset)
-    every = found.deviations_of_shape if args.deviations == _SHAPE else found.deviations
-    _tell(found, every, len(spotted))
-    contradiction.check(args, found.readout_check, "without one it is found")
+    surveyed_map = survey(camera, spotted, markers, origin=origin, stamp_offset=config.stamp_offset)
+    every = (
+        surveyed_map.deviations_of_shape if args.deviations == _SHAPE else surveyed_map.deviations
+    )
+    _tell(surveyed_map, every, len(spotted))
+    contradiction.check(args, surveyed_map.readout_check, "without one it is found")
     surveyed = tuple(
         replace(marker, deviations=deviations)
-        for marker, deviations in zip(found.markers, every, strict=True)
+        for marker, deviations in zip(surveyed_map.markers, every, strict=True)
     )
     marker_map = MarkerMap(surveyed, map_frame=args.map_frame)
     with atomic_files(args.out) as (part,):
@@ -158,7 +160,7 @@ def _spotted(
                 continue
             read = read_camera_info(shot.camera_info)
             if calibration is not None and read != calibration:
-                raise ValueError("camera_info changes on the way; cut the recording there")
+                raise ValueError("camera_info changes within the recording; cut it there")
             calibration = read
             camera = calibration.camera(config.readout_time, config.scan_direction)
             height, width = shot.image.pixels.shape
@@ -175,10 +177,10 @@ def _spotted(
     return camera, [spotted[stamp] for stamp in sorted(spotted)]
 
 
-def _tell(found: Survey, every: Array, images: int) -> None:
+def _tell(surveyed_map: Survey, every: Array, images: int) -> None:
     """The table of the markers, with their deviations (m,6)."""
-    fit = found.fit
-    print(f"images with a marker     {found.images} of {images}")
+    fit = surveyed_map.fit
+    print(f"images with a marker     {surveyed_map.images} of {images}")
     print(f"noise of the corners     {fit.deviation:.3f} px, {np.mean(fit.inliers):.1%} fit")
     deviation = fit.readout_time_deviation
     spread = "" if np.isnan(deviation) else f" +- {1e3 * deviation:.3f}"
@@ -187,7 +189,7 @@ def _tell(found: Survey, every: Array, images: int) -> None:
         f"{'marker':26} {'images':>6} {'x':>9} {'y':>9} {'z (m)':>9} {'+- (mm)':>8} {'+- (deg)':>8}"
     )
     for marker, sights, deviations, poor in zip(
-        found.markers, found.sights, every, found.poor, strict=True
+        surveyed_map.markers, surveyed_map.sights, every, surveyed_map.poor, strict=True
     ):
         x, y, z = marker.pose.position
         place = 1e3 * np.linalg.norm(deviations[:3])
@@ -195,30 +197,33 @@ def _tell(found: Survey, every: Array, images: int) -> None:
         name = marker.name.removeprefix("marker ")
         mark = " poor" if poor else ""
         print(f"{name:26} {sights:6} {x:9.4f} {y:9.4f} {z:9.4f} {place:8.2f} {turn:8.3f}{mark}")
-    _tell_frame(found)
-    if found.poor.any():
-        poor = tuple(found.markers[k] for k in np.flatnonzero(found.poor))
+    _tell_frame(surveyed_map)
+    if surveyed_map.poor.any():
+        poor = tuple(surveyed_map.markers[k] for k in np.flatnonzero(surveyed_map.poor))
         print(f"warning: known to worse than a tenth of their size: {_listed(poor)}")
-    for part in found.apart:
+    for part in surveyed_map.apart:
         print(
             f"not connected: {_listed(part)}: no image shows one of them together with those above"
         )
-    if found.rare:
+    if surveyed_map.rare:
         print(
-            f"left out: {_listed(found.rare)}: too few images show them, or not enough to "
+            f"left out: {_listed(surveyed_map.rare)}: too few images show them, or not enough to "
             "determine their orientation"
         )
 
 
-def _tell_frame(found: Survey) -> None:
+def _tell_frame(surveyed_map: Survey) -> None:
     """What the errors of the origin's own pose make of all others in its frame."""
-    origin, places = found.markers[0], [marker.pose.position for marker in found.markers]
-    turn = np.degrees(np.linalg.norm(found.deviations_of_shape[0, 3:]))
+    origin, places = (
+        surveyed_map.markers[0],
+        [marker.pose.position for marker in surveyed_map.markers],
+    )
+    turn = np.degrees(np.linalg.norm(surveyed_map.deviations_of_shape[0, 3:]))
     far = int(np.argmax(np.linalg.norm(places, axis=1)))
-    there = 1e3 * np.linalg.norm(found.deviations[far, :3])
+    there = 1e3 * np.linalg.norm(surveyed_map.deviations[far, :3])
     print(
         f"frame: that of {origin.name}, whose own orientation is known to {turn:.3f} deg: in it, "
-        f"{found.markers[far].name} is known to {there:.1f} mm"
+        f"{surveyed_map.markers[far].name} is known to {there:.1f} mm"
     )
 
 

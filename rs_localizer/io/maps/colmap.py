@@ -97,10 +97,10 @@ def _read_text(path: Path) -> Model:
                 if not 0 <= ids[-1] < 2**63 or np.any((track < 0) | (track >= 2**32)):
                     raise ValueError
             except (ValueError, OverflowError):
-                found = line[:80].decode("ascii", "replace").strip()
+                text = line[:80].decode("ascii", "replace").strip()
                 raise MapError(
                     f"points3D.txt, line {number}: expected ID X Y Z R G B ERROR and pairs of "
-                    f"image and feature, found {found!r}"
+                    f"image and feature, found {text!r}"
                 ) from None
             tracks.append(track.astype(np.uint32))
     starts = np.cumsum([0, *(len(track) // 2 for track in tracks)], dtype=np.int64)
@@ -136,18 +136,18 @@ def read_images(folder: Path) -> dict[str, ModelImage]:
     """
     binary, text = folder / "images.bin", folder / "images.txt"
     if binary.exists():
-        found = _read_binary_images(binary.read_bytes())
+        images = _read_binary_images(binary.read_bytes())
     elif text.exists():
-        found = _read_text_images(text)
+        images = _read_text_images(text)
     else:
         raise MapError(f"{folder} has neither {binary.name} nor {text.name}")
-    if not found:
+    if not images:
         raise MapError(f"the model in {folder} has no images")
-    return found
+    return images
 
 
 def _read_binary_images(data: bytes) -> dict[str, ModelImage]:
-    found: dict[str, ModelImage] = {}
+    images: dict[str, ModelImage] = {}
     try:
         (count,) = _COUNT.unpack_from(data)
         position = _COUNT.size
@@ -156,17 +156,17 @@ def _read_binary_images(data: bytes) -> dict[str, ModelImage]:
             start = position + _IMAGE.size
             end = data.index(0, start)
             (features,) = _COUNT.unpack_from(data, end + 1)
-            found[data[start:end].decode("utf-8")] = ModelImage(number, features)
+            images[data[start:end].decode("utf-8")] = ModelImage(number, features)
             position = end + 1 + _COUNT.size + features * _FEATURE_BYTES
     except (struct.error, ValueError, OverflowError):  # ValueError also where a name is no text
         position = len(data) + 1
     if position > len(data):
         raise MapError("images.bin is truncated or damaged")
-    return found
+    return images
 
 
 def _read_text_images(path: Path) -> dict[str, ModelImage]:
-    found: dict[str, ModelImage] = {}
+    images: dict[str, ModelImage] = {}
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -181,12 +181,12 @@ def _read_text_images(path: Path) -> dict[str, ModelImage]:
             if len(words) != 10:
                 raise ValueError
             count = len(features.split()) // _FEATURE_WORDS
-            found[words[9]] = ModelImage(int(words[0]), count)
+            images[words[9]] = ModelImage(int(words[0]), count)
         except ValueError:
             raise MapError(
                 f"images.txt: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, found {line[:80]!r}"
             ) from None
-    return found
+    return images
 
 
 DATABASE = "database.db"
@@ -221,12 +221,14 @@ def read_colmap(folder: Path, frame: str, database: Path | None = None) -> Map:
     if database is None:
         return make_map(model.points, model.ids, None, frame)
     try:
-        descriptors, known = _descriptors(model, database)
+        descriptors, usable = _descriptors(model, database)
     except MapError as error:
         raise MapError(f"{database}: {error}") from error
-    found = make_map(model.points[known], model.ids[known], descriptors, frame)
-    unknown = len(known) - int(np.count_nonzero(known))
-    return Map(found.points, found.ids, found.descriptors, frame, found.dropped + unknown)
+    landmarks = make_map(model.points[usable], model.ids[usable], descriptors, frame)
+    unknown = len(usable) - int(np.count_nonzero(usable))
+    return Map(
+        landmarks.points, landmarks.ids, landmarks.descriptors, frame, landmarks.dropped + unknown
+    )
 
 
 def _find_database(places: tuple[Path, ...]) -> Path | None:
@@ -234,12 +236,12 @@ def _find_database(places: tuple[Path, ...]) -> Path | None:
         if (place / DATABASE).is_file():
             return place / DATABASE
     for place in places:
-        found = [path for path in sorted(place.glob("*.db")) if _has_descriptors(path)]
-        if len(found) > 1:
-            names = ", ".join(path.name for path in found)
+        databases = [path for path in sorted(place.glob("*.db")) if _has_descriptors(path)]
+        if len(databases) > 1:
+            names = ", ".join(path.name for path in databases)
             raise MapError(f"{place} has several databases of COLMAP, {names}: name one")
-        if found:
-            return found[0]
+        if databases:
+            return databases[0]
     return None
 
 
@@ -255,19 +257,19 @@ def _descriptors(model: Model, database: Path) -> tuple[NDArray[np.generic], NDA
     """Descriptors (k,d) of the points that have any, and which points (n,) these are."""
     chosen = _chosen(model)
     observations = model.tracks[chosen]
-    found, known = _observed(observations, database)
+    described, has_one = _observed(observations, database)
     counts = np.diff(np.searchsorted(chosen, model.starts))
-    medoids = np.zeros((len(counts), found.shape[1]), found.dtype)
+    medoids = np.zeros((len(counts), described.shape[1]), described.dtype)
     usable = np.zeros(len(counts), np.bool_)
     end = 0
     for point, count in enumerate(counts):
         start, end = end, end + count
-        rows = found[start:end][known[start:end]]
+        rows = described[start:end][has_one[start:end]]
         if len(rows):
             medoids[point], usable[point] = rows[medoid(rows)], True
     if not usable.any():
         raise MapError("no point of the model has a descriptor in it; is it of another model?")
-    return (medoids.astype(np.float32) if _numeric(found) else medoids)[usable], usable
+    return (medoids.astype(np.float32) if _numeric(described) else medoids)[usable], usable
 
 
 def _numeric(descriptors: NDArray[np.generic]) -> bool:
@@ -288,8 +290,8 @@ def _observed(
     observations: NDArray[np.void], database: Path
 ) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:
     """Descriptors (m,d) of observations (m,), and which of them (m,) are known."""
-    known = np.zeros(len(observations), np.bool_)
-    found: NDArray[np.generic] | None = None
+    has_one = np.zeros(len(observations), np.bool_)
+    described: NDArray[np.generic] | None = None
     order = np.argsort(observations["image"], kind="stable")
     images, firsts = np.unique(observations["image"][order], return_index=True)
     groups = np.split(order, firsts[1:]) if len(order) else []
@@ -308,22 +310,22 @@ def _observed(
                 part = _of_image(tables, image, kind)
                 if part is None:
                     continue
-                if found is None:
-                    found = np.zeros((len(observations), part.shape[1]), part.dtype)
-                if part.shape[1] != found.shape[1] or part.dtype != found.dtype:
+                if described is None:
+                    described = np.zeros((len(observations), part.shape[1]), part.dtype)
+                if part.shape[1] != described.shape[1] or part.dtype != described.dtype:
                     raise MapError(
                         f"image {image} has descriptors of {part.shape[1]} x {part.dtype}, others "
-                        f"of {found.shape[1]} x {found.dtype}"
+                        f"of {described.shape[1]} x {described.dtype}"
                     )
                 features = observations["feature"][rows]
                 there = features < len(part)
-                found[rows[there]] = part[features[there]]
-                known[rows[there]] = True
+                described[rows[there]] = part[features[there]]
+                has_one[rows[there]] = True
     except (sqlite3.Error, UnicodeDecodeError) as error:  # which the text of an error may cause
         raise MapError(f"it cannot be read as a database of COLMAP: {error}") from error
-    if found is None:
+    if described is None:
         raise MapError("it has no descriptors of the images of the model")
-    return found, known
+    return described, has_one
 
 
 def _of_image(

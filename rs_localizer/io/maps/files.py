@@ -34,8 +34,8 @@ def read_map_file(path: Location, frame: str, database: Path | None = None) -> M
             if database is not None:
                 raise MapError("it is not a folder of COLMAP, which alone has a database")
             if file.suffix not in _READERS:
-                known = ", ".join(_READERS)
-                raise MapError(f"expected a folder of COLMAP or a file ending in {known}")
+                endings = ", ".join(_READERS)
+                raise MapError(f"expected a folder of COLMAP or a file ending in {endings}")
             return _READERS[file.suffix](file, frame)
         except MapError as error:
             raise MapError(f"{path}: {error}") from error

@@ -51,8 +51,8 @@ def _arrays(file: IO[bytes]) -> dict[str, NDArray[Any]]:
             members = {info.filename: info for info in archive.infolist()}
             wanted = [members[f"{name}.npy"] for name in _ARRAYS if f"{name}.npy" in members]
             if "points.npy" not in members:
-                found = ", ".join(sorted(members)[:10]) or "none"
-                raise MapError(f"the archive has no array 'points'; found {found}")
+                names = ", ".join(sorted(members)[:10]) or "none"
+                raise MapError(f"the archive has no array 'points'; found {names}")
             if sum(info.file_size for info in wanted) > _MOST_BYTES:
                 raise MapError(f"the arrays are larger than {_MOST_BYTES // 2**30} GiB")
             return {info.filename[:-4]: _read(archive, info) for info in wanted}

@@ -144,8 +144,8 @@ def _header(file: IO[bytes]) -> tuple[str, list[_Element]]:
             case ["comment" | "obj_info", *_]:
                 pass
             case _:
-                found = repr(line.strip()[:80]) if line else "the end of the file"
-                raise PlyError(f"the header is not understood at {found}")
+                text = repr(line.strip()[:80]) if line else "the end of the file"
+                raise PlyError(f"the header is not understood at {text}")
     raise PlyError(f"the header has more than {_MOST_HEADER_LINES} lines")
 
 

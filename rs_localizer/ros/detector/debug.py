@@ -101,8 +101,8 @@ class DebugPictures:
         return -offset - 1e-6 <= after <= config.readout_time + offset + 1e-6
 
     def _pose_of(self, detected: Detected, config: DetectorConfig) -> CameraPath | None:
-        found = (path for path in self._poses.values() if self._belongs(path, detected, config))
-        return next(found, None)
+        paths = (path for path in self._poses.values() if self._belongs(path, detected, config))
+        return next(paths, None)
 
     def _finish(self, detected: Detected, path: CameraPath | None, config: DetectorConfig) -> None:
         picture = draw_detections(detected.image.pixels, detected.detections)

@@ -47,14 +47,16 @@ class FeatureDetectorNode(ImageNode[FeatureConfig, Extracted]):
     def make_finder(self, config: FeatureConfig) -> FrameExtractor:
         return FrameExtractor(config)
 
-    def make_cloud(self, found: Extracted, make: Make) -> Any:
-        return keypoints(found, make)
+    def make_cloud(self, extracted: Extracted, make: Make) -> Any:
+        return keypoints(extracted, make)
 
     def make_drawing(
         self, show: Show, worker: Worker[Work[FeatureConfig, Extracted], Extracted]
     ) -> Drawing[Extracted, FeatureConfig]:
         return Drawing(
-            lambda found, _: show(found.image, draw_features(found.image.pixels, found.features))
+            lambda extracted, _: show(
+                extracted.image, draw_features(extracted.image.pixels, extracted.features)
+            )
         )
 
     def describe(self, finder: Finder[Extracted]) -> str:

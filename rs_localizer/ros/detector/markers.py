@@ -27,7 +27,7 @@ class MarkerSight:
     @property
     def text(self) -> str:
         if self.corners == 0:
-            return "the last image shows nothing of the map"
+            return "the last image shows no part of the map"
         boards = f" and {self.boards} boards" if self.boards else ""
         return f"{self.corners} corners of {self.markers} markers{boards}"
 
@@ -43,12 +43,12 @@ class MarkerSight:
 
 def tell(detected: Detected) -> tuple[int, MarkerSight]:
     """Stamp of an image (ns), and what the statistics keep of it."""
-    found = detected.detections
+    detections = detected.detections
     sight = MarkerSight(
-        markers=sum(int(item.known.sum()) for item in found.markers),
-        boards=len(found.boards),
-        corners=len(found.ids),
-        unknown=len(found.unknown),
+        markers=sum(int(item.known.sum()) for item in detections.markers),
+        boards=len(detections.boards),
+        corners=len(detections.ids),
+        unknown=len(detections.unknown),
     )
     return detected.image.stamp_ns, sight
 
@@ -72,8 +72,8 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
     def make_finder(self, config: DetectorConfig) -> FrameDetector:
         return FrameDetector(config, self.refusals.notice)
 
-    def make_cloud(self, found: Detected, make: Make) -> Any:
-        return correspondences(found, make)
+    def make_cloud(self, detected: Detected, make: Make) -> Any:
+        return correspondences(detected, make)
 
     def make_drawing(
         self, show: Show, worker: Worker[Work[DetectorConfig, Detected], Detected]
@@ -86,5 +86,6 @@ class MarkerDetectorNode(ImageNode[DetectorConfig, Detected]):
 
     def describe(self, finder: Finder[Detected]) -> str:
         assert isinstance(finder, FrameDetector)
-        found = finder.map
-        return f"{len(found.markers)} markers and {len(found.boards)} boards in {found.map_frame}"
+        marker_map = finder.map
+        markers, boards = len(marker_map.markers), len(marker_map.boards)
+        return f"{markers} markers and {boards} boards in {marker_map.map_frame}"

@@ -37,16 +37,16 @@ from rs_localizer.ros.node.health import (
     State,
     lost_on_the_way,
     milliseconds,
+    one_line,
     out_of_service,
     refused,
-    told,
 )
 from rs_localizer.ros.node.inputs import Silence, Topic
 from rs_localizer.ros.node.managed import ManagedNode
 from rs_localizer.ros.node.statistics import WINDOW, Summary
 from rs_localizer.ros.node.worker import Worker
 
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 class Sight(Protocol):
@@ -119,7 +119,7 @@ def _judge(condition: Condition, summary: Summary[Sight]) -> Judgement:
     if summary.recently_missing > SOME * summary.recently_received:
         return Judgement(Level.WARN, State.DETECTING, lost_on_the_way(summary))
     if condition.oddities:
-        return Judgement(Level.WARN, State.DETECTING, told(condition.oddities))
+        return Judgement(Level.WARN, State.DETECTING, one_line(condition.oddities))
     last = summary.last
     message = "no image has been looked at yet" if last is None else last.text
     return Judgement(Level.OK, State.DETECTING, message)
@@ -131,13 +131,13 @@ _IMAGES = {IMAGE: ImageMessage, COMPRESSED_IMAGE: CompressedImage}
 _LOOK_PERIOD = 0.2
 
 Settings = TypeVar("Settings", DetectorConfig, FeatureConfig)
-Found_co = TypeVar("Found_co", covariant=True)
+Result_co = TypeVar("Result_co", covariant=True)
 
 
-class Finder(Protocol[Found_co]):
+class Finder(Protocol[Result_co]):
     """What looks at the images: the class that works offline, too."""
 
-    def take(self, message: Any) -> Found_co | Refusal:
+    def take(self, message: Any) -> Result_co | Refusal:
         """What a sensor_msgs/Image or CompressedImage shows."""
         ...
 
@@ -147,24 +147,24 @@ class Finder(Protocol[Found_co]):
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing(Generic[Found, Settings]):
+class Drawing(Generic[Result, Settings]):
     """Makes debug pictures."""
 
-    draw: Callable[[Found, Settings], None]  # called in the worker's thread
+    draw: Callable[[Result, Settings], None]  # called in the worker's thread
     topics: Mapping[str, Topic] = field(default_factory=dict)  # what it needs besides the images
 
 
 @dataclass(slots=True)
-class Work(Generic[Settings, Found]):
+class Work(Generic[Settings, Result]):
     """What the worker alone touches."""
 
-    finder: Finder[Found]
+    finder: Finder[Result]
     config: Settings
-    draw: Callable[[Found, Settings], None] | None = None  # makes the debug picture
+    draw: Callable[[Result, Settings], None] | None = None  # makes the debug picture
 
 
 class ImageNode(
-    ManagedNode[Settings, Work[Settings, Found], Found, Sight], Generic[Settings, Found]
+    ManagedNode[Settings, Work[Settings, Result], Result, Sight], Generic[Settings, Result]
 ):
     """Looks at images; see :class:`rs_localizer.ros.node.managed.ManagedNode`.
 
@@ -180,10 +180,10 @@ class ImageNode(
         self,
         name: str,
         kind: Any,  # class of its settings, which mypy cannot follow to the base class
-        tell: Callable[[Found], tuple[int, Sight]],
+        tell: Callable[[Result], tuple[int, Sight]],
         **options: Any,
     ) -> None:
-        self._outputs: ImageOutputs[Found] | None = None
+        self._outputs: ImageOutputs[Result] | None = None
         self._topics: dict[str, Topic] = {}  # all that may be listened to
         self._for_pictures: tuple[str, ...] | None = None  # none was wanted so far
         self._timer: Timer | None = None
@@ -192,21 +192,21 @@ class ImageNode(
 
     # -- what a node looks for ---------------------------------------------------------------
 
-    def make_finder(self, config: Settings) -> Finder[Found]:
+    def make_finder(self, config: Settings) -> Finder[Result]:
         """Raise ``ValueError`` for settings that cannot be used."""
         raise NotImplementedError
 
-    def make_cloud(self, found: Found, make: Make) -> Any:
+    def make_cloud(self, result: Result, make: Make) -> Any:
         """The sensor_msgs/PointCloud2 of an image."""
         raise NotImplementedError
 
     def make_drawing(
-        self, show: Show, worker: Worker[Work[Settings, Found], Found]
-    ) -> Drawing[Found, Settings]:
+        self, show: Show, worker: Worker[Work[Settings, Result], Result]
+    ) -> Drawing[Result, Settings]:
         """What makes debug pictures, which ``show`` takes, in the worker's thread."""
         raise NotImplementedError
 
-    def describe(self, finder: Finder[Found]) -> str:
+    def describe(self, finder: Finder[Result]) -> str:
         """What the node is active with, for the log."""
         raise NotImplementedError
 
@@ -224,12 +224,12 @@ class ImageNode(
     def open(self, config: Settings) -> None:
         finder = self.make_finder(config)
         self._outputs = outputs = ImageOutputs(self, self.output, self.make_cloud)
-        work: Work[Settings, Found] = Work(finder, config)
+        work: Work[Settings, Result] = Work(finder, config)
 
-        def publish(found: Found) -> None:
-            outputs.publish(found)
+        def publish(result: Result) -> None:
+            outputs.publish(result)
             if work.draw is not None and outputs.pictures_wanted():
-                work.draw(found, work.config)
+                work.draw(result, work.config)
 
         self._topics = _image_topics(self.employ(work, publish))
         self._for_pictures = None
@@ -261,7 +261,7 @@ class ImageNode(
         if self.worker is not None:
             self.worker.update("settings", lambda work: self._change(work, config))
 
-    def _change(self, work: Work[Settings, Found], config: Settings) -> None:
+    def _change(self, work: Work[Settings, Result], config: Settings) -> None:
         work.finder = self.make_finder(config)
         work.config = config
 
@@ -296,7 +296,7 @@ class ImageNode(
             assert self.worker is not None
             drawing = self.make_drawing(self._outputs.show, self.worker)
 
-            def take(work: Work[Settings, Found]) -> None:
+            def take(work: Work[Settings, Result]) -> None:
                 work.draw = drawing.draw
 
             self.worker.update("drawing", take)
@@ -315,7 +315,7 @@ class ImageNode(
         return self._listening[-1] if self._listening else IMAGE
 
 
-def _image_topics(worker: Worker[Work[Settings, Found], Found]) -> dict[str, Topic]:
+def _image_topics(worker: Worker[Work[Settings, Result], Result]) -> dict[str, Topic]:
     """Both topics of images, whose messages go to the worker."""
 
     def images(topic: str) -> Callable[[Any], None]:
@@ -334,7 +334,7 @@ Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
 Show = Callable[[Image, Picture], None]
 
 
-class ImageOutputs(Generic[Found]):
+class ImageOutputs(Generic[Result]):
     """The clouds, ``~/debug_image`` and ``~/debug_image/compressed``.
 
     Nothing is built that nobody listens to. All methods may be called from any thread.
@@ -346,7 +346,7 @@ class ImageOutputs(Generic[Found]):
     """
 
     def __init__(
-        self, node: LifecycleNode, topic: str, make_cloud: Callable[[Found, Make], Any]
+        self, node: LifecycleNode, topic: str, make_cloud: Callable[[Result, Make], Any]
     ) -> None:
         self._node = node
         self._make_cloud = make_cloud
@@ -369,11 +369,11 @@ class ImageOutputs(Generic[Found]):
         publishers = (self._pictures, self._jpegs)
         return not self._closed and any(p.get_subscription_count() > 0 for p in publishers)
 
-    def publish(self, found: Found) -> None:
+    def publish(self, result: Result) -> None:
         """The cloud of an image."""
         with self._lock:
             if self.clouds_wanted():
-                self._clouds.publish(self._make_cloud(found, make_message))
+                self._clouds.publish(self._make_cloud(result, make_message))
 
     def show(self, image: Image, picture: Picture) -> None:
         """The debug picture of an image."""

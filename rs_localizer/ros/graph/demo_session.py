@@ -204,8 +204,8 @@ class Session:
             with ThreadPoolExecutor(1) as starter:
                 for name, parameters in methods.items():
                     listeners[name].subscribe(node, f"{self.namespace}/{name}/{NODE_NAME}")
-                    given = {**shutter, **parameters}
-                    starter.submit(self._start, name, given, topic, processes).result()
+                    settings = {**shutter, **parameters}
+                    starter.submit(self._start, name, settings, topic, processes).result()
             player = _Player(node, executor, listeners, lossless, topic)
             player.wait_for_nodes(recording, lambda: self._check(processes))
             for index in range(len(recording.clouds)):

@@ -105,9 +105,9 @@ def _play(
         if started is None:
             started = time.monotonic(), recorded_ns
         due = started[0] + (recorded_ns - started[1]) * 1e-9 / rate
-        while (left := due - time.monotonic()) > 0.0:
-            _tick(clock, recorded_ns - round(left * rate * 1e9))
-            _listen(executor, min(left, _CLOCK_PERIOD))
+        while (seconds_left := due - time.monotonic()) > 0.0:
+            _tick(clock, recorded_ns - round(seconds_left * rate * 1e9))
+            _listen(executor, min(seconds_left, _CLOCK_PERIOD))
         _tick(clock, recorded_ns)
         publishers[topic].publish(copy_message(message, types[topic]))
     for publisher in publishers.values():
@@ -140,8 +140,8 @@ class _Poses:
 
 def _listen(executor: SingleThreadedExecutor, seconds: float) -> None:
     deadline = time.monotonic() + seconds
-    while (left := deadline - time.monotonic()) > 0.0:
-        executor.spin_once(timeout_sec=left)
+    while (seconds_left := deadline - time.monotonic()) > 0.0:
+        executor.spin_once(timeout_sec=seconds_left)
 
 
 def _wait_for_listeners(node: Any, publishers: Mapping[str, Any]) -> None:

@@ -62,8 +62,8 @@ class Status:
     def refusals(self) -> list[str]:
         """Why frames were refused, and how often."""
         start = "Refused: "
-        found = {k.removeprefix(start): v for k, v in self.values.items() if k.startswith(start)}
-        return [f"{reason} {count}" for reason, count in found.items()]
+        counts = {k.removeprefix(start): v for k, v in self.values.items() if k.startswith(start)}
+        return [f"{reason} {count}" for reason, count in counts.items()]
 
 
 @dataclass(slots=True)
@@ -236,12 +236,12 @@ def _why_silent(node: Any, name: str) -> str:
     end = f"/{topics.POSE_WITH_COVARIANCE}"
     kind = TYPES[topics.POSE_WITH_COVARIANCE]
     others = [
-        found.removesuffix(end)
-        for found, kinds in node.get_topic_names_and_types()
-        if found.endswith(end) and kind in kinds and node.count_publishers(found)
+        other.removesuffix(end)
+        for other, kinds in node.get_topic_names_and_types()
+        if other.endswith(end) and kind in kinds and node.count_publishers(other)
     ]
     hint = f"; there is {', '.join(others)}" if others else ""
-    return f"nobody publishes {topic} (ROS_DOMAIN_ID {os.environ.get('ROS_DOMAIN_ID', '0')}){hint}"
+    return f"no publisher on {topic} (ROS_DOMAIN_ID {os.environ.get('ROS_DOMAIN_ID', '0')}){hint}"
 
 
 @dataclass(slots=True)

@@ -20,9 +20,9 @@ from rs_localizer.ros.node.health import (
     State,
     lost_on_the_way,
     milliseconds,
+    one_line,
     out_of_service,
     refused,
-    told,
 )
 from rs_localizer.ros.node.inputs import Silence
 from rs_localizer.ros.node.statistics import WINDOW, Summary
@@ -88,9 +88,9 @@ def imu_values(state: ImuState) -> dict[str, str]:
     mostly = f"not used: {state.mostly}" if state.share < _FEW else "used"
     values = {"IMU": mostly, "IMU used (share of the last frames)": f"{state.share:.0%}"}
     if state.gravity is not None:
-        known = math.isfinite(state.gravity)
+        finite = math.isfinite(state.gravity)
         values["IMU gravity off gravity_in_map (deg)"] = (
-            f"{math.degrees(state.gravity):.1f}" if known else "not known yet"
+            f"{math.degrees(state.gravity):.1f}" if finite else "not known yet"
         )
     if math.isfinite(state.rate):
         values["IMU rate (Hz)"] = f"{state.rate:.1f}"
@@ -173,7 +173,7 @@ def _judge(condition: Condition, summary: Summary[Answer]) -> Judgement:
         causes = [f"{it.topic}: {it.cause}" for it in condition.silence.values() if it.cause]
         for reason in (INPUTS[name].refused for name in condition.missing):
             if count := summary.refusals.get(reason):
-                causes.append(f"{count} came and cannot be used: {reason} in the log says why")
+                causes.append(f"{count} cannot be used: see {reason} in the log")
         if any(item.mismatch for item in condition.silence.values()):
             level = Level.ERROR
         message = "; ".join([f"{State.WAITING} {what}", *causes])
@@ -208,7 +208,7 @@ def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Judg
         message = f"the last {summary.refused_since_answer} frames gave no pose"
         if reasons := summary.recently_refused:
             message += f", mostly for {max(reasons, key=lambda reason: reasons[reason])}"
-        message = "; ".join(filter(None, [message, told(oddities)]))
+        message = "; ".join(filter(None, [message, one_line(oddities)]))
         return Judgement(Level.ERROR, State.LOST, message)
     state = State.TRACKING if last.tracked else State.LOCALIZED
     bad, replaced = sum(summary.recently_refused.values()), summary.recently_replaced
@@ -221,7 +221,7 @@ def _judge_frames(summary: Summary[Answer], oddities: Mapping[str, str]) -> Judg
     if summary.recently_missing > SOME * summary.recently_received:
         return Judgement(Level.WARN, state, lost_on_the_way(summary))
     if oddities:
-        return Judgement(Level.WARN, state, told(oddities))
+        return Judgement(Level.WARN, state, one_line(oddities))
     message = f"{state} with {last.inliers} of {last.points} points"
     return Judgement(Level.OK, state, message)
 
@@ -244,8 +244,8 @@ def _values(condition: Condition, summary: Summary[Answer]) -> dict[str, str]:
             "Iterations": str(summary.last.iterations),
         }
     if condition.readout is not None:
-        seen, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
-        values["Readout time seen (ms)"] = f"{seen:.2f} +- {deviation:.2f}"
+        readout, deviation = 1e3 * condition.readout.readout_time, 1e3 * condition.readout.deviation
+        values["Readout time seen (ms)"] = f"{readout:.2f} +- {deviation:.2f}"
     if condition.imu is not None:
         values |= imu_values(condition.imu)
     values |= {

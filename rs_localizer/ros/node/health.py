@@ -90,7 +90,7 @@ def out_of_service(life_cycle: str) -> Judgement | None:
     return Judgement(Level.OK, State.INACTIVE, f"the node is {life_cycle}: {steps}")
 
 
-def told(oddities: Mapping[str, str]) -> str:
+def one_line(oddities: Mapping[str, str]) -> str:
     """What is odd, in one line."""
     return "; ".join(f"{name}: {text}" for name, text in oddities.items())
 

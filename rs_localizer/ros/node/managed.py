@@ -114,10 +114,10 @@ def _failure(function: Callable[[], None]) -> str:
 
 
 Result = TypeVar("Result")
-Told = TypeVar("Told")
+Kept = TypeVar("Kept")
 
 
-class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Told]):
+class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Kept]):
     """Only while active it takes and publishes messages.
 
     A node says what it does by overriding :meth:`check`, :meth:`open`, :meth:`close`,
@@ -142,7 +142,7 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Told]):
         self,
         name: str,
         kind: type[Config],
-        tell: Callable[[Result], tuple[int, Told]],
+        tell: Callable[[Result], tuple[int, Kept]],
         **options: Any,
     ) -> None:
         super().__init__(name, **options)
@@ -161,7 +161,7 @@ class ManagedNode(RobustLifecycleNode, Generic[Config, State, Result, Told]):
         )
         self.autostart: bool = config.autostart
         self.refusals = Refusals(self.warn)
-        self.statistics: Statistics[Result, Told] = Statistics(
+        self.statistics: Statistics[Result, Kept] = Statistics(
             self.refusals, tell, lambda: int(self.get_clock().now().nanoseconds)
         )
         self._diagnostics = Diagnostics(

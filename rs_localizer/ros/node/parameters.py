@@ -34,12 +34,12 @@ def declare(node: Node, kind: type[Config]) -> Config:
         try:
             node.declare_parameter(name, setting.default, _descriptor(setting))
         except InvalidParameterTypeException as error:
-            given = node._parameter_overrides[name].value
+            value = node._parameter_overrides[name].value
             hint = ""
-            if isinstance(setting.default, float) and type(given) is int:
-                hint = f" (write {float(given)!r})"
+            if isinstance(setting.default, float) and type(value) is int:
+                hint = f" (write {float(value)!r})"
             raise ValueError(
-                f"{name} must be {type_of(setting.default)}, got {given!r}{hint}"
+                f"{name} must be {type_of(setting.default)}, got {value!r}{hint}"
             ) from error
         except InvalidParameterValueException as error:
             raise ValueError(str(error)) from error
@@ -133,5 +133,7 @@ def _descriptor(setting: Setting) -> ParameterDescriptor:
 
 def _constraints(setting: Setting) -> list[str]:
     """What ranges cannot say."""
-    found = [f"one of {', '.join(setting.choices)}"] if setting.choices else []
-    return found + (["can be changed while the node is unconfigured"] if setting.fixed else [])
+    constraints = [f"one of {', '.join(setting.choices)}"] if setting.choices else []
+    return constraints + (
+        ["can be changed while the node is unconfigured"] if setting.fixed else []
+    )

@@ -64,8 +64,8 @@ class Refusals:
         """Of these, what has been noticed in the last seconds, and its latest detail."""
         with self._lock:
             since = self._clock() - seconds
-            found = {reason: self._latest.get(reason) for reason in reasons}
-            return {k: item[1] for k, item in found.items() if item and item[0] >= since}
+            latest = {reason: self._latest.get(reason) for reason in reasons}
+            return {k: item[1] for k, item in latest.items() if item and item[0] >= since}
 
     def _line(self, reason: str, detail: str) -> str | None:
         """What to log of it; None if it has been said."""

@@ -39,14 +39,14 @@ def missing(stamps_ns: Sequence[int]) -> int:
             total += interval
             multiples += max(round(interval / period), 1)
             period = total / multiples
-    found = np.maximum(np.round(intervals / period), 1.0)
-    if np.mean(np.abs(intervals / period - found) > _LOOSE) > _MOST_LOOSE:
+    counts = np.maximum(np.round(intervals / period), 1.0)
+    if np.mean(np.abs(intervals / period - counts) > _LOOSE) > _MOST_LOOSE:
         return 0
-    return int(np.sum(found - 1.0))
+    return int(np.sum(counts - 1.0))
 
 
 Result = TypeVar("Result")
-Told = TypeVar("Told")
+Kept = TypeVar("Kept")
 
 WINDOW = 5.0
 """What "now" means, in s."""
@@ -60,7 +60,7 @@ Percentiles = tuple[float, float]  # s, the median and the 95th
 
 
 @dataclass(frozen=True, slots=True)
-class Summary(Generic[Told]):
+class Summary(Generic[Kept]):
     """How things are now."""
 
     received: dict[str, int]  # frames since the start, by topic
@@ -79,10 +79,10 @@ class Summary(Generic[Told]):
     busy: float | None  # s for which the worker has had the same frame
     latency: Percentiles | None  # from receiving to publishing
     delay: Percentiles | None  # from the header's stamp to publishing, where that makes sense
-    last: Told | None  # of the last frame that was answered; None: there was none
+    last: Kept | None  # of the last frame that was answered; None: there was none
 
 
-class Statistics(Generic[Result, Told]):
+class Statistics(Generic[Result, Kept]):
     """Counts frames; all methods may be called from any thread.
 
     Args:
@@ -95,7 +95,7 @@ class Statistics(Generic[Result, Told]):
     def __init__(
         self,
         refusals: Refusals,
-        tell: Callable[[Result], tuple[int, Told]],
+        tell: Callable[[Result], tuple[int, Kept]],
         ros_time: Callable[[], int] = time.time_ns,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -106,7 +106,7 @@ class Statistics(Generic[Result, Told]):
         self._lock = threading.Lock()
         self._received: Counter[str] = Counter()
         self._answered = self._replaced = self._refused = self._dropped = self._in_a_row = 0
-        self._last: Told | None = None
+        self._last: Kept | None = None
         self._started: float | None = None
         # Times of what happened, and what is told of each answer.
         self._in: deque[float] = deque(maxlen=_MOST_FRAMES)
@@ -151,16 +151,16 @@ class Statistics(Generic[Result, Told]):
 
     def answered(self, result: Result, received: float) -> None:
         """A result was published of a frame that had been received at this time of the clock."""
-        input_stamp_ns, told = self._tell(result)
+        input_stamp_ns, summary = self._tell(result)
         now = self._clock()
         delay = (self._ros_time() - input_stamp_ns) * 1e-9
         with self._lock:
             self._answered += 1
             self._in_a_row = 0
             self._out.append((now, now - received, delay))
-            self._last = told
+            self._last = summary
 
-    def summary(self) -> Summary[Told]:
+    def summary(self) -> Summary[Kept]:
         """How things are now."""
         with self._lock:
             since = self._clock() - WINDOW

@@ -151,7 +151,7 @@ def test_one_of_several_cameras(tmp_path):
         (KALIBR.replace("equidistant", "fov"), r"distortion_model must be one of radtan"),
         (COLMAP.format("FOV", "500 510 321 241 1"), r"model must be one of .* found FOV"),
         (COLMAP.format("OPENCV", "500 510 321 241 1"), r"OPENCV has width, height, fx fy"),
-        (JSON % '"a": 1', r"does not say for which size of images"),
+        (JSON % '"a": 1', r"it has no image size"),
         (JSON % '"width": 640', r"not a usable calibration: no 'image_height'"),
         (JSON % '"width": 300, "height": 480', r"principal point \(320.5, 240.5\) lies outside"),
         (XML.replace("<opencv_storage>", "<opencv_storage"), "XML cannot be read"),

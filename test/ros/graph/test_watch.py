@@ -99,7 +99,7 @@ def test_without_a_node_it_says_what_is_missing_and_who_is_there(peer):
         [*WATCH, "--every", "0.1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert watching.stdout is not None
-    wanted = "nobody publishes /rs_localizer/pose_with_covariance (ROS_DOMAIN_ID "
+    wanted = "no publisher on /rs_localizer/pose_with_covariance (ROS_DOMAIN_ID "
     while "there is /front/rs_localizer" not in (said := watching.stdout.readline()):
         assert said.startswith(wanted)
         node.publish()

@@ -244,7 +244,7 @@ def test_what_is_missing_came_and_cannot_be_used(world):
         world.refusals.add("bad_camera_info", "the camera is not calibrated: K[0] is 0")
     health = world.diagnose(replace(GOOD, missing=("camera_info",)))
     assert health.message == (
-        "waiting for camera_info; 3 came and cannot be used: bad_camera_info in the log says why"
+        "waiting for camera_info; 3 cannot be used: see bad_camera_info in the log"
     )
 
 
