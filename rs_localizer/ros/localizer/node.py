@@ -18,6 +18,7 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
+from rs_localizer.pipeline.compiling import is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
 from rs_localizer.pipeline.refusal import Refusal
@@ -260,7 +261,12 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def kernels(self) -> Callable[[], None]:
         frames = FrameLocalizer(self.config)
         log = self.get_logger()
-        log.info("compiling kernels (once on this machine, up to a minute)")
+        self.compiles = not is_compiled(self.config.solver)
+        log.info(
+            "compiling kernels (once on this machine, up to a minute)"
+            if self.compiles
+            else "loading kernels"
+        )
 
         def compiles() -> None:
             with contextlib.suppress(ValueError):  # of which on_configure tells, at once
