@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -174,7 +174,7 @@ def disagreement(values: Array, deviations: Array) -> float:
     mean = np.sum(weights * values) / total
     squared = float(np.sum(weights * (values - mean) ** 2))
     freedoms = len(values) - 1
-    if chi2.sf(squared, freedoms) > _DISAGREEMENT:
+    if chdtrc(freedoms, squared) > _DISAGREEMENT:
         return 1.0
     # What the blocks disagree in is not their noise: none of them is better than the others.
     scatter = np.std(values, ddof=1) / math.sqrt(len(values))
