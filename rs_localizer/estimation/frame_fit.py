@@ -585,7 +585,7 @@ def fit_frame(
             what is known of them.
         with_turns, with_smooth: whether there is an in-frame turn, a smooth error.
         bend: (n,b) functions of the points' places in the map, of which the smooth error is a
-            combination for each axis of the camera (m); (n,0): it is one of the image (px).
+            combination for each axis of the camera (m); (n,0): it is one of the image.
         most: steps.
     """
     q = (TURNS if with_turns else 0) + (smooth_size(bend) if with_smooth else 0)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
@@ -50,9 +50,9 @@ from rs_localizer.estimation.undetected_vibration import Undetected, undetected_
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
 # hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
 # twenty. Standard normal, of 14 frequencies and of the smooth error.
-_ASKS_TURNS, _ASKS_SMOOTH = float(norm.isf(0.3 / len(CYCLES))), float(norm.isf(0.05))
+_ASKS_TURNS, _ASKS_SMOOTH = float(-ndtri(0.3 / len(CYCLES))), float(-ndtri(0.05))
 # What chance explains in one frame of ten thousand may have moved points out of the gate.
-_WIDENS = float(norm.isf(1e-4 / len(CYCLES)))
+_WIDENS = float(-ndtri(1e-4 / len(CYCLES)))
 # Coefficients of each; six of the smooth error's twenty are as a pose's that is off.
 _COEFFICIENTS = np.append(np.full(len(CYCLES), 6.0), 2.0 * SMOOTH_TERMS - 6.0)
 # Likewise of the frames before (standard normal): one track in a thousand.
@@ -132,8 +132,7 @@ class _Frame(NamedTuple):
     hyper: Hyperprior
     smooth: bool  # beside a smooth error
     planar: bool
-    bend: Array  # (n,b) of the declared errors of the map (see frame_fit); (n,0): none
-    pixels: float  # by how many a smooth error of scale 1 moves points
+    bend: Array  # (n,b) of a smooth error of the map (see frame_fit); (n,0): of the image
 
 
 class Mode(NamedTuple):
@@ -144,7 +143,7 @@ class Mode(NamedTuple):
     evidence: float
     cost: float  # noise variances
     speed: int  # index of SPEEDS
-    smooth: float = 0.0  # its scale
+    smooth: float = 0.0  # px
 
 
 def frame_posterior(
@@ -164,7 +163,10 @@ def frame_posterior(
         gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
         errors = observations.squared_errors(part.state)
         inliers = errors <= gate**2
-        bend = _bend(observations.points, inliers, SMOOTH_DEGREE) if part.bend.size else part.bend
+        bend = part.bend
+        if bend.shape[1]:
+            depth = max(median_depth(part.state, observations.points, inliers), _NEAREST)
+            bend = _bend(observations.points, inliers, depth / assumed.focal_length)
         return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed)
 
@@ -186,7 +188,7 @@ def _of_points(
             best, other = again, mirrored(observations.points, again.inliers, again.state)
     depth = max(median_depth(best.state, observations.points, best.inliers), _NEAREST)
     declared = assumed.map_deviation * assumed.focal_length / depth  # px
-    hyper = _hyperprior(assumed)
+    hyper = _hyperprior(assumed, declared)
     explained, agreement, vibration = _look(
         observations.packed, len(observations), best.state, observations.row_time_gradient,
         best.inliers, terms, best.noise, best.freedom, hyper.mean, hyper.precision,
@@ -201,18 +203,20 @@ def _of_points(
     hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
-    smooth = declared > 0.0 or (
-        assumed.turn is None
-        and bool(excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
-    )
+    shows = excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED
+    smooth = bool(best.inliers.any() and (declared > 0.0 or (assumed.turn is None and shows)))
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
-    bend = _bend(observations.points, best.inliers, SMOOTH_DEGREE if declared > 0.0 else -1)
-    pixels = assumed.focal_length / depth if declared > 0.0 else 1.0
     frame = _Frame(
-        observations, best, terms, threshold, assumed, hyper, smooth, other is not None, bend,
-        pixels,
+        observations, best, terms, threshold, assumed, hyper, smooth, other is not None,
+        np.zeros((len(observations), 0)),
     )  # fmt: skip
+    if smooth:
+        bend = _bend(observations.points, best.inliers, depth / assumed.focal_length)
+        of_map = frame._replace(bend=bend)
+        # A bent map leaves more open: it is left out only where it is far less probable.
+        if declared > 0.0 or _evidence_of(of_map) > _evidence_of(frame) - _FAR_LESS_PROBABLE:
+            frame = of_map
     shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
     weighed = frame.smooth or frame.planar
     if weighed or (assumed.may_rest and not _clearly_moving(best, terms, assumed)):
@@ -221,7 +225,7 @@ def _of_points(
         covariance = along_arcs(best.inflation * best.covariance, best.state[9:12])
         posterior, evidence = replace(best, covariance=covariance), -math.inf
         if shaken is not None:
-            evidence = _mode(frame, best.state, terms, len(SPEEDS) - 1, 0.0).evidence
+            evidence = _evidence_of(frame)
     if shaken is not None:
         fitted, evidence_of_shaking = shaken
         # Scales at their most probable values say less than those that are integrated.
@@ -262,35 +266,38 @@ def _standard(explained: Array, freedom: float) -> Array:
     return np.where(enough, np.clip(standard, -_CLIPPED, _CLIPPED), -_CLIPPED)
 
 
-def _bend(points: Array, inliers: BoolArray, degree: int) -> Array:
-    """Polynomials (n,b) of the places of points, together of a mean square of 1 over the inliers.
+def _bend(points: Array, inliers: BoolArray, size: float) -> Array:
+    """Polynomials (n,b) of the places of points, of each degree as much as of the image.
 
-    Of each degree as much as the smooth error of the image has.
+    ``size``: m, their root mean square over the inliers, all together.
     """
     chosen = points[inliers]
     low, high = chosen.min(axis=0), chosen.max(axis=0)
     places = (points - 0.5 * (low + high)) / max(0.5 * float(np.max(high - low)), _NEAREST)
-    x, y, z = (legvander(places[:, k], max(degree, 0)) for k in range(3))
-    columns = [
-        DEGREE_SIZES[i + j + k]
-        * math.sqrt((2 * i + 1) * (2 * j + 1) * (2 * k + 1)) * x[:, i] * y[:, j] * z[:, k]
-        for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)
-    ]  # fmt: skip
-    if not columns:
-        return np.zeros((len(points), 0))
-    bend = np.column_stack(columns)
-    whole: Array = bend / math.sqrt(np.mean(np.sum(bend[inliers] ** 2, axis=1)))
-    return np.ascontiguousarray(whole)
+    x, y, z = (legvander(places[:, k], SMOOTH_DEGREE) for k in range(3))
+    bend = np.column_stack([
+        DEGREE_SIZES[i + j + k] * math.sqrt((2 * i + 1) * (2 * j + 1) * (2 * k + 1))
+        * x[:, i] * y[:, j] * z[:, k]
+        for i in range(SMOOTH_DEGREE + 1)
+        for j in range(SMOOTH_DEGREE + 1 - i)
+        for k in range(SMOOTH_DEGREE + 1 - i - j)
+    ])  # fmt: skip
+    return bend * (size / math.sqrt(np.mean(np.sum(bend[inliers] ** 2, axis=1))))
 
 
-def _hyperprior(assumed: Assumed) -> Hyperprior:
-    """What is known of the scales of a frame."""
+def _evidence_of(frame: _Frame) -> float:
+    """Of the fastest motion."""
+    return _mode(frame, frame.best.state, frame.terms, len(SPEEDS) - 1, 0.0).evidence
+
+
+def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
+    """What is known of the scales of a frame; ``declared``: px, of the map."""
     mean = np.append(_TURN_SCALES, _SMOOTH_SCALE)
     precision = np.append(np.full(SCALES - 1, _PRECISION), _SMOOTH_PRECISION)
-    if assumed.map_deviation > 0.0:
-        mean[-1], precision[-1] = math.log(assumed.map_deviation), _DECLARED_PRECISION
+    if declared > 0.0:
+        mean[-1], precision[-1] = math.log(declared), _DECLARED_PRECISION
     first = np.full(SCALES, _FIRST_TURN)
-    first[-1] = mean[-1] if assumed.map_deviation > 0.0 else max(_FIRST_SMOOTH, mean[-1])
+    first[-1] = max(_FIRST_SMOOTH, mean[-1])
     known = assumed.scales
     both = precision + known.precisions
     mean = (precision * mean + known.precisions * known.means) / both
@@ -300,7 +307,7 @@ def _hyperprior(assumed: Assumed) -> Hyperprior:
 
 def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior, float] | None:
     """The posterior of a camera that turns within the frame, and its evidence; None: no such."""
-    observations, best, terms, threshold, assumed, hyper, _, _, bend, pixels = frame
+    observations, best, terms, threshold, assumed, hyper, _, _, bend = frame
     mean, precision, first = hyper
     gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
     if asked.wide:
@@ -338,8 +345,7 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         inliers=fit.inliers,
         squared_errors=fit.squared_errors,
         shake=fit.turns,
-        model_error=pixels * fit.smooth,
-        smooth_scale=fit.smooth,
+        model_error=fit.smooth,
         bend=bend,
         agreement=fit.agreement,
         scales=scales,
@@ -393,8 +399,7 @@ def _merged(frame: _Frame) -> tuple[Posterior, float]:
         covariance=covariance,
         squared_errors=frame.observations.squared_errors(state),
         # Beside a motion that is free: at rest, what moves looks like an error of the map.
-        model_error=frame.pixels * modes[-1].smooth,
-        smooth_scale=modes[-1].smooth,
+        model_error=modes[-1].smooth,
         bend=frame.bend,
         speeds=np.eye(len(SPEEDS))[[mode.speed for mode in modes]].T @ weights,
         scales=Scales.nothing()._replace(speeds=by_speed),

@@ -77,9 +77,9 @@ class Posterior:
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
     undetected: Array = field(default_factory=lambda: np.zeros((12, 12)))
-    # Of the smooth error, which other frames share and the covariance does not have, either
-    smooth_scale: float = 0.0  # px, or m of a bent map; 0: none was fitted
-    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n,b), see frame_fit
+    # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
+    # that the covariance does not have it, either
+    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def determined(self) -> bool:
