@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
@@ -49,9 +49,9 @@ from rs_localizer.estimation.undetected_vibration import Undetected, undetected_
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
 # hides in the noise spoils regions and a fit from near by is cheap; a smooth error in one of
 # twenty. Standard normal, of 14 frequencies and of the smooth error.
-_ASKS_TURNS, _ASKS_SMOOTH = float(norm.isf(0.3 / len(CYCLES))), float(norm.isf(0.05))
+_ASKS_TURNS, _ASKS_SMOOTH = float(-ndtri(0.3 / len(CYCLES))), float(-ndtri(0.05))
 # What chance explains in one frame of ten thousand may have moved points out of the gate.
-_WIDENS = float(norm.isf(1e-4 / len(CYCLES)))
+_WIDENS = float(-ndtri(1e-4 / len(CYCLES)))
 # Coefficients of each; six of the smooth error's twenty are as a pose's that is off.
 _COEFFICIENTS = np.append(np.full(len(CYCLES), 6.0), 2.0 * SMOOTH_TERMS - 6.0)
 # Likewise of the frames before (standard normal): one track in a thousand.
@@ -179,10 +179,8 @@ def _of_points(
     hidden = assumed.turn is None and bool(most > _ASKS_TURNS or known)
     turns = assumed.rolling and (wide or hidden)
     # What a gyroscope that comes too late leaves is smooth, too.
-    smooth = declared > 0.0 or (
-        assumed.turn is None
-        and bool(excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED)
-    )
+    shows = excess[-1] > _ASKS_SMOOTH or remembered.excess[-1] > _ASKS_REMEMBERED
+    smooth = bool(best.inliers.any() and (declared > 0.0 or (assumed.turn is None and shows)))
     best = replace(best, agreement=agreement, near_outliers=near, declared=declared)
     # What turns within the frame would explain, errors of map and lens may explain as well.
     frame = _Frame(
