@@ -12,9 +12,8 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.packing import weighted
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.observations import Observations, weighted
+from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import (
     EXPECTED_NOISE,
     LEAST_NOISE,
@@ -77,9 +76,9 @@ class Posterior:
     scales: Scales = field(default_factory=Scales.nothing)  # what the frame says of them
     # (12,12) of pose and velocities, beside the covariance: vibration that hides in the noise
     undetected: Array = field(default_factory=lambda: np.zeros((12, 12)))
-    # Of the smooth error, which other frames share and the covariance does not have, either
-    smooth_scale: float = 0.0  # px, or m of a bent map; 0: none was fitted
-    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n,b), see frame_fit
+    # (n,b): of what the smooth error is a combination (see frame_fit), which other frames share, so
+    # that the covariance does not have it, either
+    bend: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def determined(self) -> bool:
@@ -223,7 +222,7 @@ def maximum_a_posteriori(
     return Posterior(
         *_rounds(
             observations.packed,
-            len(observations),
+            observations.count,
             start,
             observations.row_time_gradient,
             prior,

@@ -39,7 +39,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cholesky, solve_triangular, toeplitz
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.inertial.gravity import STANDARD_GRAVITY
@@ -435,7 +435,7 @@ def excess(values: Array, deviations: Array) -> float:
     total, squares = float(np.sum(weights)), float(np.sum(weights**2))
     mean = np.sum(weights * values) / total
     squared, freedoms = float(np.sum(weights * (values - mean) ** 2)), len(values) - 1
-    if freedoms < 1 or chi2.sf(squared, freedoms) > _CHANCE:
+    if freedoms < 1 or chdtrc(freedoms, squared) > _CHANCE:
         return 1.0
     own = max(squared - freedoms, 0.0) / (total - squares / total)
     return math.sqrt(1.0 + own * squares / total)

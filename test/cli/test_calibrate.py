@@ -1,16 +1,16 @@
 """``rs_localizer calibrate``, ``readout`` and ``replay --smooth``: the real recording, faults."""
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from recorded import imu, tf
 from scipy.spatial.transform import Rotation
 
 from rs_localizer import data
 from rs_localizer.cli.main import main
-from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.settings import load_params_file
@@ -56,30 +56,13 @@ def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path):
     assert abs(values["readout_time"] - 0.02) < 4.0 * values["readout_time_deviation"]
 
 
-def imu_message(stamp_ns: int, rate: np.ndarray) -> Any:
-    stamp = make_message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9,
-                         nanosec=stamp_ns % 10**9)  # fmt: skip
-    x, y, z = rate.tolist()
-    vector, unknown = "geometry_msgs/msg/Vector3", np.zeros(9)
-    return make_message(
-        "sensor_msgs/msg/Imu",
-        header=make_message("std_msgs/msg/Header", stamp=stamp, frame_id="imu"),
-        orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=unknown,
-        angular_velocity=make_message(vector, x=x, y=y, z=z),
-        angular_velocity_covariance=unknown,
-        linear_acceleration=make_message(vector, x=0.0, y=0.0, z=9.81),
-        linear_acceleration_covariance=unknown,
-    )
-
-
 @pytest.fixture(scope="module")
 def inertial_flight(flight, tmp_path_factory) -> Path:
     """The flight with a gyroscope whose stamps are 5 ms early, and TF that is 20 degrees off."""
     out, offset_ns = tmp_path_factory.mktemp("flight") / "inertial", 5_000_000
     motion = RecordedMotion(read_tum(data.path(data.HAND_MOTION)))
     axes = Rotation.from_euler("xyz", [90.0, 0.0, 30.0], degrees=True)
-    said = (axes * Rotation.from_rotvec([0.0, np.radians(20.0), 0.0])).as_quat()
+    said = axes * Rotation.from_rotvec([0.0, np.radians(20.0), 0.0])
     with open_bag(flight) as bag, BagWriter(out) as copy:
         stamps = []
         for topic, stamp_ns, message in bag.messages(tuple(bag.topics)):
@@ -90,25 +73,9 @@ def inertial_flight(flight, tmp_path_factory) -> Path:
         rates = motion.state(int(times[0]), (times - times[0]) * 1e-9).angular @ axes.as_matrix()
         rates = rates + np.random.default_rng(0).normal([0.02, 0.0, -0.01], 0.01, rates.shape)
         for stamp_ns, rate in zip(times.tolist(), rates, strict=True):
-            copy.write("/imu", imu_message(stamp_ns - offset_ns, rate), stamp_ns)
-        copy.write("/tf_static", static_transform(camera, "imu", said), min(stamps))
+            copy.write("/imu", imu(stamp_ns - offset_ns, rate), stamp_ns)
+        copy.write("/tf_static", tf(camera, "imu", np.zeros(3), said), min(stamps))
     return out
-
-
-def static_transform(parent: str, child: str, rotation: np.ndarray) -> Any:
-    time = make_message("builtin_interfaces/msg/Time", sec=0, nanosec=0)
-    x, y, z, w = rotation.tolist()
-    stamped = make_message(
-        "geometry_msgs/msg/TransformStamped",
-        header=make_message("std_msgs/msg/Header", stamp=time, frame_id=parent),
-        child_frame_id=child,
-        transform=make_message(
-            "geometry_msgs/msg/Transform",
-            translation=make_message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0),
-            rotation=make_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        ),
-    )
-    return make_message("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
 
 def test_an_imu(inertial_flight, flight, tmp_path, capsys):

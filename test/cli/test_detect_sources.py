@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from recorded import imu, tf
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
@@ -123,39 +124,13 @@ def test_a_board_of_exactly_min_inliers_corners(here):
     np.testing.assert_allclose(np.median(found.positions, axis=0), expected, atol=0.01)
 
 
-def transform(static: bool) -> Any:
-    one = make_message(
-        "geometry_msgs/msg/TransformStamped",
-        header=make_camera_info(CAMERA, 5, "base_link").header,
-        child_frame_id="eye" if static else "wheel",
-        transform=make_message(
-            "geometry_msgs/msg/Transform",
-            translation=make_message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=2.0),
-            rotation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        ),
-    )
-    return make_message("tf2_msgs/msg/TFMessage", transforms=[one])
-
-
-def imu(ns: int) -> Any:
-    vector = make_message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    return make_message(
-        "sensor_msgs/msg/Imu",
-        header=make_camera_info(CAMERA, ns, "imu_link").header,
-        orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=np.zeros(9),
-        angular_velocity=vector,
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector,
-        linear_acceleration_covariance=np.zeros(9),
-    )
-
-
 @pytest.mark.parametrize("own_calibration", [True, False])
 def test_transforms_and_imu_of_a_bag_are_kept(here, own_calibration, capsys):
     start = 100 * 10**9  # the recorder's clock is another one than the stamps
     with BagWriter(here.path / "bag") as bag:
-        bag.write("/tf_static", transform(static=True), start)
+        bag.write(
+            "/tf_static", tf("base_link", "eye", (0.0, 0.0, 2.0), Rotation.identity(), 5), start
+        )
         for k in range(6):
             stamp = 10**9 + 33_000_000 * k
             png = cv2.imencode(".png", board(6, 4, k))[1].tobytes()
@@ -168,7 +143,11 @@ def test_transforms_and_imu_of_a_bag_are_kept(here, own_calibration, capsys):
             )
             bag.write("/image", image, start + stamp)
             bag.write("/imu/data", imu(stamp), start + stamp + 7)
-            bag.write("/tf", transform(static=False), start + stamp)
+            bag.write(
+                "/tf",
+                tf("base_link", "wheel", (0.0, 0.0, 2.0), Rotation.identity(), 5),
+                start + stamp,
+            )
     calibration = here.calibration if own_calibration else ()
     words = ["detect", str(here.path / "bag"), *calibration, *here.board, "--out", str(here.out)]
     assert main(words) == 0

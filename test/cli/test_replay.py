@@ -5,40 +5,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.typesys import Stores, get_typestore
+from recorded import CAMERA, READOUT_TIME, SHUTTER, flight, write_ros1
 
 from rs_localizer.cli.main import main
-from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import STORAGES, BagWriter, open_bag
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.io.trajectories import read_tum, read_twists
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.true_motion import ConstantVelocity
 
-READOUT_TIME = 0.03
 FRAMES = 6
 # Nanoseconds since 1970 that a float of seconds cannot hold.
 START = 1_732_204_800_123_456_789
-K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-SHUTTER = ["-p", f"readout_time:={READOUT_TIME}"]
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     """A simulated flight with /truth beside the inputs."""
     path = tmp_path_factory.mktemp("bags") / "flight"
-    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
-    motion = ConstantVelocity(
-        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.3, start_ns=START
-    )
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     settings = FrameSettings(points=100, noise=0.5, outliers=0.2)
     with BagWriter(path) as bag:
-        for frame in list(simulate_frames(camera, motion, world, settings))[:FRAMES]:
-            write_simulated(bag, camera, frame)
+        for frame in flight(world, FRAMES, settings, START):
+            write_simulated(bag, CAMERA, frame)
     return path
 
 
@@ -97,42 +87,13 @@ def test_what_comes_out(recording, tmp_path, capsys):
     assert (out / "twists.txt").read_text().startswith("# velocity of 'camera_optical_frame' with")
 
 
-def write_ros1(source: Path, target: Path) -> Path:
-    """The inputs of a recording as a ROS 1 bag, with its capitals and sequence numbers."""
-    store = get_typestore(Stores.ROS1_NOETIC)
-
-    def old(message: Any) -> Any:
-        if not hasattr(message, "__msgtype__"):
-            return [old(item) for item in message] if isinstance(message, list) else message
-        names = {"d": "D", "k": "K", "r": "R", "p": "P"}
-        is_info = message.__msgtype__ == "sensor_msgs/msg/CameraInfo"
-        fields = {
-            (names.get(name, name) if is_info else name): old(getattr(message, name))
-            for name in message.__dataclass_fields__
-            if name != "__msgtype__" and not name.isupper()
-        }
-        if message.__msgtype__ == "std_msgs/msg/Header":
-            fields["seq"] = 0
-        return store.types[message.__msgtype__](**fields)
-
-    with Ros1Writer(target) as bag:
-        connections = {}
-        for topic, stamp_ns, message in messages(source):
-            if topic.startswith("/truth"):
-                continue
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = bag.add_connection(topic, kind, typestore=store)
-            bag.write(connections[topic], stamp_ns, store.serialize_ros1(old(message), kind))
-    return target
-
-
 def test_every_kind_of_recording_gives_the_same(recording, tmp_path):
+    inputs = [message for message in messages(recording) if not message[0].startswith("/truth")]
     bags = [
         recording,
         next(recording.glob("*.mcap")),
         rewrite(recording, tmp_path / "sqlite", lambda topic, message: topic, "sqlite3"),
-        write_ros1(recording, tmp_path / "old.bag"),
+        write_ros1(tmp_path / "old.bag", inputs),
     ]
     texts = []
     for i, bag in enumerate(bags):

@@ -5,63 +5,35 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from recorded import CAMERA, SHUTTER, flight, tf, write_ros1
 from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.camera import Camera
-from rs_localizer.io.bags import BagWriter, make_message, open_bag
+from rs_localizer.io.bags import BagWriter, open_bag
 from rs_localizer.io.trajectories import read_tum, read_twists
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import room
-from rs_localizer.simulation.true_motion import ConstantVelocity
 
-READOUT_TIME = 0.03
 FRAMES = 5
-CAMERA = "camera_optical_frame"
-SHUTTER = ("-p", f"readout_time:={READOUT_TIME}")
+EYE = "camera_optical_frame"
 # A camera that looks to the left from the front of a base.
 LEVER = np.array([0.5, 0.2, 0.9])
 TURN = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def tf(parent: str, child: str, position: Any, turn: Rotation, stamp_ns: int = 0) -> Any:
-    x, y, z, w = turn.as_quat().tolist()
-    px, py, pz = map(float, position)
-    seconds, nanoseconds = divmod(stamp_ns, 10**9)
-    stamp = make_message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    transform = make_message(
-        "geometry_msgs/msg/TransformStamped",
-        header=make_message("std_msgs/msg/Header", stamp=stamp, frame_id=parent),
-        child_frame_id=child,
-        transform=make_message(
-            "geometry_msgs/msg/Transform",
-            translation=make_message("geometry_msgs/msg/Vector3", x=px, y=py, z=pz),
-            rotation=make_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        ),
-    )
-    return make_message("tf2_msgs/msg/TFMessage", transforms=[transform])
-
-
 @pytest.fixture(scope="module")
 def record(tmp_path_factory) -> Any:
-    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
-    motion = ConstantVelocity(
-        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.3, start_ns=10**12
-    )
     world = room(np.zeros((1, 3)), np.random.default_rng(0), count=5000)
     settings = FrameSettings(points=100, noise=0.3, outliers=0.2)
-    frames = list(simulate_frames(camera, motion, world, settings))[:FRAMES]
+    frames = flight(world, FRAMES, settings, 10**12)
 
     def write(transforms: list[tuple[str, Any]]) -> Path:
         path = tmp_path_factory.mktemp("bags") / "flight"
         with BagWriter(path) as bag:
             for frame in frames:
-                write_simulated(bag, camera, frame)
+                write_simulated(bag, CAMERA, frame)
             for topic, message in transforms:  # behind: a recording is read as a whole
                 bag.write(topic, message, 2 * 10**12)
         return path
@@ -69,7 +41,7 @@ def record(tmp_path_factory) -> Any:
     return write
 
 
-STATIC = [("/tf_static", tf("base_link", CAMERA, LEVER, TURN))]
+STATIC = [("/tf_static", tf("base_link", EYE, LEVER, TURN))]
 
 
 def replayed(bag: Path, out: Path, *settings: str) -> list[tuple[Array, Array, Array, Array]]:
@@ -132,41 +104,14 @@ def test_transforms_come_out(record, tmp_path):
 
 def test_an_old_recording(record, tmp_path):
     # ROS 1 before tf2: another type, slashes before the names, and the mounting on /tf.
-    store = get_typestore(Stores.ROS1_NOETIC)
-    definition = "geometry_msgs/TransformStamped[] transforms"
-    store.register(get_types_from_msg(definition, "tf/msg/tfMessage"))
-
-    def old(message: Any) -> Any:
-        if isinstance(message, list):
-            return [old(item) for item in message]
-        if not hasattr(message, "__msgtype__"):
-            return message
-        kind = message.__msgtype__.replace("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-        names = {"d": "D", "k": "K", "r": "R", "p": "P"} if kind.endswith("CameraInfo") else {}
-        fields = {
-            names.get(name, name): old(getattr(message, name))
-            for name in message.__dataclass_fields__
-            if name != "__msgtype__" and not name.isupper()
-        }
-        if kind == "std_msgs/msg/Header":
-            fields["seq"] = 0
-        return store.types[kind](**fields)
-
-    with open_bag(record(STATIC)) as bag, Ros1Writer(tmp_path / "old.bag") as writer:
-        connections: dict[str, Any] = {}
+    with open_bag(record(STATIC)) as bag:
         messages = list(bag.messages(("/camera_info", "/correspondences")))
-        first = messages[0][1]
-        for stamp_ns in (first - 10**9, first + 10**9):
-            message = tf("/base_link", f"/{CAMERA}", LEVER, TURN, stamp_ns)
-            messages.append(("/tf", stamp_ns, message))
-        for topic, stamp_ns, message in messages:
-            converted = old(message)
-            kind = converted.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            data = store.serialize_ros1(converted, kind)
-            writer.write(connections[topic], stamp_ns, data)
+    first = messages[0][1]
+    for stamp_ns in (first - 10**9, first + 10**9):
+        mounting = tf("/base_link", f"/{EYE}", LEVER, TURN, stamp_ns)
+        messages.append(("/tf", stamp_ns, mounting))
+    bag = write_ros1(tmp_path / "old.bag", messages)
     settings = ("-p", "base_frame:=base_link")
     new = replayed(record(STATIC), tmp_path / "new", *settings)
-    for a, b in zip(replayed(tmp_path / "old.bag", tmp_path / "out", *settings), new, strict=True):
+    for a, b in zip(replayed(bag, tmp_path / "out", *settings), new, strict=True):
         assert all(np.allclose(*pair, atol=1e-6) for pair in zip(a, b, strict=True))

@@ -5,21 +5,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import recorded
+from recorded import SHUTTER
 
 from rs_localizer.cli.main import main
-from rs_localizer.core.camera import Camera
 from rs_localizer.io.bags import BagWriter, make_message, open_bag
 from rs_localizer.io.clouds import make_cloud
 from rs_localizer.io.maps.files import write_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
-from rs_localizer.simulation.frames import FrameSettings, simulate_frames
+from rs_localizer.simulation.frames import FrameSettings
 from rs_localizer.simulation.recording import write_simulated
 from rs_localizer.simulation.scene import keypoint_rows, map_rows, random_descriptors, room
-from rs_localizer.simulation.true_motion import ConstantVelocity
 
-READOUT_TIME = 0.03
-SHUTTER = ["-p", f"readout_time:={READOUT_TIME}"]
 FRAMES = 8
 POINTS = room(np.zeros((1, 3)), np.random.default_rng(0), count=6000)
 LANDMARKS = Map(
@@ -31,15 +29,10 @@ LANDMARKS = Map(
 def flight(tmp_path_factory) -> Path:
     """Recordings of one flight: with correspondences, keypoints, and a map, as asked for."""
     folder = tmp_path_factory.mktemp("bags")
-    K = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
-    camera = Camera(640, 480, K, readout_time=READOUT_TIME)
-    motion = ConstantVelocity(
-        np.array([0.5, -1.0, 1.5]), np.array([0.5, 0.2, -0.3]), 0.4, start_ns=10**9
-    )
     seen = FrameSettings(points=80, noise=0.5, outliers=0.2)
     with BagWriter(folder / "all") as bag:
-        for frame in list(simulate_frames(camera, motion, POINTS, seen))[:FRAMES]:
-            write_simulated(bag, camera, frame)
+        for frame in recorded.flight(POINTS, FRAMES, seen, 10**9):
+            write_simulated(bag, recorded.CAMERA, frame)
             rows = keypoint_rows(frame, LANDMARKS, np.random.default_rng(frame.stamp_ns))
             for topic, names in (
                 ("/cam/keypoints", ("u", "v", "descriptor")),

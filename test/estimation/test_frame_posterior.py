@@ -20,7 +20,7 @@ from rs_localizer.core.state import step_between
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.frame_posterior import _look, frame_posterior
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior_terms import held_terms
+from rs_localizer.estimation.prior import held_terms
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 
@@ -365,27 +365,6 @@ def test_scores_tell_the_frequency():
         assert statistic[:-1].max() > 50.0
 
 
-def test_a_map_that_is_bent_is_refused_or_covered():
-    """A wall of 3 m whose middle stands 3 cm out, 4 m away: more than ten pixels of noise."""
-    squared, refused = [], 0
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        flat = np.column_stack([rng.uniform(-1.5, 1.5, 80), rng.uniform(-1.2, 1.2, 80),
-                                rng.uniform(-1.0, 1.0, 80)])  # fmt: skip
-        bent = flat + np.column_stack([np.zeros((80, 2)), 0.03 * (1 - (flat[:, 0] / 1.5) ** 2)])
-        state = np.concatenate([np.eye(3).ravel(), [0.0, 0.0, 4.0], 0.02 * rng.normal(size=6),
-                                np.zeros(6)])  # fmt: skip
-        observations = observe(state, bent, 0.1, rng, seen_as=flat)
-        found = frame_posterior(observations, state, PRIOR, 2.0, ASSUMED)
-        if refused_of(observations, found):
-            refused += 1
-            continue
-        assert found.model_error > 0.1
-        squared.append(distance(found, state, slice(0, 6)))
-    # What a motion mimics of a bend is seen by nothing: five of twenty are published, and wrong.
-    assert refused >= 15 or np.mean(np.array(squared) < chi2.ppf(0.95, 6)) >= 0.75
-
-
 def published(make, frames=60, noise=0.5, points=80):
     """Scores (n,2) of poses and twists of an independent simulator: first row, and middle one."""
     seen = frames_of(Camera(), make, Rich(points), frames, 3)
@@ -455,3 +434,12 @@ def test_however_sure_frames_are_what_is_clear_is_seen(sure):
     found = frame_posterior(observations, truth, PRIOR, 2.0, knows)
     assert distance(found, truth, slice(0, 6)) < chi2.ppf(0.999, 6)
     assert distance(found, truth, slice(6, 12)) < chi2.ppf(0.999, 6)
+
+
+def test_a_motion_without_inliers_beside_a_bent_map_is_no_error():
+    """It was one where smooth errors are declared, and in small planes that are tracked."""
+    observations, truth = frame(3, 0.0, 0.5)
+    away = truth.copy()
+    away[11] = 40.0
+    found = frame_posterior(observations, away, PRIOR, 1e-3, replace(ASSUMED, map_deviation=0.01))
+    assert found.inliers.sum() < 12

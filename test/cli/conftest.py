@@ -1,0 +1,6 @@
+"""Makes the recordings of the commands' tests importable."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
