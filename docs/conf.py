@@ -21,7 +21,10 @@ PAGES = {
     "simulation viewing integrations library security",
     "Understand": "solvers estimator honesty benchmarks architecture api",
 }
-OTHERS = ("CONTRIBUTING", "benchmarks/README", "QUALITY_DECLARATION", "CHANGELOG")
+OTHERS = (
+    *("CONTRIBUTING", "benchmarks/README", "QUALITY_DECLARATION", "CHANGELOG"),
+    *("SECURITY", "CODE_OF_CONDUCT"),
+)
 if not by_rosdoc2:
     root_doc = "README"
     include_patterns = ["README.md", "docs/*.md", *(f"{name}.*" for name in OTHERS)]
