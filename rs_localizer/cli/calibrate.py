@@ -23,7 +23,6 @@ from rs_localizer.cli.batch import (
     run_batch,
 )
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
-from rs_localizer.cli.calibrate_table import tell, tell_lens
 from rs_localizer.cli.image_input import clock_of, of_bag, of_files, tell_times
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
@@ -150,9 +149,9 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
             camera, source.images, intrinsics=intrinsics, imu=source.imu,
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
-    tell(found, args.rate)
+    _tell(found, args.rate)
     if intrinsics:
-        tell_lens(found)
+        _tell_lens(found)
     for line in imu_lines(found, source.imu, config):
         print(line)
     if args.plots is not None:
@@ -242,6 +241,53 @@ def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Sou
     if fault := sizes.fault():
         print(f"warning: {fault}", file=sys.stderr)
     return _Source(images, camera, size, map=marker_map)
+
+
+def _tell(found: Calibration, rate: float | None) -> None:
+    """Values, the parts of the recording, and what is odd."""
+    direction = verdict.scan_direction(found)
+    rows = [
+        ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
+        ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
+        ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
+        ("scan direction", str(direction)),
+        ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
+        ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
+        ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
+        ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
+        ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
+    ]
+    for name, text in rows:
+        print(f"{name:26} {text}")
+    for block in found.blocks:
+        print(
+            f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"
+            f"{1e3 * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
+        )
+    for remark in verdict.remarks(found):
+        print(remark)
+    if rate is not None:
+        share = abs(found.readout_time) / found.stamps.interval
+        print(
+            f"the readout time is {share:.3f} of the interval: it scales with --rate, "
+            f"assumed to be {rate:g} Hz"
+        )
+
+
+def _tell_lens(found: Calibration) -> None:
+    """The numbers of the lens."""
+    state = found.fit.state
+    deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
+    names = ("fx", "fy", "cx", "cy")
+    print(f"{'lens':26} {found.fit.camera.distortion_model}")
+    for k, value in enumerate(state.lens):
+        name = names[k] if k < len(names) else f"D[{k - len(names)}]"
+        print(f"{name:26} {value:.5g} +- {found.inflation * deviations[k]:.2g}")
+    errors = found.lens
+    print(
+        f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
+        f"{100.0 * errors.focal_length:.2g} %, distortion {errors.distortion:.2g} px at the corners"
+    )
 
 
 def _write(
