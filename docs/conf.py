@@ -23,7 +23,10 @@ PAGES = {
     "simulation viewing integrations library security",
     "Understand": "solvers estimator honesty benchmarks architecture api",
 }
-OTHERS = ("CONTRIBUTING", "benchmarks/README", "QUALITY_DECLARATION", "CHANGELOG")
+OTHERS = (
+    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),
+    *("QUALITY_DECLARATION", "CHANGELOG"),
+)
 if not by_rosdoc2:
     root_doc = "README"
     # A page per camera of the table of readout times, and the table as JSON.
