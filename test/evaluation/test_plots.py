@@ -1,4 +1,4 @@
-"""What pictures show: ranges that one outlier does not stretch, and no blank band."""
+"""What pictures show: ranges that one outlier does not stretch."""
 
 import numpy as np
 

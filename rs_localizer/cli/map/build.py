@@ -17,7 +17,9 @@ from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
     shutter_values,
+    telemetry_of,
     tell_left_out,
+    tell_telemetry,
     time_faults,
 )
 from rs_localizer.cli.marker_map import read_checked_map
@@ -28,10 +30,12 @@ from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.calibration import write_calibration
+from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.io.images import Image
 from rs_localizer.io.imu import read_imu_csv
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
+from rs_localizer.io.telemetry import Telemetry
 from rs_localizer.io.topics import IMU
 from rs_localizer.io.trajectories import Trajectory, write_tum
 from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
@@ -154,8 +158,8 @@ def add_imu_arguments(group: argparse._ArgumentGroup) -> None:
         const="",
         metavar="TOPIC|FILE.csv",
         help="the IMU that went along: no map without its scale. A topic of the bag (default: the "
-        "only one; used without this option, too, if it gives a scale); beside a video or a folder "
-        "a file as EuRoC's imu0/data.csv, with the clock of the images",
+        "only one; used without this option, too, if it gives a scale), or that inside a video; "
+        "beside a video or a folder a file as EuRoC's imu0/data.csv, with the clock of the images",
     )
     group.add_argument("--no-imu", action="store_true", help="without that of the bag")
 
@@ -173,12 +177,22 @@ def imu_of(args: argparse.Namespace) -> GivenImu | None:
         return None
     if is_bag(args.images):
         return _of_bag(args)
-    if args.imu is None:
-        return None
     if not args.imu:
-        raise UsageError("a video or folder has no IMU of its own: give --imu FILE.csv")
+        telemetry = telemetry_of(args.images, args)
+        if telemetry is not None and args.rate is None:
+            return _of_video(telemetry, args)
+        if args.imu is None:
+            return None
+        raise UsageError("this video or folder has no IMU of its own: give --imu FILE.csv")
     stamps, rates, forces = read_imu_csv(Path(args.imu))
     return GivenImu(ImuRecording(stamps, rates, specific_forces=forces), asked=True)
+
+
+def _of_video(telemetry: Telemetry, args: argparse.Namespace) -> GivenImu:
+    start_ns = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
+    stamps = start_ns + np.round(1e9 * telemetry.times).astype(np.int64)
+    recording = ImuRecording(stamps, telemetry.rates, np.eye(3), telemetry.forces)
+    return GivenImu(recording, asked=args.imu is not None)
 
 
 def _of_bag(args: argparse.Namespace) -> GivenImu | None:
@@ -268,6 +282,7 @@ def run(args: argparse.Namespace) -> None:
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
     markers = None if args.markers is None else read_checked_map(args.markers)
+    tell_telemetry(args)
     shutter, imu = shutter_of(args), imu_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
