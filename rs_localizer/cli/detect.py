@@ -19,6 +19,7 @@ from rs_localizer.cli.image_input import (
     shutter_values,
     tell_left_out,
     tell_next,
+    tell_telemetry,
     time_faults,
     write_shutter,
 )
@@ -139,6 +140,7 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
     )
     if recorded.with_corners < recorded.images:
         print(f"{recorded.images - recorded.with_corners} images show no part of the map")
+    tell_telemetry(args)
     tell_left_out(recorded.refused, recorded.carried)
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
@@ -199,6 +201,7 @@ def _tell_features(args: argparse.Namespace, extraction: Extraction) -> None:
     )
     if bare := len(extraction.stamps_ns) - with_any:
         print(f"{bare} images have no keypoint")
+    tell_telemetry(args)
     tell_left_out(extraction.refused, extraction.carried)
 
 
