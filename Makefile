@@ -12,9 +12,9 @@ VENV ?= .venv
 OUT ?= out
 
 # The first interpreter that will do; without any, python3 is refused below with the reason.
-supported = import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
+supported = import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 ifndef PYTHON
-PYTHON := $(shell for p in python3 python3.12 python3.11; do \
+PYTHON := $(shell for p in python3 python3.13 python3.12 python3.11; do \
     $$p -c '$(supported)' 2>/dev/null && echo $$p && exit; done; echo python3)
 endif
 
@@ -73,7 +73,7 @@ lint: $(ready)
 
 $(ready): setup.py pyproject.toml Makefile
 	@$(PYTHON) -c '$(supported)' 2>/dev/null || { \
-	    echo "rs_localizer needs Python 3.11 or 3.12, but $(PYTHON) is" \
+	    echo "rs_localizer needs Python 3.11, 3.12 or 3.13, but $(PYTHON) is" \
 	        "$$($(PYTHON) -V 2>/dev/null || echo 'not there')." \
 	        "Choose another with: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
@@ -81,7 +81,7 @@ $(ready): setup.py pyproject.toml Makefile
 	        "On Debian and Ubuntu: sudo apt install python3-venv" >&2; exit 1; }
 	@echo "Preparing $(VENV) (once, takes a few minutes)"
 	@[ -e $@ ] || $(PYTHON) -m venv --clear $(VENV)
-	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,hloc,mapping,table,view,test]'
+	@$(python) -m pip install -qq --disable-pip-version-check --no-input --no-compile --editable '.[ros,evo,fleet,hloc,mapping,table,video,view,test]'
 	@# Which pip does one file after the other, and the tests of other packages with them.
 	@$(python) -m compileall -qq -j 0 -x '/(tests|pip)/' $(VENV)/lib || true
 	@touch $@

@@ -106,5 +106,15 @@ def test_rosdep_knows_every_key():
     package = parse_package(ROOT / "package.xml")
     named = {item.name for kind in ("exec", "test", "build", "buildtool")
              for item in getattr(package, f"{kind}_depends")}  # fmt: skip
-    assert named == keys["apt"].keys() | keys["jazzy"].keys()
-    assert all(name.startswith("python3-") for name in keys["apt"].values())  # and none by pip
+    assert named == keys["apt"].keys() | keys["after jazzy"].keys() | keys["ros"].keys()
+    for names in (keys["apt"], keys["after jazzy"]):
+        assert all(name.startswith("python3-") for name in names.values())  # and none by pip
+
+
+@pytest.mark.parametrize(("distribution", "numba"), [("jazzy", False), ("lyrical", True)])
+def test_numba_is_asked_for_where_ubuntu_has_it(distribution, numba):
+    package = parse_package(ROOT / "package.xml")
+    package.evaluate_conditions({"ROS_DISTRO": distribution})
+    chosen = {item.name for item in package.exec_depends if item.evaluated_condition}
+    assert ("python3-numba" in chosen) is numba
+    assert "python3-numpy" in chosen

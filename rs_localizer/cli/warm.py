@@ -13,6 +13,7 @@ from rs_localizer.config import NodeConfig
 from rs_localizer.core.simd import shipped
 from rs_localizer.core.simd.jit import cache_directory
 from rs_localizer.markers import detection
+from rs_localizer.pipeline.compiling import note_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.solvers.table import SOLVERS
 from rs_localizer.trajectory import warm_up as trajectory
@@ -51,6 +52,8 @@ def run(arguments: argparse.Namespace) -> None:
                 compiles()
             except RuntimeWarning as warning:
                 raise OSError(str(warning)) from warning
+            if name.startswith("solver "):
+                note_compiled(name.removeprefix("solver "))
             print(f"{name:20} {time.monotonic() - started:6.1f} s", flush=True)
     places = f"{cache_directory()}"
     if shipped.FOLDER.is_dir():

@@ -20,7 +20,7 @@ from rs_localizer.core.state import step_between
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.frame_posterior import _look, frame_posterior
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior_terms import held_terms
+from rs_localizer.estimation.prior import held_terms
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 
@@ -434,3 +434,12 @@ def test_however_sure_frames_are_what_is_clear_is_seen(sure):
     found = frame_posterior(observations, truth, PRIOR, 2.0, knows)
     assert distance(found, truth, slice(0, 6)) < chi2.ppf(0.999, 6)
     assert distance(found, truth, slice(6, 12)) < chi2.ppf(0.999, 6)
+
+
+def test_a_motion_without_inliers_beside_a_bent_map_is_no_error():
+    """It was one where smooth errors are declared, and in small planes that are tracked."""
+    observations, truth = frame(3, 0.0, 0.5)
+    away = truth.copy()
+    away[11] = 40.0
+    found = frame_posterior(observations, away, PRIOR, 1e-3, replace(ASSUMED, map_deviation=0.01))
+    assert found.inliers.sum() < 12

@@ -9,8 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from std_srvs.srv import Trigger
@@ -20,6 +18,7 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
+from rs_localizer.pipeline.compiling import compile_in_child, is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
 from rs_localizer.pipeline.refusal import Refusal
@@ -33,7 +32,7 @@ from rs_localizer.ros.localizer.health import (
     tell,
 )
 from rs_localizer.ros.localizer.transforms import Broadcaster
-from rs_localizer.ros.node.conversion import installed, make_message, message_class
+from rs_localizer.ros.node.conversion import create_output, installed, make_message, message_class
 from rs_localizer.ros.node.health import Health
 from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.managed import ManagedNode
@@ -196,11 +195,9 @@ def described(landmarks: Map) -> str:
 def warm_up(frames: FrameLocalizer) -> float:
     """Compile all kernels that the settings need; how many seconds it took."""
     started = time.monotonic()
+    compile_in_child(frames.config.solver)
     frames.warm_up()
     return time.monotonic() - started
-
-
-_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
 
 
 class Outputs:
@@ -217,12 +214,7 @@ class Outputs:
         self._node = node
         self._afterwards = afterwards
         self._publishers = {
-            name: node.create_lifecycle_publisher(
-                message_class(type_name),
-                f"~/{name}",
-                QoSProfile(**_QOS),  # a new one each: overrides are written into it
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+            name: create_output(node, message_class(type_name), f"~/{name}")
             for name, type_name in TYPES.items()
         }
 
@@ -270,7 +262,12 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def kernels(self) -> Callable[[], None]:
         frames = FrameLocalizer(self.config)
         log = self.get_logger()
-        log.info("compiling kernels (once on this machine, up to a minute)")
+        self.compiles = not is_compiled(self.config.solver)
+        log.info(
+            "compiling kernels (once on this machine, up to a minute)"
+            if self.compiles
+            else "loading kernels"
+        )
 
         def compiles() -> None:
             with contextlib.suppress(ValueError):  # of which on_configure tells, at once

@@ -22,6 +22,7 @@ class State(StrEnum):
     """Of nodes: THE list; docs/reasons.md says what each means and what to do."""
 
     COMPILING = "compiling"
+    LOADING = "loading"
     INACTIVE = "inactive"
     WAITING = "waiting for"  # what, is the subject
     # Of the localizer.
@@ -36,6 +37,12 @@ class State(StrEnum):
 
 # What a node that is not active needs, by the label of its state.
 _STEPS = {"unconfigured": "configure and activate it", "finalized": "start it again"}
+
+_PREPARING = {
+    "configuring": (State.LOADING, "loaded"),
+    "compiling": (State.COMPILING, "compiled"),
+    "loading": (State.LOADING, "loaded"),
+}
 
 
 class Level(IntEnum):
@@ -73,10 +80,9 @@ class Judgement(NamedTuple):
 
 def out_of_service(life_cycle: str) -> Judgement | None:
     """What to say of a node that is not active, by the label of its state; None if it is."""
-    if life_cycle == "configuring":
-        return Judgement(
-            Level.WARN, State.COMPILING, "the node is being configured: kernels are compiled"
-        )
+    if life_cycle in _PREPARING:
+        state, what = _PREPARING[life_cycle]
+        return Judgement(Level.WARN, state, f"the node is being configured: kernels are {what}")
     if life_cycle == "active":
         return None
     # Somebody wants it so: no fault, which an aggregator would make of STALE.

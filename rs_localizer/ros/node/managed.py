@@ -46,6 +46,7 @@ class RobustLifecycleNode(LifecycleNode):
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
         self._prepared: Future | None = None
+        self.compiles = True  # what it prepares; otherwise it loads what has been compiled
         # A request to configure waits; others shall not wait for it.
         group = ReentrantCallbackGroup()
         for service in self.services:
@@ -58,10 +59,10 @@ class RobustLifecycleNode(LifecycleNode):
 
     @property
     def state(self) -> str:
-        """Label of the present state; ``configuring`` also while kernels are compiled for it."""
+        """Label of the present state; ``compiling`` or ``loading`` while kernels are prepared."""
         label: str = self._state_machine.current_state[1]
         if self._prepared is not None and not self._prepared.done() and label == "unconfigured":
-            return "configuring"
+            return "compiling" if self.compiles else "loading"
         return label
 
     def prepare(self) -> Future:

@@ -164,7 +164,18 @@ def silent(topic: str, cause: str, heard: bool = False, mismatch: bool = False) 
     ("change", "level", "state", "message"),
     [
         ({"life_cycle": "inactive"}, Level.OK, "inactive", "the node is inactive: activate it"),
-        ({"life_cycle": "configuring"}, Level.WARN, "compiling", "the node is being configured"),
+        (
+            {"life_cycle": "compiling"},
+            Level.WARN,
+            "compiling",
+            "the node is being configured: kernels are compiled",
+        ),
+        (
+            {"life_cycle": "loading"},
+            Level.WARN,
+            "loading",
+            "the node is being configured: kernels are loaded",
+        ),
         (
             {"life_cycle": "unconfigured"},
             Level.OK,

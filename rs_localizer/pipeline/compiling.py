@@ -1,0 +1,61 @@
+"""Kernels are compiled in a process of their own: a node does not keep the compiler's memory."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+from numba.core.registry import cpu_target
+
+from rs_localizer.core.simd import shipped
+from rs_localizer.core.simd.jit import PARTS, cache_directory, digest
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+# ``warm``, until the end of its input says that the process that waits for it has ended.
+_PROGRAM = """
+import os, sys, threading
+threading.Thread(target=lambda: os._exit(sys.stdin.read() == ""), daemon=True).start()
+from rs_localizer.__main__ import run
+sys.exit(run())
+"""
+
+
+def is_compiled(solver: str) -> bool:
+    """Whether all kernels of a solver's frames are on disk, by the note of who compiled them."""
+    return shipped.FOLDER.is_dir() or _note(solver).is_file()
+
+
+def note_compiled(solver: str) -> None:
+    """Note that all kernels of a solver's frames are on disk.
+
+    Raises:
+        OSError: when that cannot be written there.
+    """
+    note = _note(solver)
+    if not shipped.FOLDER.is_dir() and note.parent.is_dir():
+        note.touch()
+
+
+def compile_in_child(solver: str) -> None:
+    """Compile what is not on disk yet, as ``rs_localizer warm --solver SOLVER``.
+
+    What fails there is compiled in this process, which then says why.
+    """
+    if is_compiled(solver):
+        return
+    program = [sys.executable, "-c", _PROGRAM, "warm", "--solver", solver]
+    with subprocess.Popen(
+        program, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as child:
+        child.wait()
+
+
+def _note(solver: str) -> Path:
+    """A file beside the machine code of these sources; Numba files code by the rest."""
+    target = cpu_target.target_context.codegen().magic_tuple()
+    about = repr((solver, sys.version, numba.__version__, target))
+    name = f"rs_localizer.{solver}-{hashlib.sha256(about.encode()).hexdigest()[:16]}"
+    return cache_directory() / digest(PARTS[-1], _PACKAGE) / name
