@@ -49,6 +49,7 @@ from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
+from rs_localizer.readout import shared_row
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
@@ -111,6 +112,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write the files although the result is refused (the exit code stays 1)",
     )
+    parser.add_argument(
+        "--share",
+        metavar="CAMERA",
+        help="also write a row of this camera for the table of readout times, to send as a pull "
+        "request: FILE_share.csv beside --out",
+    )
+    parser.add_argument("--firmware", default="", metavar="TEXT", help="for --share: the camera's")
     add_batch_arguments(parser)
 
 
@@ -161,12 +169,27 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
         _write(args, found, source.map, intrinsics, config)
     if refusal:
         raise ValueError(refusal)
+    if args.share:
+        _share(args, found)
     return found
+
+
+def _share(args: argparse.Namespace, found: Calibration) -> None:
+    """The row of the table that this recording gives."""
+    width, height = found.fit.camera.size
+    mode = f"{width}x{height} {1.0 / found.stamps.interval:.4g} Hz"
+    row = shared_row(args.share, mode, verdict.readout_time(found), found.deviation, args.firmware)
+    path = args.out.with_name(f"{args.out.stem}_share.csv")
+    with atomic_files(path) as (part,):
+        part.write_text(row, encoding="utf-8")
+    print(f"written: {path}, a row for rs_localizer/data/readout_times/table.csv: send it to us")
 
 
 def _config(args: argparse.Namespace) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
+    if args.share and args.out is None:
+        raise UsageError("--share needs --out FILE.yaml")
     return given_settings(args)
 
 
