@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,7 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, add_overwrite, replaced
+from rs_localizer.cli import UsageError, add_overwrite, replaced, stage
 from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
@@ -25,6 +22,7 @@ from rs_localizer.cli.image_input import (
     tell_telemetry,
     time_faults,
 )
+from rs_localizer.cli.marker_map import read_checked_map
 from rs_localizer.config import FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
@@ -46,9 +44,6 @@ from rs_localizer.mapping.colmap import Effort, require
 from rs_localizer.mapping.inertial_metres import GivenImu
 from rs_localizer.mapping.report import advice, rows, written
 from rs_localizer.mapping.views import Looker, View
-from rs_localizer.markers.consistency import other_units
-from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.detect import Cameras
 from rs_localizer.offline.image_sources import Carried
 from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
@@ -286,7 +281,7 @@ def run(args: argparse.Namespace) -> None:
     require()
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
-    markers = None if args.markers is None else _marker_map(args.markers)
+    markers = None if args.markers is None else read_checked_map(args.markers)
     tell_telemetry(args)
     shutter, imu = shutter_of(args), imu_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
@@ -300,7 +295,7 @@ def run(args: argparse.Namespace) -> None:
             )  # fmt: skip
             folder = out / COLMAP
             folder.mkdir()
-            built = build_map(inputs, Workshop(folder, Effort(args.threads, args.seed), _stage))
+            built = build_map(inputs, Workshop(folder, Effort(args.threads, args.seed), stage))
         _write(out, built, looked)
     _tell(args, built, looked)
 
@@ -316,19 +311,6 @@ def _check_points(args: argparse.Namespace) -> None:
                 f"--distance: the point {name} must be given by --point in two images or more, "
                 f"it is in {names.count(name)}"
             )
-
-
-def _marker_map(path: Path) -> MarkerMap:
-    marker_map = read_marker_map(path)
-    for fault in other_units(marker_map):
-        print(f"warning: {path}: {fault}", file=sys.stderr)
-    return marker_map
-
-
-@contextmanager
-def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
-    with tqdm(total=total, desc=name, disable=None) as bar:
-        yield bar.update
 
 
 def _write(out: Path, built: Built, looked: Looked) -> None:

@@ -60,6 +60,11 @@ def copy_message(source: Any, type_name: str) -> Any:
     return make_message(type_name, **fields)
 
 
+def xyz(vector: Any) -> Any:
+    """The numbers (3,) of a Point, a Vector3 or a Quaternion without its w."""
+    return np.array([vector.x, vector.y, vector.z])
+
+
 def create_output(node: LifecycleNode, kind: type, topic: str) -> Any:
     """A reliable publisher that publishes while the node is active; its QoS can be overridden."""
     return node.create_lifecycle_publisher(
