@@ -78,6 +78,7 @@ setup(
         "hloc": ["h5py"],
         "mapping": ["pycolmap"],
         "table": ["fsspec", "pyarrow"],
+        "video": ["telemetry-parser"],
         "view": ["rerun-sdk"],
         "test": [
             "build",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import runpy
+from pathlib import Path
 from typing import Any
 
 project = "rs_localizer"
@@ -16,15 +18,27 @@ rosdoc2_settings["allow_other_extensions"] = True  # Mermaid, where it is instal
 by_rosdoc2 = "confpy_succeeded" in globals()  # which runs this file inside its own
 # The pages, in the order of the site's contents; rosdoc2 makes a front page of its own.
 PAGES = {
-    "Start": "concepts install camera",
+    "Start": "concepts install camera cameras/index",
     "Use": "node reasons detector features imu recordings calibration mapping map_build maps "
     "simulation viewing integrations library security",
     "Understand": "solvers estimator honesty benchmarks architecture api",
 }
-OTHERS = ("CONTRIBUTING", "benchmarks/README", "QUALITY_DECLARATION", "CHANGELOG")
+OTHERS = (
+    *("CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "benchmarks/README"),
+    *("QUALITY_DECLARATION", "CHANGELOG"),
+)
 if not by_rosdoc2:
     root_doc = "README"
-    include_patterns = ["README.md", "docs/*.md", *(f"{name}.*" for name in OTHERS)]
+    # A page per camera of the table of readout times, and the table as JSON.
+    make_cameras = runpy.run_path(str(Path(__file__).with_name("make_cameras.py")))
+    make_cameras["write"]()
+    html_extra_path = [f"cameras/{make_cameras['JSON']}"]
+    include_patterns = [
+        "README.md",
+        "docs/*.md",
+        "docs/cameras/*.md",
+        *(f"{name}.*" for name in OTHERS),
+    ]
     exclude_patterns = [".*", "out", "build", "install", "log", "rs_localizer", "test"]
     html_theme = "alabaster"
     html_theme_options = {"page_width": "1100px", "fixed_sidebar": True}

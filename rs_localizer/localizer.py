@@ -18,6 +18,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE, step_between
 from rs_localizer.core.types import Estimate, Failure
+from rs_localizer.estimation import frame_fit, mirror, motion_model, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.assumptions import (
     assumptions,
@@ -28,19 +29,22 @@ from rs_localizer.estimation.assumptions import (
 )
 from rs_localizer.estimation.calibration import NO_EFFECT, calibration_effect
 from rs_localizer.estimation.frame_posterior import frame_posterior
-from rs_localizer.estimation.inputs import checked, unfit
 from rs_localizer.estimation.lens import decided, find_lens, may_be_lens, refuted, told_of_lens
-from rs_localizer.estimation.medians import median_depth
-from rs_localizer.estimation.observing import Observed, Sighted, find_usable, packed
+from rs_localizer.estimation.observations import (
+    Observed,
+    Sighted,
+    checked,
+    find_usable,
+    median_depth,
+    packed,
+    relinearized,
+    unfit,
+)
 from rs_localizer.estimation.posterior import Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.prior_terms import PriorTerms, with_motion
-from rs_localizer.estimation.ransac import Candidate
-from rs_localizer.estimation.relinearized import relinearized
+from rs_localizer.estimation.prior import Prior, PriorTerms, state_in, with_motion
+from rs_localizer.estimation.ransac import Candidate, generator
 from rs_localizer.estimation.result import estimate_of
-from rs_localizer.estimation.sampling import generator
 from rs_localizer.estimation.searching import MotionSearch
-from rs_localizer.estimation.warm_up import compile_rare
 from rs_localizer.solvers.table import find_solver, start_solver
 
 # A prediction may be off by this multiple of the inlier threshold.
@@ -96,7 +100,8 @@ class Localizer:
         """Compile every kernel that :meth:`localize`, or tracking, may need, or load it from the
         cache.
         """
-        compile_rare()
+        for part in (frame_fit, mirror, motion_model, observations, ransac):
+            part.warm_up()
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
         count = max(160, self.config.min_inliers)
         pixels = np.random.default_rng(0).uniform(0.3, 0.7, (count, 2)) * self.camera.size
@@ -189,9 +194,12 @@ class Localizer:
     def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
         """What there is to find by a lens that other frames tell of, or by the calibration's."""
         points, pixels, scores, prior, expected_share, turn = given
-        terms, prior = (
-            told_speed(self._terms, prior) if self._assumed.may_rest else (self._terms, prior)
-        )
+        terms, assumed = self._terms, self._assumed
+        if prior is not None or turn is not None:
+            if assumed.may_rest:
+                terms, prior = told_speed(terms, prior)
+            assumed = with_experience(assumed, prior, turn_seen(self._terms, turn))
+            terms = known_terms(terms, prior, turn)
         camera = self.camera if lens is None else lens.mended(self.camera)
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
         usable = find_usable(camera, points, pixels, turn)
@@ -204,9 +212,9 @@ class Localizer:
             len(points),
             usable.centre,
             None if scores is None else np.argsort(-scores[usable.indices], kind="stable"),
-            known_terms(terms, prior, turn),
+            terms,
             generator(self.config.seed),
-            with_experience(self._assumed, prior, turn_seen(self._terms, turn)),
+            assumed,
             Sighted(camera, points, pixels, usable, turn),
             lens,
             prior is not None and prior.asks_lens,

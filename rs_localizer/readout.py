@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import csv
 import difflib
+import io
 from dataclasses import dataclass
 from enum import StrEnum
 
 from rs_localizer import data
 
 _TABLE = "readout_times/table.csv"
+_COLUMNS = ("name", "mode", "median_ms", "low_ms", "high_ms", "number", "source")
+_QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 # Of the interval between images: who writes this much has rather an upper bound than a measurement.
 _UPPER_BOUND = 0.95
 
@@ -77,6 +80,29 @@ def find_readout(name: str, mode: str = "") -> list[Known]:
         modes = ", ".join(f"{entry.name}: {entry.mode}" for entry in named)
         raise ValueError(f"no mode {mode!r} of {name!r} is known, but {modes}")
     return matching
+
+
+def shared_row(
+    name: str, mode: str, readout_time: float, deviation: float, firmware: str = ""
+) -> str:
+    """A row for the table, of one recording: two lines of CSV, the first one its columns.
+
+    Args:
+        name: of the camera.
+        mode: as ``1920x1080 30 Hz``.
+        readout_time, deviation: s.
+        firmware: of the camera; empty: not known.
+    """
+    half = _QUARTILE * deviation
+    milliseconds = [f"{1e3 * value:.3f}" for value in (readout_time, readout_time - half)]
+    milliseconds.append(f"{1e3 * (readout_time + half):.3f}")
+    about = f", firmware {firmware}" if firmware else ""
+    source = f"rs_localizer calibrate (+- {1e3 * deviation:.3f} ms{about})"
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    writer.writerow([name, mode, *milliseconds, 1, source])
+    return text.getvalue()
 
 
 def _has(text: str, words: str) -> bool:

@@ -25,15 +25,19 @@ from rs_localizer.settings import settings as all_settings
 from rs_localizer.simulation.scene import map_rows
 
 quick = settings(max_examples=60, deadline=None)
-# Of a PointField; 32 bits hold all of these.
-IDS = st.integers(0, 2**32 - 1) | st.integers(0, 5)
+# Of a PointField: 32 bits, unsigned or signed.
+IDS = [
+    st.integers(0, 2**32 - 1) | st.integers(0, 5) | st.just(2**32 - 1),
+    st.integers(-(2**31), 2**31 - 1) | st.just(-(2**31)),
+]
 
 
 @st.composite
 def maps(draw: Any) -> Map:
     count = draw(st.integers(1, 6))
     points = draw(arrays.arrays(np.float64, (count, 3), elements=st.floats(-1e8, 1e8)))
-    ids = draw(st.none() | st.lists(IDS, min_size=count, max_size=count, unique=True))
+    numbers = st.lists(draw(st.sampled_from(IDS)), min_size=count, max_size=count, unique=True)
+    ids = draw(st.none() | numbers)
     width = draw(st.integers(1, 70))
     kind = draw(st.sampled_from([None, np.uint8, np.float32]))
     descriptors = None

@@ -1,13 +1,22 @@
 """The table of readout times, and the conventions."""
 
+import csv
+import json
+import re
+import runpy
+from dataclasses import fields
+from pathlib import Path
+
 import pytest
 
+from rs_localizer import data
 from rs_localizer.readout import (
     StampAt,
     find_readout,
     from_all_rows,
     from_line_time,
     known_cameras,
+    shared_row,
     stamp_offset,
 )
 
@@ -45,3 +54,37 @@ def test_conventions():
         stamp_offset(StampAt.MIDDLE, 0.01, middle_row=True)
     with pytest.raises(ValueError, match="2 rows"):
         from_line_time(1e-5, 1)
+
+
+def test_a_shared_row_fits_the_table():
+    text = shared_row('Maker "One", 2', "1920x1080 30 Hz", 0.0206, 0.0001, "2.10")
+    (row,) = csv.DictReader(text.splitlines())
+    with data.path("readout_times/table.csv").open(encoding="utf-8") as file:
+        assert list(row) == next(csv.reader(file))
+    assert (row["name"], row["mode"], row["number"]) == ('Maker "One", 2', "1920x1080 30 Hz", "1")
+    # Quartiles of a normal distribution.
+    assert [row[f"{name}_ms"] for name in ("low", "median", "high")] == [
+        "20.533", "20.600", "20.667"
+    ]  # fmt: skip
+    assert row["source"] == "rs_localizer calibrate (+- 0.100 ms, firmware 2.10)"
+
+
+def test_every_camera_has_a_page_and_the_json_the_whole_table(tmp_path):
+    docs = Path(__file__).parents[1] / "docs"
+    made = runpy.run_path(str(docs / "make_cameras.py"))
+    made["write"](tmp_path)
+    table = known_cameras()
+    told = json.loads((tmp_path / made["JSON"]).read_text())
+    assert {*told[0]} == {field.name for field in fields(table[0])} | {"upper_bound"}
+    medians = {(row["name"], row["mode"]): row["median"] for row in told}
+    assert medians == pytest.approx({(known.name, known.mode): known.median for known in table})
+    index = (tmp_path / "index.md").read_text()
+    pages = {path.stem: path.read_text() for path in tmp_path.glob("*.md")}
+    assert set(re.findall(r"\((\S+)\.md\) \|", index)) == {*pages} - {"index"}
+    for known in table:
+        page = pages[re.sub(r"[^a-z0-9]+", "-", known.name.lower())]
+        assert f"| {known.mode} | {1e3 * known.median:.2f}" in page
+    for text in pages.values():  # every link leads somewhere, from docs/cameras
+        for link in re.findall(r"\]\((?!http)([^)#]+)", text):
+            place = docs / link[3:] if link.startswith("../") else tmp_path / link
+            assert place.exists(), link

@@ -10,8 +10,7 @@ from rs_localizer import data
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior import state_in
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, state_in
 from rs_localizer.estimation.refine import refine
 from rs_localizer.estimation.residuals import linearized
 from rs_localizer.io.bags import open_bag

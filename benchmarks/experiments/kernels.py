@@ -7,11 +7,11 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
-from rs_localizer.estimation.packing import pack, weighted
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.observations import pack, weighted
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.ransac import optimize, state_of_model
 from rs_localizer.estimation.refine import EXPECTED_NOISE, refine
 from rs_localizer.estimation.residuals import normal_equations, squared_errors, truncated_cost
-from rs_localizer.estimation.scoring import optimize, state_of_model
 
 
 @kernel

@@ -5,8 +5,8 @@
 with a free 3x3 matrix R_RS (Kukelova, Albl, Sugimoto, Pajdla, ACCV 2018, sec. 4). Taking a motion
 from it leaves out what of R_RS no rotation can follow, and most of its inliers with it. A model
 is kept as the matrix (3,8) that takes ``(X, 1, r X, r)`` to the camera. Errors are measured as
-those of motions (:mod:`rs_localizer.estimation.view`): where the model puts the point on the image,
-at the row that sees it there.
+those of motions (:mod:`rs_localizer.estimation.residuals`): where the model puts the point on the
+image, at the row that sees it there.
 """
 
 from __future__ import annotations

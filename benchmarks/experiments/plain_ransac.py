@@ -16,9 +16,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, STATE_TRANSLATION, rotation_of
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.ransac import MODEL_SIZE
-from rs_localizer.estimation.sampling import draw, generator
-from rs_localizer.estimation.scoring import best_models
+from rs_localizer.estimation.ransac import MODEL_SIZE, best_models, draw, generator
 from rs_localizer.solvers.table import find_solver
 
 

@@ -20,8 +20,7 @@ from rs_localizer.config import VelocityPrior
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.state import rotation_of
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior import state_in
-from rs_localizer.estimation.prior_terms import motion_terms
+from rs_localizer.estimation.prior import motion_terms, state_in
 from rs_localizer.evaluation.plots import BLUE, ORANGE
 from rs_localizer.localizer import Localizer
 

@@ -35,10 +35,10 @@ from rs_localizer.estimation.assumptions import (
     turn_seen,
     with_experience,
 )
-from rs_localizer.estimation.observing import Observed, Sighted, find_usable, packed
+from rs_localizer.estimation.observations import Observed, Sighted, find_usable, packed
 from rs_localizer.estimation.posterior import maximum_a_posteriori
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.sampling import generator
+from rs_localizer.estimation.ransac import generator
 from rs_localizer.estimation.searching import MotionSearch
 from rs_localizer.solvers.table import Solver, find_solver, start_solver
 

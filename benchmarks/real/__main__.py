@@ -33,10 +33,13 @@ _PARTS = {
     "jitter over that of P3P": tuple(
         f"{name}_{what}" for name in METHODS for what in ("turn50", "turn95", "move50", "move95")
     ),
-    "poses of halves of the corners": tuple(
-        f"{name}_{what}"
-        for name in METHODS[1:]
-        for what in ("halves", "inside", "turn_claimed", "move_claimed")
+    "poses of the two sides of the board, at the same motion": (
+        *(
+            f"{name}_{what}"
+            for name in METHODS[1:]
+            for what in ("halves", "inside", "turn_claimed", "move_claimed")
+        ),
+        "random_turn_claimed",
     ),
     "held-out corners over P3P's": (
         "held_px",
@@ -45,8 +48,14 @@ _PARTS = {
         "reversed_held", "reversed_held_low", "reversed_held_high",
         "tracked_over_single",
     ),
+    "held-out corners, one motion through all images, over a global shutter": (
+        "found_ms", "motion_held", "motion_held_low", "motion_held_high",
+        "backward_held", "backward_held_low", "backward_held_high",
+    ),
     "readout, twists (deg/s), lens notices, time": (
-        "readout_ms", "twist_error", "twist_size", "lens_notices",
+        "readout_ms",
+        *(f"{name}_twist_{what}" for name in METHODS[1:] for what in ("size", "error", "inside")),
+        "lens_notices",
         *(f"{name}_ms" for name in METHODS),
     ),
 }  # fmt: skip
@@ -133,7 +142,7 @@ def _draw(rows: Mapping[str, Row], file: Path) -> None:
         "localized / P3P": [f"{name}_localized" for name in METHODS],
         "jitter of orientation / P3P, median": [f"{name}_turn50" for name in METHODS],
         "inside 95 % regions": ["single_inside", "tracked_inside"],
-        "held-out corners / P3P": ["single_held", "tracked_held", "reversed_held"],
+        "held-out corners / global shutter": ["motion_held", "tracked_held", "backward_held"],
     }
     figure, axes = plt.subplots(2, 2, figsize=(11, 7), layout="constrained")
     places = np.arange(len(rows))

@@ -92,14 +92,15 @@ def summary(result: Result) -> str:
 
 
 def pairs(results: dict[str, Result]) -> list[float]:
-    """By how many deviations accepted readout times of parts that share no image differ."""
-    differences = []
-    for one, other in combinations(PARTS[1:], 2):
-        a, b = results[one], results[other]
-        if one[-1] == other[-1] and not a["refusal"] and not b["refusal"]:
-            noise = math.hypot(a["deviation"], b["deviation"])
-            differences.append((a["readout_time"] - b["readout_time"]) / noise)
-    return differences
+    """By how many deviations accepted readout times differ: of parts, and of these and the whole.
+
+    Parts that share images differ by less than these deviations say.
+    """
+    accepted = [result for result in results.values() if not result["refusal"]]
+    return [
+        (a["readout_time"] - b["readout_time"]) / math.hypot(a["deviation"], b["deviation"])
+        for a, b in combinations(accepted, 2)
+    ]
 
 
 def unseen_errors(clip: Clip, results: dict[str, Result], parts: int) -> list[Array]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.io.video import read_video
 from rs_localizer.markers.boards import find_chessboard
@@ -144,7 +144,7 @@ def _calibrated(clip: Clip, images: list[Observed]) -> dict[str, object]:
     }
 
 
-def halved(count: int, seed: int) -> tuple[Array, Array]:
+def halved(count: int, seed: int) -> tuple[IntArray, IntArray]:
     """Two random halves of so many corners, as indices."""
     order = np.random.default_rng(seed).permutation(count)
     return np.sort(order[: count // 2]), np.sort(order[count // 2 :])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -14,20 +14,27 @@ import numpy as np
 from benchmarks.real.clips import Clip, Shutter, halved
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core import so3
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
+from rs_localizer.core.state import ANGULAR, PARAMETERS, POSE, TURN
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Memory, Tracker
-from rs_localizer.trajectory.observe import Observed
+from rs_localizer.trajectory.calibration import calibrate, within
+from rs_localizer.trajectory.first_lens import first_lens
+from rs_localizer.trajectory.fit import fit
+from rs_localizer.trajectory.observe import Observed, collect
 from rs_localizer.trajectory.online_readout import REVERSED
+from rs_localizer.trajectory.problem import LIMIT, Problem
 
 Poses = list[Estimate | Failure]
 METHODS = ("default", "tracked", "single")
 # 95 % quantile of chi-squared with six degrees of freedom, and the median with three.
 _INSIDE, _MEDIAN = 12.592, 2.366
+_INSIDE_3 = 7.815  # likewise with three degrees of freedom
 # Printed boards: by this part of the way from its middle a corner is off (0.2 mm in 10 cm).
 _PAPER = 0.002
 # Images in one block of the bootstrap: neighbours show nearly the same.
@@ -56,8 +63,10 @@ def judged(clip: Clip, lens: Camera, shutter: Shutter, config: LocalizerConfig) 
     row["solvepnp_localized"] = sum(_solve_pnp(lens, image) for image in whole)
     for name in METHODS:
         row |= {f"{name}_{key}": x for key, x in _jitter(clip, poses[name], poses["p3p"]).items()}
-    row |= _twists(clip, poses["single"], poses["p3p"], shutter.readout_time)
-    row |= _halves(camera, whole, config)
+    for name in METHODS[1:]:
+        of_name = _twists(clip, poses[name], poses["p3p"], shutter.readout_time)
+        row |= {f"{name}_{key}": x for key, x in of_name.items()}
+    row |= _halves(camera, whole, config) | _shutter_gain(clip)
     return row
 
 
@@ -117,48 +126,54 @@ def _second_difference(triple: Sequence[Estimate]) -> tuple[float, float]:
     return float(np.linalg.norm(turn)), float(np.linalg.norm(move))
 
 
-def _twists(clip: Clip, single: Poses, p3p: Poses, readout_time: float) -> dict[str, float]:
-    """Turn rates of single images against the poses (P3P) of their neighbours."""
-    own, between = [], []
-    for k in range(1, len(single) - 1):
-        before, here, after = p3p[k - 1], single[k], p3p[k + 1]
+def _twists(clip: Clip, poses: Poses, p3p: Poses, readout_time: float) -> dict[str, float]:
+    """Turn rates against the poses (P3P) of the neighbours, and the share inside 95 % regions."""
+    errors, rates, inside = [], [], []
+    for k in range(1, len(poses) - 1):
+        before, here, after = p3p[k - 1], poses[k], p3p[k + 1]
         seconds = 1e-9 * (clip.images[k + 1].stamp_ns - clip.images[k - 1].stamp_ns)
-        if before and here and after and seconds < 3.0 * clip.interval:
-            own.append(here.angular_velocity / readout_time)
-            between.append(so3.log(before.rotation @ after.rotation.T) / seconds)
-    if not own:
+        if not (before and here and after and seconds < 3.0 * clip.interval):
+            continue
+        rate = so3.log(before.rotation @ after.rotation.T) / seconds
+        error = here.angular_velocity / readout_time - rate
+        of_rate = (before.joint_covariance + after.joint_covariance)[TURN, TURN] / seconds**2
+        spread = here.covariance[ANGULAR, ANGULAR] / readout_time**2 + of_rate
+        inside.append(error @ np.linalg.solve(spread, error) < _INSIDE_3)
+        errors.append(np.linalg.norm(error))
+        rates.append(np.linalg.norm(rate))
+    if not errors:
         return {}
-    rates, truth = np.array(own), np.array(between)
-    error = np.linalg.norm(rates - truth, axis=1)
     return {
-        "twist_error": float(np.degrees(np.median(error))),
-        "twist_size": float(np.degrees(np.median(np.linalg.norm(truth, axis=1)))),
+        "twist_error": float(np.degrees(np.median(errors))),
+        "twist_size": float(np.degrees(np.median(rates))),
+        "twist_inside": float(np.mean(inside)),
     }
 
 
 def _halves(
     camera: Camera, images: Sequence[Observed], config: LocalizerConfig
 ) -> dict[str, float]:
-    """Poses from random halves of the corners against each other, and what each says of the other's
-    corners: rolling over global shutter, the direction of the scan, and the reversed one.
+    """Poses of one half of the corners against those of the other, and what each says of the
+    other's corners: rolling over global shutter, the direction of the scan, and the reversed one.
+
+    Poses of the two sides of the board are compared with their regions: random halves share
+    the board's bend, which is a part of both regions and of no difference (``random``: for
+    comparison). Corners are held out by random halves.
     """
-    parts: list[list[Observed]] = [[], []]
-    for seed, image in enumerate(images):
-        for part, chosen in zip(parts, halved(len(image.points), seed), strict=True):
-            part.append(replace(image, points=image.points[chosen], pixels=image.pixels[chosen]))
+    row: dict[str, float] = {}
+    for name in ("single", "tracked"):
+        sides = [localized(name, camera, part, config) for part in _parts(images, _sides)]
+        row |= {f"{name}_{key}": x for key, x in _agreement(*sides).items()}
+    parts = _parts(images, lambda image, seed: halved(len(image.points), seed))
     reverse = replace(camera, scan_direction=str(REVERSED[ScanDirection(camera.scan_direction)]))
     cameras = {"single": camera, "tracked": camera, "reversed": reverse, "p3p": camera}
     fits = {
-        name: [
-            localized("tracked" if name == "reversed" else name, by, part, config)
-            for part in (parts if name in ("single", "tracked") else parts[:1])
-        ]
+        name: localized("tracked" if name == "reversed" else name, by, parts[0], config)
         for name, by in cameras.items()
     }
-    row: dict[str, float] = {}
-    for name in ("single", "tracked"):
-        row |= {f"{name}_{key}": x for key, x in _agreement(*fits[name]).items()}
-    errors = {name: _errors(by, fits[name][0], parts[1]) for name, by in cameras.items()}
+    others = localized("tracked", camera, parts[1], config)
+    row["random_turn_claimed"] = _agreement(fits["tracked"], others).get("turn_claimed", math.nan)
+    errors = {name: _errors(by, fits[name], parts[1]) for name, by in cameras.items()}
     for name in ("single", "tracked", "reversed"):
         low, middle, high = _ratio(errors[name], errors["p3p"])
         row |= {f"{name}_held": middle, f"{name}_held_low": low, f"{name}_held_high": high}
@@ -167,8 +182,61 @@ def _halves(
     return row
 
 
+def _sides(image: Observed, number: int) -> tuple[IntArray, IntArray]:
+    """Left and right, or upper and lower half of the board in turn."""
+    order = np.argsort(image.points[:, number % 2], kind="stable")
+    return order[: len(order) // 2], order[len(order) // 2 :]
+
+
+def _parts(
+    images: Sequence[Observed], split: Callable[[Observed, int], tuple[IntArray, IntArray]]
+) -> list[list[Observed]]:
+    """The images with one part of their corners, and with the other."""
+    parts: list[list[Observed]] = [[], []]
+    for number, image in enumerate(images):
+        for part, chosen in zip(parts, split(image, number), strict=True):
+            part.append(replace(image, points=image.points[chosen], pixels=image.pixels[chosen]))
+    return parts
+
+
+def _shutter_gain(clip: Clip) -> dict[str, float]:
+    """One motion through all images from half of the corners, lens and board estimated with it:
+    errors of the other half with the readout time that it finds, and with its reverse, over those
+    with a global shutter.
+    """
+    parts = _parts(clip.images, lambda image, seed: halved(len(image.points), seed))
+    try:
+        camera = first_lens(clip.size, parts[0])
+        found = calibrate(camera, parts[0], intrinsics=True, own_stamps=False)
+    except ValueError:
+        return {}
+    spline, held = found.fit.state.spline, replace(found.fit.freedom, readout_time=False)
+    known = within(found.posed.observations, spline)
+    nothing = Failure(Reason.TOO_FEW_INLIERS, "")
+    unseen = within(collect(camera, parts[1], [nothing] * len(parts[1])).observations, spline)
+    errors = []
+    for sign in (1.0, 0.0, -1.0):
+        start = replace(found.fit.state, readout_time=sign * found.readout_time)
+        state = fit(camera, known, start, held, found.fit.deviation).state
+        squared = Problem(camera, unseen, state, held).errors(state)
+        # Corners that are wrong say nothing of the shutter.
+        squared = np.minimum(squared, (LIMIT * found.fit.deviation) ** 2)
+        counts = np.bincount(unseen.frames, minlength=len(parts[1]))
+        sums = np.bincount(unseen.frames, squared, len(parts[1]))
+        errors.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
+    row = {"found_ms": 1e3 * found.readout_time}
+    for name, own in (("motion", errors[0]), ("backward", errors[2])):
+        low, middle, high = _ratio(own, errors[1])
+        row |= {f"{name}_held": middle, f"{name}_held_low": low, f"{name}_held_high": high}
+    return row
+
+
 def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
-    """How two poses of each image agree, and whether their covariances say so."""
+    """How two poses of each image agree, and whether their covariances say so.
+
+    Poses are compared at the same motion: what the prior says of the velocities is the same
+    in both, and would be a part of both regions and of no difference.
+    """
     inside, turns, moves = [], [], []
     for one, other in zip(ones, others, strict=True):
         if not (one and other):
@@ -179,7 +247,9 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
                 one.rotation @ (other.position - one.position),
             ]
         )
-        spread = own_covariance(one) + own_covariance(other)
+        (first, _), (second, gain) = _at_known_motion(one), _at_known_motion(other)
+        step = step + gain @ (_motion(one) - _motion(other))
+        spread = first + second
         inside.append(step @ np.linalg.solve(spread, step) < _INSIDE)
         turns.append(step[:3] @ np.linalg.solve(spread[:3, :3], step[:3]))
         moves.append(step[3:] @ np.linalg.solve(spread[3:, 3:], step[3:]))
@@ -193,10 +263,21 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
     }
 
 
-def own_covariance(estimate: Estimate) -> Array:
-    """Of the pose, less what all images of a calibration share: it is no difference of halves."""
-    shared = getattr(estimate, "calibration_covariance", np.zeros((12, 12)))
-    return estimate.covariance[:6, :6] - shared[:6, :6]
+def _motion(estimate: Estimate) -> Array:
+    """Velocities and accelerations (12,)."""
+    return np.concatenate([
+        estimate.angular_velocity, estimate.linear_velocity,
+        estimate.angular_acceleration, estimate.linear_acceleration,
+    ])  # fmt: skip
+
+
+def _at_known_motion(estimate: Estimate) -> tuple[Array, Array]:
+    """Covariance (6,6) of the pose at a given motion, without what all images of a calibration
+    share; and how the pose follows the motion (6,12).
+    """
+    joint = estimate.joint_covariance[:PARAMETERS, :PARAMETERS]
+    gain = joint[POSE, POSE.stop :] @ np.linalg.inv(joint[POSE.stop :, POSE.stop :])
+    return joint[POSE, POSE] - gain @ joint[POSE.stop :, POSE], gain
 
 
 def _errors(camera: Camera, poses: Poses, held_out: Sequence[Observed]) -> Array:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
 
 
 class UsageError(ValueError):
@@ -39,3 +44,42 @@ def _clear(directory: Path) -> None:
                 shutil.rmtree(path)
         else:
             path.unlink()
+
+
+def refuse_existing(args: argparse.Namespace) -> None:
+    """Raise ``ValueError`` if ``args.out`` exists and is not to be replaced."""
+    if args.out.exists() and not args.overwrite:
+        raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
+
+
+def import_ros(name: str, what: str) -> Any:
+    """A module of ``rs_localizer.ros.graph``, by name: all else works without ROS.
+
+    Raises:
+        ValueError: without ROS, which ``what`` needs.
+    """
+    try:
+        return importlib.import_module(f"rs_localizer.ros.graph.{name}")
+    except ImportError as error:
+        raise ValueError(
+            f"{what} needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
+            "(docs/install.md)"
+        ) from error
+
+
+def read_counts(text: str, option: str) -> tuple[int, int]:
+    """Columns and rows of ``6x4``; raises UsageError for anything else."""
+    try:
+        columns, rows = (int(word) for word in text.split("x"))
+    except ValueError:
+        columns = rows = 0
+    if min(columns, rows) < 1:
+        raise UsageError(f"{option} must be of the form 6x4, got {text!r}")
+    return columns, rows
+
+
+@contextmanager
+def stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
+    """A progress bar for a person who waits; what moves it on."""
+    with tqdm(total=total, desc=name, disable=None) as bar:
+        yield bar.update

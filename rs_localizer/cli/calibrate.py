@@ -23,7 +23,6 @@ from rs_localizer.cli.batch import (
     run_batch,
 )
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
-from rs_localizer.cli.calibrate_table import tell, tell_lens
 from rs_localizer.cli.image_input import clock_of, of_bag, of_files, tell_times
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
@@ -50,6 +49,7 @@ from rs_localizer.offline.recordings import read_recording
 from rs_localizer.offline.replay import find_topics, has_frames
 from rs_localizer.pipeline.images import FrameDetector
 from rs_localizer.process.arguments import number
+from rs_localizer.readout import shared_row
 from rs_localizer.trajectory import verdict
 from rs_localizer.trajectory.calibration import Calibration, calibrate
 from rs_localizer.trajectory.first_lens import first_lens
@@ -112,6 +112,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write the files although the result is refused (the exit code stays 1)",
     )
+    parser.add_argument(
+        "--share",
+        metavar="CAMERA",
+        help="also write a row of this camera for the table of readout times, to send as a pull "
+        "request: FILE_share.csv beside --out",
+    )
+    parser.add_argument("--firmware", default="", metavar="TEXT", help="for --share: the camera's")
     add_batch_arguments(parser)
 
 
@@ -150,9 +157,9 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
             camera, source.images, intrinsics=intrinsics, imu=source.imu,
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
-    tell(found, args.rate)
+    _tell(found, args.rate)
     if intrinsics:
-        tell_lens(found)
+        _tell_lens(found)
     for line in imu_lines(found, source.imu, config):
         print(line)
     if args.plots is not None:
@@ -162,12 +169,27 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
         _write(args, found, source.map, intrinsics, config)
     if refusal:
         raise ValueError(refusal)
+    if args.share:
+        _share(args, found)
     return found
+
+
+def _share(args: argparse.Namespace, found: Calibration) -> None:
+    """The row of the table that this recording gives."""
+    width, height = found.fit.camera.size
+    mode = f"{width}x{height} {1.0 / found.stamps.interval:.4g} Hz"
+    row = shared_row(args.share, mode, verdict.readout_time(found), found.deviation, args.firmware)
+    path = args.out.with_name(f"{args.out.stem}_share.csv")
+    with atomic_files(path) as (part,):
+        part.write_text(row, encoding="utf-8")
+    print(f"written: {path}, a row for rs_localizer/data/readout_times/table.csv: send it to us")
 
 
 def _config(args: argparse.Namespace) -> NodeConfig:
     if args.out is not None and args.out.suffix not in (".yaml", ".yml"):
         raise UsageError(f"--out must end in .yaml, got {args.out}")
+    if args.share and args.out is None:
+        raise UsageError("--share needs --out FILE.yaml")
     return given_settings(args)
 
 
@@ -242,6 +264,53 @@ def _detected(args: argparse.Namespace, shots: Iterator[Shot | Carried]) -> _Sou
     if fault := sizes.fault():
         print(f"warning: {fault}", file=sys.stderr)
     return _Source(images, camera, size, map=marker_map)
+
+
+def _tell(found: Calibration, rate: float | None) -> None:
+    """Values, the parts of the recording, and what is odd."""
+    direction = verdict.scan_direction(found)
+    rows = [
+        ("readout time", f"{1e3 * verdict.readout_time(found):.3f} ms"),
+        ("standard deviation", f"{1e3 * found.deviation:.3f} ms"),
+        ("of it by noise alone", f"{1e3 * found.formal_deviation:.3f} ms"),
+        ("scan direction", str(direction)),
+        ("interval between images", f"{1e3 * found.stamps.interval:.3f} ms"),
+        ("images with a pose", f"{len(found.posed.times)} of {found.images}"),
+        ("noise of the keypoints", f"{found.fit.deviation:.3f} px"),
+        ("keypoints that fit", f"{np.mean(found.fit.inliers):.1%}"),
+        ("spacing of the knots", f"{1e3 * found.fit.state.spline.layout.spacing:.1f} ms"),
+    ]
+    for name, text in rows:
+        print(f"{name:26} {text}")
+    for block in found.blocks:
+        print(
+            f"  {block.start:6.1f} to {block.end:5.1f} s {'':5}"
+            f"{1e3 * block.readout_time:+.3f} +- {1e3 * block.deviation:.3f} ms"
+        )
+    for remark in verdict.remarks(found):
+        print(remark)
+    if rate is not None:
+        share = abs(found.readout_time) / found.stamps.interval
+        print(
+            f"the readout time is {share:.3f} of the interval: it scales with --rate, "
+            f"assumed to be {rate:g} Hz"
+        )
+
+
+def _tell_lens(found: Calibration) -> None:
+    """The numbers of the lens."""
+    state = found.fit.state
+    deviations = np.sqrt(np.diag(found.fit.border_covariance)[1 : 1 + len(state.lens)])
+    names = ("fx", "fy", "cx", "cy")
+    print(f"{'lens':26} {found.fit.camera.distortion_model}")
+    for k, value in enumerate(state.lens):
+        name = names[k] if k < len(names) else f"D[{k - len(names)}]"
+        print(f"{name:26} {value:.5g} +- {found.inflation * deviations[k]:.2g}")
+    errors = found.lens
+    print(
+        f"{'what it is off by':26} centre {errors.principal_point:.2g} px, focal length "
+        f"{100.0 * errors.focal_length:.2g} %, distortion {errors.distortion:.2g} px at the corners"
+    )
 
 
 def _write(

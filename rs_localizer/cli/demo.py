@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -18,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from rs_localizer import data
+from rs_localizer.cli import import_ros, stage
 from rs_localizer.config import NodeConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.evaluation import plots
@@ -97,9 +96,9 @@ class RoomScene:
         folder = directory / "colmap"
         folder.mkdir()
         with TemporaryDirectory() as images:
-            with _bar("Walking through a room", len(self._room.stamps(_WALK))) as step:
+            with stage("Walking through a room", len(self._room.stamps(_WALK))) as step:
                 views = self._room.look(_WALK, Path(images), lambda: step(1))
-            built = self._room.build(views, folder, _bar, _EFFORT)
+            built = self._room.build(views, folder, stage, _EFFORT)
         self._landmarks = built.landmarks
         write_npz(self.map_file, built.landmarks)
         write_npz(self.global_map_file, without_refinement(built))
@@ -107,7 +106,7 @@ class RoomScene:
     def record(self) -> Recording:
         """The keypoints of the second walk, and the truth at the middle rows."""
         stamps = self._room.stamps(_FLIGHT)
-        with _bar("Walking there again", len(stamps)) as step:
+        with stage("Walking there again", len(stamps)) as step:
             clouds = self._room.clouds(_FLIGHT, lambda: step(1))
         middles = np.array([middle_stamp(_CAMERA, stamp) for stamp in stamps], np.int64)
         states = [self._room.motion.state(int(middle), np.zeros(1)) for middle in middles]
@@ -175,12 +174,6 @@ def play_room(
     print(f"\n{table('A room mapped without markers', recording, results)}", flush=True)
     plots.save(room.picture(recording, results), out / ROOM)
     print(out / ROOM)
-
-
-@contextmanager
-def _bar(name: str, total: int) -> Iterator[Callable[[int], object]]:
-    with tqdm(total=total, desc=name, disable=None) as bar:
-        yield bar.update
 
 
 CUBE = "cube.gif"
@@ -274,13 +267,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    try:
-        session_type = importlib.import_module("rs_localizer.ros.graph.demo_session").Session
-    except ImportError as error:
-        raise ValueError(
-            f"the demo needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(docs/install.md)"
-        ) from error
+    session_type = import_ros("demo_session", "the demo").Session
     started = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     methods = {_ROLLING: {"solver": args.solver}, _GLOBAL: {"solver": "p3p"}}

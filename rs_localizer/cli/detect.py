@@ -19,6 +19,7 @@ from rs_localizer.cli.image_input import (
     shutter_values,
     tell_left_out,
     tell_next,
+    tell_telemetry,
     time_faults,
     write_shutter,
 )
@@ -28,8 +29,7 @@ from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES
 from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
 from rs_localizer.offline.fleet.task import Figures, Kind
-from rs_localizer.pipeline.features import FrameExtractor
-from rs_localizer.pipeline.images import FrameDetector
+from rs_localizer.pipeline.images import FrameDetector, FrameExtractor
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
 
@@ -140,6 +140,7 @@ def _tell(args: argparse.Namespace, recorded: Recorded, notices: Counter[str]) -
     )
     if recorded.with_corners < recorded.images:
         print(f"{recorded.images - recorded.with_corners} images show no part of the map")
+    tell_telemetry(args)
     tell_left_out(recorded.refused, recorded.carried)
     for text, count in notices.most_common(3):
         print(f"note ({count} images): {text}")
@@ -200,6 +201,7 @@ def _tell_features(args: argparse.Namespace, extraction: Extraction) -> None:
     )
     if bare := len(extraction.stamps_ns) - with_any:
         print(f"{bare} images have no keypoint")
+    tell_telemetry(args)
     tell_left_out(extraction.refused, extraction.carried)
 
 

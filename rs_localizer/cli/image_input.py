@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
 from rs_localizer.io.recording import PARAMETERS
+from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
 from rs_localizer.io.video import has_times
 from rs_localizer.offline.image_sources import (
     IMAGE_TYPES,
@@ -30,9 +32,13 @@ from rs_localizer.offline.image_sources import (
     from_video,
     have_times,
     image_files,
+    with_telemetry,
 )
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import build, settings, write_parameters
+
+# Readout times that differ by less are called the same: what a file says counts rows its own way.
+_SAME_READOUT = 0.05
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,6 +54,11 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         camera,
         f"as of calibrate; they go to {PARAMETERS} beside the data, for replay --params (default: "
         f"those in {PARAMETERS} of the bag)",
+    )
+    camera.add_argument(
+        "--no-telemetry",
+        action="store_true",
+        help="ignore the gyroscope and the readout time inside a video",
     )
     longest = settings()["readout_time"].maximum or 0.0
     camera.add_argument(
@@ -91,7 +102,58 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
     beside = args.images / PARAMETERS
     if args.params is None and is_bag(args.images) and beside.exists():
         return given_values(argparse.Namespace(params=beside, assignments=args.assignments), also)
-    return given_values(args, also)
+    values = given_values(args, also)
+    telemetry = telemetry_of(args.images, args)
+    if telemetry is not None and telemetry.readout_time is not None:
+        values.setdefault("readout_time", telemetry.readout_time)
+    return values
+
+
+def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
+    """What a video says of its camera; None: nothing, or it is not to be used.
+
+    Raises:
+        ValueError: for telemetry that cannot be read.
+    """
+    if getattr(args, "no_telemetry", True) or not _may_tell(path):
+        return None
+    if importlib.util.find_spec("telemetry_parser") is None:
+        return None
+    found = read_telemetry(path)
+    return None if found is None or found.stabilizer else found
+
+
+def _may_tell(path: Path) -> bool:
+    return path.is_file() and not is_bag(path) and has_telemetry(path)
+
+
+def tell_telemetry(args: argparse.Namespace) -> None:
+    """Say what a video knows of its camera, and what is not used of it."""
+    path = args.images
+    if args.no_telemetry or not _may_tell(path):
+        return
+    if importlib.util.find_spec("telemetry_parser") is None:
+        print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
+        return
+    found = read_telemetry(path)
+    if found is None:
+        return
+    if found.stabilizer:
+        print(
+            f"warning: {found.camera} has stabilized this video ({found.stabilizer}): its rows are "
+            "not what the shutter saw, and poses are wrong; switch it off. Its gyroscope and "
+            "readout time are not used"
+        )
+        return
+    said = [f"gyroscope at {found.rate:.0f} Hz"]
+    if found.readout_time is not None:
+        said.append(f"readout time {1e3 * found.readout_time:.2f} ms")
+        used = build(shutter_values(args)).readout_time
+        if abs(used / found.readout_time - 1.0) > _SAME_READOUT:
+            said[-1] += f" (not used: {1e3 * used:.2f} ms was given)"
+    if found.exposure is not None:
+        said.append(f"exposure {1e3 * found.exposure:.2f} ms (median)")
+    print(f"{found.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 
 def write_shutter(
@@ -166,7 +228,12 @@ def opened(
         if args.calibration is None and calibrated:
             raise UsageError("a video or folder has no camera_info: give --calibration")
         camera = None if args.calibration is None else read_calibration(args.calibration)
-        yield of_files(path, camera, clock_of(path, args.rate, start))
+        source = of_files(path, camera, clock_of(path, args.rate, start))
+        telemetry = telemetry_of(path, args)
+        if telemetry is not None and source.clock is not None:
+            moving = with_telemetry(source.shots, telemetry, source.clock)
+            source = replace(source, shots=moving)
+        yield source
         return
     for name, value in (("rate", args.rate), ("start", start)):
         if value is not None:

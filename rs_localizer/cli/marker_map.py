@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, read_counts
 from rs_localizer.markers.consistency import other_units
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.markers.maps import MarkerMap
@@ -46,6 +47,14 @@ def add_board_arguments(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def read_checked_map(path: Path) -> MarkerMap:
+    """The map of a file; warns of sizes in other units."""
+    marker_map = read_marker_map(path)
+    for fault in other_units(marker_map):
+        print(f"warning: {path}: {fault}", file=sys.stderr)
+    return marker_map
+
+
 def find_map(args: argparse.Namespace) -> MarkerMap:
     """The map that was given, or that of the board.
 
@@ -58,16 +67,10 @@ def find_map(args: argparse.Namespace) -> MarkerMap:
         for name in ("square", "pattern"):
             if getattr(args, name) is not None:
                 raise UsageError(f"--{name} goes with --board")
-        marker_map = read_marker_map(args.map)
-        for fault in other_units(marker_map):
-            print(f"warning: {args.map}: {fault}", file=sys.stderr)
-        return marker_map
+        return read_checked_map(args.map)
     if args.square is None:
         raise UsageError("--board needs --square")
-    try:
-        columns, rows = (int(word) for word in args.board.split("x"))
-    except ValueError:
-        raise UsageError(f"--board must be of the form 6x4, got {args.board!r}") from None
+    columns, rows = read_counts(args.board, "--board")
     pattern = args.pattern or _CHESSBOARD
     inverted, kind = pattern.startswith(_INVERTED), pattern.removeprefix(_INVERTED)
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, read_counts
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.markers.consistency import problems
 from rs_localizer.markers.families import FAMILIES, family
@@ -124,7 +124,7 @@ def _map(args: argparse.Namespace) -> MarkerMap:
     pose = Pose(np.zeros(3), _STANDING if args.standing else np.eye(3))
     if args.chessboard is None and args.charuco is None:
         _refuse(args, "a board", "square", "marker")
-        grid = _counts(args.grid or _GRID, "--grid")
+        grid = read_counts(args.grid or _GRID, "--grid")
         size = args.size or _SIZE
         gap = _GAP * size / _SIZE if args.gap is None else args.gap
         markers = wall(
@@ -139,9 +139,9 @@ def _map(args: argparse.Namespace) -> MarkerMap:
     square = args.square or _SQUARE
     if args.chessboard is not None:
         _refuse(args, "markers", "family", "first_id", "marker")
-        board: Board = Chessboard(*_counts(args.chessboard, "--chessboard"), square, pose)
+        board: Board = Chessboard(*read_counts(args.chessboard, "--chessboard"), square, pose)
     else:
-        columns, rows = _counts(args.charuco, "--charuco")
+        columns, rows = read_counts(args.charuco, "--charuco")
         marker = args.marker or _MARKER_SHARE * square
         chosen = family(args.family or _FAMILY)
         board = Charuco(columns, rows, square, marker, chosen, args.first_id or 0, False, pose)
@@ -152,16 +152,6 @@ def _refuse(args: argparse.Namespace, what: str, *names: str) -> None:
     for name in names:
         if getattr(args, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} is for {what}")
-
-
-def _counts(text: str, option: str) -> tuple[int, int]:
-    try:
-        columns, rows = (int(word) for word in text.split("x"))
-    except ValueError:
-        raise UsageError(f"{option} must be of the form 6x4, got {text!r}") from None
-    if min(columns, rows) < 1:
-        raise UsageError(f"{option} must be of the form 6x4, got {text!r}")
-    return columns, rows
 
 
 def _check(path: Path) -> None:

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, import_ros
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
 from rs_localizer.cli.replay_result import (
     BRIDGED,
@@ -429,13 +429,7 @@ def _play(bag: BagReader, topics: Topics | None, rate: float, imus: list[str]) -
     Raises:
         ValueError: without ROS, without anything to play, or when nobody listens.
     """
-    try:  # by name: whoever has no ROS replays offline
-        player = importlib.import_module("rs_localizer.ros.graph.player")
-    except ImportError as error:
-        raise ValueError(
-            f"--ros needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(docs/install.md)"
-        ) from error
+    player = import_ros("player", "--ros")
     images = image_topics(bag)
     inputs = images + (_of_type(bag, INFO_TYPE) if topics is None else list(topics.names))
     if not images and topics is None:

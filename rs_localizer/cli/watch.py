@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import re
 import sys
 
+from rs_localizer.cli import import_ros
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import NODE_NAME
 
@@ -45,11 +45,4 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         ValueError: without ROS.
     """
-    try:
-        watch = importlib.import_module("rs_localizer.ros.graph.watch").watch
-    except ImportError as error:
-        raise ValueError(
-            f"watch needs ROS 2 ({error}): source a ROS 2 workspace, or install rclpy with pip "
-            "(docs/install.md)"
-        ) from error
-    watch(args.node, sys.stdout, args.every)
+    import_ros("watch", "watch").watch(args.node, sys.stdout, args.every)

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Random = NDArray[np.uint64]  # (1,), the state of a random generator of kernels
 BoolArray = NDArray[np.bool_]
 
 

@@ -18,6 +18,9 @@ one readout resolves (twice the Rayleigh spacing of cosine and sine together).""
 FUNCTIONS = 2 * len(CYCLES)
 RATES = 2.0 * np.pi * CYCLES
 """rad per unit of row time."""
+# What :func:`shake_basis` takes away of each function: its value and its rate at the middle row.
+MIDDLE_VALUES, MIDDLE_RATES = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
+MIDDLE_VALUES[::2], MIDDLE_RATES[1::2] = 1.0, RATES
 
 
 @kernel
@@ -58,10 +61,3 @@ def shake_at(tau: Array, coefficients: Array) -> Array:
 def within_rows(tau: float) -> float:
     """The row time itself, or that of the first or last row before or after them."""
     return min(max(tau, -0.5), 0.5)
-
-
-def shake_in_the_middle(count: int) -> tuple[Array, Array]:
-    """Values and slopes (count,) at the middle row that :func:`shake_basis` takes away."""
-    values, slopes = np.zeros(FUNCTIONS), np.zeros(FUNCTIONS)
-    values[::2], slopes[1::2] = 1.0, RATES
-    return values[:count].copy(), slopes[:count].copy()

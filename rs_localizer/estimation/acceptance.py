@@ -9,8 +9,7 @@ import numpy as np
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.medians import median_depth, median_of
-from rs_localizer.estimation.observations import Observations
+from rs_localizer.estimation.observations import Observations, median_depth, median_of
 from rs_localizer.estimation.posterior import Mirror, Posterior
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
@@ -62,14 +61,14 @@ def refusal(
     found, needed = int(np.count_nonzero(posterior.inliers)), min_inliers
     if found < needed:
         behind = int(np.count_nonzero(np.isinf(posterior.squared_errors)))
-        if 2 * behind > len(observations):
+        if 2 * behind > observations.count:
             return Failure(
                 Reason.BEHIND_CAMERA,
-                f"{behind} of {len(observations)} points lie behind the camera",
+                f"{behind} of {observations.count} points lie behind the camera",
             )
         return Failure(
             Reason.TOO_FEW_INLIERS,
-            f"{found} inliers of {len(observations)} points after {samples} samples, "
+            f"{found} inliers of {observations.count} points after {samples} samples, "
             f"{needed} are needed",
         )
     if not posterior.determined:

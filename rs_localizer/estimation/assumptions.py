@@ -12,12 +12,12 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.state import ANGULAR
-from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.prior_terms import (
+from rs_localizer.estimation.prior import (
+    Prior,
     PriorTerms,
     held_terms,
     motion_terms,
-    slower_terms,
+    terms_at,
     with_measurements,
     with_turn,
 )
@@ -94,7 +94,7 @@ def told_speed(terms: PriorTerms, prior: Prior | None) -> tuple[PriorTerms, Prio
     if part == 1.0:
         return terms, prior
     scales = prior.scales._replace(speeds=np.zeros(len(SPEEDS)))
-    return slower_terms(terms, max(part, _SLOWEST)), replace(prior, scales=scales)
+    return terms_at(terms, max(part, _SLOWEST), False), replace(prior, scales=scales)
 
 
 def with_experience(assumed: Assumed, prior: Prior | None, turn: TurnSeen | None) -> Assumed:

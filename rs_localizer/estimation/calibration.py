@@ -23,10 +23,9 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, MOVE, PARAMETERS, POSE, TURN
 from rs_localizer.estimation.frame_fit import SMOOTH_TERMS, smooth_terms
 from rs_localizer.estimation.lens import rays_of_lens
-from rs_localizer.estimation.observing import Observed
+from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import Posterior
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
+from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import Lines, linearized
 

@@ -16,8 +16,7 @@ from rs_localizer.core.scales import joined as joined_scales
 from rs_localizer.core.state import POSE
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.lens import credible, joined, odds_of
-from rs_localizer.estimation.prior import Prior
-from rs_localizer.estimation.prior_terms import WALKING
+from rs_localizer.estimation.prior import WALKING, Prior
 
 # Frames farther apart (s) say little of how fast a camera moves; what those of a second say$
 # together is less than their sum.

@@ -19,16 +19,20 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.scales import SCALES
-from rs_localizer.core.shake import FUNCTIONS, RATES, shake_at, shake_basis
+from rs_localizer.core.shake import (
+    FUNCTIONS,
+    MIDDLE_RATES,
+    MIDDLE_VALUES,
+    shake_at,
+    shake_basis,
+)
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, noise_deviation
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import apply_step, half_inverse, inverted, squared
 from rs_localizer.estimation.residual_tests import neighbours_agree
-from rs_localizer.estimation.residuals import Lines, linearized, squared_errors
-from rs_localizer.estimation.view import POINT_SIZE
+from rs_localizer.estimation.residuals import POINT_SIZE, Lines, linearized, squared_errors
 
 SMOOTH_DEGREE = 3
 SMOOTH_TERMS = (SMOOTH_DEGREE + 1) * (SMOOTH_DEGREE + 2) // 2
@@ -227,14 +231,13 @@ def full_prior(
     row stand in the state, ``x_without = x - G c``: coefficients (28,3) of the turn take part.
     """
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    # Row of x and its derivative by each coefficient: -1 and -rate.
-    places, factors = np.empty(3 * len(turns), np.int64), np.empty(3 * len(turns))
+    # G: by how much each function of the row time turns the middle row, and how fast (m,).
+    values, rates = MIDDLE_VALUES, MIDDLE_RATES
     step = np.zeros(PARAMETERS)
     for k in range(len(turns)):
         for axis in range(3):
-            places[3 * k + axis] = axis if k % 2 == 0 else 6 + axis
-            factors[3 * k + axis] = -1.0 if k % 2 == 0 else -RATES[k // 2]
-            step[places[3 * k + axis]] += factors[3 * k + axis] * turns[k, axis]
+            step[axis] -= values[k] * turns[k, axis]
+            step[6 + axis] -= rates[k] * turns[k, axis]
     cost = add_prior(
         prior.informations, prior.references, prior.gravity, apply_step(state, step), 1.0,
         information, slope,
@@ -242,14 +245,18 @@ def full_prior(
     whole, along = np.zeros((size, size)), np.zeros(size)
     whole[:PARAMETERS, :PARAMETERS] = information
     along[:PARAMETERS] = slope
-    for a in range(len(places)):
-        i = PARAMETERS + a
-        along[i] = factors[a] * slope[places[a]]
-        for j in range(PARAMETERS):
-            whole[i, j] = factors[a] * information[places[a], j]
-            whole[j, i] = whole[i, j]
-        for b in range(len(places)):
-            whole[i, PARAMETERS + b] = factors[a] * factors[b] * information[places[a], places[b]]
+    for k in range(len(turns)):
+        for axis in range(3):
+            i = PARAMETERS + 3 * k + axis
+            along[i] = -values[k] * slope[axis] - rates[k] * slope[6 + axis]
+            for j in range(PARAMETERS):
+                pull = -values[k] * information[axis, j] - rates[k] * information[6 + axis, j]
+                whole[i, j] = whole[j, i] = pull
+    for k in range(len(turns)):
+        for axis in range(3):
+            i = PARAMETERS + 3 * k + axis
+            for j in range(PARAMETERS, PARAMETERS + 3 * len(turns)):
+                whole[j, i] = -values[k] * whole[j, axis] - rates[k] * whole[j, 6 + axis]
     return whole, along, cost
 
 

@@ -19,32 +19,31 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales
 from rs_localizer.core.shake import CYCLES
 from rs_localizer.core.simd.jit import kernel
-from rs_localizer.core.state import (
-    LINEAR,
-    PARAMETERS,
-    VELOCITIES,
-    at_rest,
-    step_between,
-)
+from rs_localizer.core.state import LINEAR, PARAMETERS, VELOCITIES, step_between
 from rs_localizer.estimation.assumptions import Assumed
-from rs_localizer.estimation.averaging import averaged
-from rs_localizer.estimation.curvature import along_arcs
 from rs_localizer.estimation.frame_fit import (
     DEGREE_SIZES,
     SMOOTH_DEGREE,
     SMOOTH_TERMS,
     FrameFit,
     fit_frame,
-    log_determinant_of_inverse,
     score_products,
 )
-from rs_localizer.estimation.medians import median_depth
 from rs_localizer.estimation.mirror import farthest, mirrored
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.packing import weighted
+from rs_localizer.estimation.modes import (
+    FAR_LESS_PROBABLE,
+    STEPS,
+    TEMPER,
+    Inliers,
+    SmoothError,
+    along_arcs,
+    log_evidence,
+    mixture_of,
+)
+from rs_localizer.estimation.observations import Observations, median_depth
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior_terms import PriorTerms, terms_at
-from rs_localizer.estimation.refine import apply_step, inverted, refine
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.refine import apply_step, inverted
 from rs_localizer.estimation.undetected_vibration import Undetected, undetected_vibration
 
 # An in-frame turn is fitted where chance explains as much in three frames of ten, because one that
@@ -57,6 +56,8 @@ _WIDENS = float(-ndtri(1e-4 / len(CYCLES)))
 _COEFFICIENTS = np.append(np.full(len(CYCLES), 6.0), 2.0 * SMOOTH_TERMS - 6.0)
 # Likewise of the frames before (standard normal): one track in a thousand.
 _ASKS_REMEMBERED = 3.3
+# Of the typical speeds.
+_RESTS, _NOTHING = np.array([speed == 0.0 for speed in SPEEDS], float), np.zeros(len(SPEEDS))
 # Shaking of up to this (rad, 2 deg) moves points out of the gate of a motion without it.
 _LARGEST_SHAKE = 0.035
 # Points just outside of the gate that are no chance: shaking may have moved them there.
@@ -72,37 +73,23 @@ _DECLARED_PRECISION = 4.0
 # Scales from which a fit starts: those that it does not need shrink fast, those that it needs grow
 # slowly.
 _FIRST_TURN, _FIRST_SMOOTH = math.log(5e-3), math.log(0.3)
-_STEPS = 25
 # A mode that loses more inliers than this part leaves is another group of points.
 _KEPT = 0.9
 # No frame says more than this to the next ones (standard normal).
 _CLIPPED = 6.0
-# Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
-_MOST_BETTER = 0.01
 # Probability that does not count.
 _NO_PART = 1e-4
 # More points than this only take time.
 _MOST_POINTS = 2500
-# Logarithms of the odds of rest against each typical speed, and of none against an in-frame turn,
-# before any frame: errors of maps that no polynomial of the image follows look like motion, and a
-# hundred to one is what surveyed tags ask for (benchmarks.honesty tags).
-_REST_ODDS, _STEADY_ODDS = math.log(100.0), math.log(100.0)
+# Logarithm of the odds of none against an in-frame turn, before any frame.
+_STEADY_ODDS = math.log(100.0)
 # Of the cameras that do not show it, one in ten shakes: with one in three, in ten, and in twenty
 # the turn rates of hands are claimed to be 1.7, 1.4 and 1.3 times their actual deviation, and 95,
 # 93.5 and 92.9 % of the twists under one sine are inside (benchmarks.frames, hand and sine).
 _HIDDEN_ODDS = math.log(10.0)
-# Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
-_FAR_LESS_PROBABLE = 9.0
-# The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
-# this power, about the same mean: it holds for a camera that moves so little that rest is more
-# probable (1 would hold on average over all cameras, and not for that one). The odds against an
-# in-frame turn have no part in it.
-TEMPER = 0.25
 # Velocities beyond doubt, in squared standard deviations (four times the 99 % quantile of six), of
 # which the prior knows less than this part: typical speeds are not weighed.
 _CLEARLY_MOVING, _LITTLE_OF_THE_PRIOR = 67.0, 0.05
-_FITS, _FINE = 4, 1e-6
-_NO_SCALE, _ITERATIONS = 1e6, 50
 _NEAREST = 1e-6  # m; points nearer than this would make any map useless
 
 
@@ -116,9 +103,9 @@ class Asked(NamedTuple):
 class Hyperprior(NamedTuple):
     """Of the logarithms (15,) of the scales."""
 
+    first: Array  # where a fit starts
     mean: Array
     precision: Array
-    first: Array  # where a fit starts
 
 
 class _Frame(NamedTuple):
@@ -135,17 +122,6 @@ class _Frame(NamedTuple):
     bend: Array  # (n,b) of a smooth error of the map (see frame_fit); (n,0): of the image
 
 
-class Mode(NamedTuple):
-    """A Gaussian about an optimum, and its evidence."""
-
-    state: Array  # (24,)
-    covariance: Array  # (18,18)
-    evidence: float
-    cost: float  # noise variances
-    speed: int  # index of SPEEDS
-    smooth: float = 0.0  # px
-
-
 def frame_posterior(
     observations: Observations, start: Array, terms: PriorTerms, threshold: float, assumed: Assumed
 ) -> Posterior:
@@ -158,7 +134,7 @@ def frame_posterior(
         threshold: px, of inliers.
         assumed: of the camera.
     """
-    if len(observations) > _MOST_POINTS:
+    if observations.count > _MOST_POINTS:
         part = _of_points(observations.thinned(_MOST_POINTS), start, terms, threshold, assumed)
         gate = np.sqrt(part.squared_errors[part.inliers].max(initial=0.0))
         errors = observations.squared_errors(part.state)
@@ -190,7 +166,7 @@ def _of_points(
     declared = assumed.map_deviation * assumed.focal_length / depth  # px
     hyper = _hyperprior(assumed, declared)
     explained, agreement, vibration = _look(
-        observations.packed, len(observations), best.state, observations.row_time_gradient,
+        observations.packed, observations.count, best.state, observations.row_time_gradient,
         best.inliers, terms, best.noise, best.freedom, hyper.mean, hyper.precision,
         assumed.rolling,
     )  # fmt: skip
@@ -214,10 +190,10 @@ def _of_points(
     if smooth:
         bend = _bend(observations.points, best.inliers, depth / assumed.focal_length)
         of_map = frame._replace(bend=bend)
-        # Before a plane both explain alike. In depth a bent map leaves more open: it is left out only
-        # where it is far less probable.
+        # Before a plane both explain alike. In depth a bent map leaves more open: it is left out
+        # only where it is far less probable.
         if declared > 0.0 or (
-            not frame.planar and _evidence_of(of_map) > _evidence_of(frame) - _FAR_LESS_PROBABLE
+            not frame.planar and _evidence_of(of_map) > _evidence_of(frame) - FAR_LESS_PROBABLE
         ):
             frame = of_map
     shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
@@ -290,7 +266,10 @@ def _bend(points: Array, inliers: BoolArray, size: float) -> Array:
 
 def _evidence_of(frame: _Frame) -> float:
     """Of the fastest motion."""
-    return _mode(frame, frame.best.state, frame.terms, len(SPEEDS) - 1, 0.0).evidence
+    return mixture_of(
+        _inliers(frame), frame.best.state, frame.terms, _NOTHING, _NOTHING, len(SPEEDS) - 1, False,
+        False, _smooth(frame),
+    ).evidence  # fmt: skip
 
 
 def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
@@ -305,13 +284,13 @@ def _hyperprior(assumed: Assumed, declared: float) -> Hyperprior:
     both = precision + known.precisions
     mean = (precision * mean + known.precisions * known.means) / both
     first = np.where(known.precisions > 1.0, mean, first)
-    return Hyperprior(mean, both, first)
+    return Hyperprior(first, mean, both)
 
 
 def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior, float] | None:
     """The posterior of a camera that turns within the frame, and its evidence; None: no such."""
     observations, best, terms, threshold, assumed, hyper, _, _, bend = frame
-    mean, precision, first = hyper
+    first, mean, precision = hyper
     gate, noise = min(max(threshold, GATE * best.noise), WIDEST_GATE * threshold), best.noise
     if asked.wide:
         gate = max(2.0 * WIDEST_GATE * threshold, _LARGEST_SHAKE * assumed.focal_length)
@@ -319,9 +298,9 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
     fits: list[FrameFit] = []
     for state in (best.state,) if other is None else (best.state, other):
         fit = fit_frame(
-            observations.packed, len(observations), state, observations.row_time_gradient, terms,
+            observations.packed, observations.count, state, observations.row_time_gradient, terms,
             threshold, gate, noise, first, mean, precision,
-            True, asked.smooth, bend, _STEPS,
+            True, asked.smooth, bend, STEPS,
         )  # fmt: skip
         if fit.finite:
             fits.append(fit)
@@ -357,7 +336,11 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
     covariance = along_arcs(fitted.inflation * fit.covariance, fit.state[9:12])
     near = _near_outliers(fitted, threshold)
     fitted = replace(fitted, covariance=covariance, near_outliers=near)
-    return fitted, _evidence_of_fit(frame, fit, terms)
+    evidence = log_evidence(
+        fit.log_determinant, fit.left + fit.prior_cost, terms, _inliers(frame), fit.inliers,
+        fit.noise,
+    )  # fmt: skip
+    return fitted, evidence
 
 
 def _clearly_moving(best: Posterior, terms: PriorTerms, assumed: Assumed) -> bool:
@@ -374,41 +357,47 @@ def _clearly_moving(best: Posterior, terms: PriorTerms, assumed: Assumed) -> boo
 
 def _merged(frame: _Frame) -> tuple[Posterior, float]:
     """The mixture of all modes as one Gaussian, and its evidence."""
-    best, modes = frame.best, _modes(frame)
-    evidence = np.array([mode.evidence for mode in modes])
-    if not np.any(evidence > -math.inf):
-        return replace(best, smallest_eigenvalue=0.0), -math.inf
-    resting = np.array([SPEEDS[mode.speed] == 0.0 for mode in modes])
-    with_odds = evidence + _REST_ODDS * resting
-    probable = np.exp(with_odds - with_odds.max())
-    weights = probable**TEMPER
-    probable, weights = probable / probable.sum(), weights / weights.sum()
-    first = int(np.argmax(probable))
-    state, covariance, steps = averaged(
-        np.array([mode.state for mode in modes]),
-        np.array([mode.covariance for mode in modes]),
-        first, probable, weights,
+    best, assumed = frame.best, frame.assumed
+    odds = assumed.scales.speeds + assumed.of_rest * _RESTS
+    by_turn = np.zeros(len(SPEEDS))
+    if assumed.turn is not None:
+        by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
+    slowest = 0 if assumed.may_rest else len(SPEEDS) - 1
+    found = mixture_of(
+        _inliers(frame), best.state, frame.terms, odds, by_turn, slowest,
+        assumed.turn is not None, frame.planar, _smooth(frame),
     )  # fmt: skip
-    costs = np.array([mode.cost for mode in modes])
-    by_speed = np.full(len(SPEEDS), -math.inf)
-    for mode in modes:
-        by_speed[mode.speed] = np.logaddexp(by_speed[mode.speed], mode.evidence)
-    by_speed -= frame.assumed.scales.speeds
-    by_speed[0] -= frame.assumed.of_rest
-    by_speed = np.maximum(by_speed - by_speed.max(), -10.0)
+    if found.evidence == -math.inf:
+        return replace(best, smallest_eigenvalue=0.0), -math.inf
     posterior = replace(
         best,
-        state=state,
-        covariance=covariance,
-        squared_errors=frame.observations.squared_errors(state),
-        # Beside a motion that is free: at rest, what moves looks like an error of the map.
-        model_error=modes[-1].smooth,
+        state=found.state,
+        covariance=found.covariance,
+        squared_errors=frame.observations.squared_errors(found.state),
+        model_error=found.smooth,
         bend=frame.bend,
-        speeds=np.eye(len(SPEEDS))[[mode.speed for mode in modes]].T @ weights,
-        scales=Scales.nothing()._replace(speeds=by_speed),
-        mirror=farthest(costs, evidence, steps, covariance) if frame.planar else None,
+        speeds=found.speeds,
+        scales=Scales.nothing()._replace(speeds=found.log_likelihoods),
+        mirror=(
+            farthest(found.costs, found.evidences, found.steps, found.covariance)
+            if frame.planar
+            else None
+        ),
     )
-    return posterior, float(np.logaddexp.reduce(evidence)) - math.log(len(SPEEDS))
+    return posterior, found.evidence - math.log(len(SPEEDS))
+
+
+def _smooth(frame: _Frame) -> SmoothError:
+    return SmoothError(frame.smooth, *frame.hyper, frame.bend)
+
+
+def _inliers(frame: _Frame) -> Inliers:
+    observations, best = frame.observations, frame.best
+    return Inliers(
+        observations.packed, observations.points, observations.row_time_gradient, best.inliers,
+        best.noise, best.freedom, best.cost / best.noise**2, best.inflation,
+        frame.assumed.focal_length, frame.threshold,
+    )  # fmt: skip
 
 
 def _either(
@@ -438,130 +427,6 @@ def _either(
         shake=(1.0 - probable) * shaken.shake,
         scales=shaken.scales._replace(speeds=steady.scales.speeds),
     )
-
-
-def _modes(frame: _Frame) -> list[Mode]:
-    """A Gaussian for each typical speed and each lean of a plane."""
-    best, assumed = frame.best, frame.assumed
-    turn_known = assumed.turn is not None
-    speeds = range(len(SPEEDS)) if assumed.may_rest else (len(SPEEDS) - 1,)
-    near = at_rest(best.state) if assumed.may_rest else best.state
-    odds = assumed.scales.speeds
-    modes: list[Mode] = []
-    twin: Array | None = None
-    for speed in speeds:
-        chosen = terms_at(frame.terms, SPEEDS[speed], turn_known)
-        extra = float(odds[speed]) + (assumed.of_rest if SPEEDS[speed] == 0.0 else 0.0)
-        if assumed.turn is not None:
-            extra += assumed.turn.evidence(SPEEDS[speed])
-        mode = _mode(frame, near, chosen, speed, extra)
-        modes.append(mode)
-        near = mode.state
-        lean = twin
-        if frame.planar and twin is None:
-            lean = mirrored(frame.observations.points, best.inliers, near)
-        if lean is not None:
-            second = _mode(frame, lean, chosen, speed, extra)
-            twin = None
-            if _apart(mode, second):
-                modes.append(second)
-                twin = second.state
-        here = max(mode.evidence for mode in modes if mode.speed == speed)
-        if here < max(mode.evidence for mode in modes) - _FAR_LESS_PROBABLE / TEMPER:
-            break
-    return modes
-
-
-def _apart(mode: Mode, other: Mode) -> bool:
-    """Whether two modes are not the same optimum."""
-    between = math.sqrt(max(0.0, _angle(mode.state, other.state)))
-    spread = math.sqrt(max(float(np.trace(mode.covariance[:3, :3])), 0.0))
-    return bool(between > 1e-2 * spread)
-
-
-def _angle(state: Array, other: Array) -> float:
-    """Squared angle between two orientations, rad^2, for small ones; larger for large ones."""
-    difference = state[:9] - other[:9]
-    return 0.5 * float(difference @ difference)
-
-
-def _mode(frame: _Frame, start: Array, terms: PriorTerms, speed: int, odds: float) -> Mode:
-    """The Gaussian about the optimum near a state (24,)."""
-    observations, best = frame.observations, frame.best
-    data, gradient = weighted(observations.packed, best.inliers), observations.row_time_gradient
-    state, cost, covariance, volume = _laplace(data, start, gradient, terms, best.noise)
-    cost, smooth = cost / best.noise**2, 0.0
-    evidence = _evidence(frame, volume, cost)
-    if frame.smooth and math.isfinite(evidence):
-        fit = fit_frame(
-            observations.packed, len(observations), state, gradient, terms, frame.threshold,
-            WIDEST_GATE * frame.threshold, best.noise, frame.hyper.first, frame.hyper.mean,
-            frame.hyper.precision, False, True, frame.bend, _STEPS,
-        )  # fmt: skip
-        if fit.finite:
-            state, covariance, smooth = fit.state, fit.covariance, fit.smooth
-            cost, evidence = fit.left + fit.prior_cost, _evidence_of_fit(frame, fit, terms)
-    if not math.isfinite(evidence) or not np.all(np.isfinite(covariance)):
-        return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -math.inf, math.inf, speed)
-    covariance = along_arcs(best.inflation * covariance, state[9:12])
-    return Mode(state, covariance, evidence + odds, cost, speed, smooth)
-
-
-def _evidence_of_fit(frame: _Frame, fit: FrameFit, terms: PriorTerms) -> float:
-    """Logarithm of the probability of the pixels under a fit, but for a constant of the frame."""
-    volume = 0.5 * fit.log_determinant + known_volume(terms)
-    cost = fit.left + fit.prior_cost
-    return volume - 0.5 * cost + _of_pixels(frame, fit.inliers, fit.noise)
-
-
-def _evidence(frame: _Frame, volume: float, cost: float) -> float:
-    """The same of a motion alone, from its volume and cost (variances of the best one's noise).
-
-    Of unknown noise (Student): what it leaves beyond the best motion tells the less, the fewer the
-    points.
-    """
-    best = frame.best
-    freedom, least = max(best.freedom, 6.0), best.cost / best.noise**2
-    beyond = freedom * math.log1p(max((cost - least) / freedom, _MOST_BETTER - 1.0))
-    return volume - 0.5 * (least + beyond) + _of_pixels(frame, best.inliers, best.noise)
-
-
-def _of_pixels(frame: _Frame, inliers: BoolArray, noise: float) -> float:
-    """Logarithm of the density of all pixels: inliers about the motion at their best, others
-    anywhere in an image of a focal length squared.
-    """
-    count = np.count_nonzero(inliers)
-    others = len(inliers) - count
-    return -count * math.log(2.0 * math.pi * noise**2) - 2.0 * others * math.log(
-        frame.assumed.focal_length
-    )
-
-
-@kernel
-def _laplace(
-    data: Array, start: Array, gradient: Array, terms: PriorTerms, noise: float
-) -> tuple[Array, float, Array, float]:
-    """State, cost (px^2), covariance and the volume part of the log evidence of an optimum."""
-    state, information, cost = start, np.empty((PARAMETERS, PARAMETERS)), 0.0
-    for _ in range(_FITS):
-        state, information, cost, converged = refine(
-            data, state, gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
-        )
-        if converged:
-            break
-    covariance = noise * noise * inverted(information)
-    volume = 0.5 * log_determinant_of_inverse(covariance) + known_volume(terms)
-    return state, cost, covariance, volume
-
-
-@kernel
-def known_volume(terms: PriorTerms) -> float:
-    """Half the logarithm of the determinant of what a prior knows of the motion."""
-    known = 0.0
-    for k in range(PARAMETERS):
-        if terms.informations[0, k, k] > 0.0:
-            known += 0.5 * np.log(terms.informations[0, k, k])
-    return known
 
 
 @kernel

@@ -27,13 +27,10 @@ from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import PARAMETERS
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.mirror import is_plane
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.observing import Observed, Sighted
+from rs_localizer.estimation.observations import Observations, Observed, Sighted, relinearized
 from rs_localizer.estimation.posterior import WIDEST_GATE, Posterior, maximum_a_posteriori
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.refine import apply_step, inverted
-from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.estimation.residuals import linearized
 
 # Standard deviations of the coefficients beforehand: radial ones of 20 px at the corners of an
@@ -99,7 +96,7 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
         observations = sighted.by(mended)
         if observations is None:
             return None
-        if len(observations) > _MOST_POINTS:
+        if observations.count > _MOST_POINTS:
             observations = observations.thinned(_MOST_POINTS)
         best = maximum_a_posteriori(observations, state, terms, gate * threshold)
         if not (best.determined and np.all(np.isfinite(best.state))):
@@ -273,7 +270,7 @@ def _told(
     Args:
         sighted: by the camera with these coefficients (k,).
     """
-    count, chosen = len(observations), best.inliers
+    count, chosen = observations.count, best.inliers
     # The noise in derivatives looks like a lens, the same in all frames, and these are joined.
     observations = relinearized(sighted.camera, observations, best.state, sighted.turn, fewest=0)
     lines = linearized(

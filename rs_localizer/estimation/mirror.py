@@ -7,12 +7,13 @@ PAMI 2006). A minimum that was found says nothing of the other one, so it is loo
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.simd.jit import inlined, kernel
-from rs_localizer.estimation.averaging import longest_axis
 from rs_localizer.estimation.posterior import Mirror
 
 # Points whose depth relief is a smaller part than this of their narrower extent are a plane.
@@ -30,13 +31,13 @@ def mirrored(points: Array, inliers: BoolArray, state: Array) -> Array | None:
 
     None if the points (n,3) that count are no plane, or face the camera.
     """
-    found, other = _leaning_less(points, inliers, state, 2.0)
+    found, other = leaning_less(points, inliers, state, 2.0)
     return other if found else None
 
 
 def facing(points: Array, inliers: BoolArray, state: Array) -> Array | None:
     """The state (24,) half-way to the mirrored one, whose plane faces the camera; None as there."""
-    found, other = _leaning_less(points, inliers, state, 1.0)
+    found, other = leaning_less(points, inliers, state, 1.0)
     return other if found else None
 
 
@@ -46,7 +47,7 @@ def is_plane(points: Array, inliers: BoolArray) -> bool:
 
 
 @kernel
-def _leaning_less(
+def leaning_less(
     points: Array, inliers: BoolArray, state: Array, leans: float
 ) -> tuple[bool, Array]:
     """Whether there is a state whose view of the plane leans by so many times its lean less."""
@@ -104,6 +105,12 @@ def _plane(points: Array, inliers: BoolArray) -> tuple[bool, Array, Array]:
     return extents[0] < _PLANE**2 * extents[1], centre, axes[:, 0].copy()
 
 
+@kernel
+def longest_axis(covariance: Array) -> float:
+    """Standard deviation (rad) of the turn about the axis that is known worst."""
+    return math.sqrt(np.linalg.eigvalsh(covariance[:3, :3].copy())[-1])
+
+
 def farthest(costs: Array, evidence: Array, steps: Array, covariance: Array) -> Mirror | None:
     """The farthest pose that is not out of the question: neither unlikely nor of a bad fit.
 
@@ -120,3 +127,8 @@ def farthest(costs: Array, evidence: Array, steps: Array, covariance: Array) -> 
     # Curved valleys leave the ellipsoid early; the longest axis tells how far they go.
     deviation = longest_axis(covariance)
     return Mirror(steps[far], float(worse[far]), bool(turns[far] < _COVERED * deviation))
+
+
+def warm_up() -> None:
+    """Compile what planes come to that show two poses."""
+    longest_axis(np.eye(3))

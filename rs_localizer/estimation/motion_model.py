@@ -15,7 +15,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.blocks import add_block
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.shake import shake_in_the_middle
+from rs_localizer.core.shake import MIDDLE_RATES, MIDDLE_VALUES
 from rs_localizer.core.shutter import Motion, Numbers, motion_of, numbers_of
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.state import ANGULAR, PARAMETERS
@@ -133,21 +133,17 @@ def unshaken(estimate: Estimate) -> tuple[Motion, Array, Array]:
     A camera that shakes is, in the middle row, somewhere on its swing; a frame later it is
     somewhere else on it. What a gyroscope knows of the turn is not in the motion, either.
     """
-    count = (len(estimate.joint_covariance) - PARAMETERS) // 3
     motion, covariance, swing = _unshaken(
         numbers_of(estimate.beside_turn()),
         np.ascontiguousarray(estimate.shake),
         np.ascontiguousarray(estimate.joint_covariance),
-        *shake_in_the_middle(max(count, len(estimate.shake))),
     )
     return motion_of(motion), covariance, swing
 
 
 @kernel
-def _unshaken(
-    motion: Numbers, shake: Array, joint: Array, values: Array, slopes: Array
-) -> tuple[Numbers, Array, Array]:
-    """``values`` and ``slopes``: of the polynomials in the middle row."""
+def _unshaken(motion: Numbers, shake: Array, joint: Array) -> tuple[Numbers, Array, Array]:
+    values, slopes = MIDDLE_VALUES, MIDDLE_RATES
     rotation, translation, angular, linear, change, acceleration = motion
     turn, rate, swing = np.zeros(3), np.zeros(3), np.zeros((PARAMETERS, PARAMETERS))
     for k in range(len(shake)):
@@ -244,5 +240,5 @@ def warm_up() -> None:
     identity = np.eye(PARAMETERS)
     predict(still, identity, 1.0, 1.0)
     acceleration_covariance(Acceleration(1.0, 1.0), 1.0, 1.0)
-    _unshaken(numbers_of(still), np.zeros((0, 3)), identity, *shake_in_the_middle(0))
+    _unshaken(numbers_of(still), np.zeros((0, 3)), identity)
     surprises_of(np.zeros(PARAMETERS), identity, identity)

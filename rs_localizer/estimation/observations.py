@@ -1,14 +1,206 @@
-"""The points of one frame, packed once for all kernels."""
+"""The points of one frame: checked, chosen, and packed once for all kernels."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from rs_localizer.core.arrays import Array
-from rs_localizer.estimation.packing import pack, thin
-from rs_localizer.estimation.residuals import row_paces, squared_errors
+from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
+from rs_localizer.core.bearings import bearings
+from rs_localizer.core.camera import Camera
+from rs_localizer.core.gyro_compensated import gyro_compensated
+from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.lens import LensError
+from rs_localizer.core.reasons import Reason
+from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.simd.tracing import LANES
+from rs_localizer.core.types import Failure
+from rs_localizer.estimation.assumptions import Assumed
+from rs_localizer.estimation.prior import PriorTerms
+from rs_localizer.estimation.residuals import POINT_SIZE, linearized, row_paces, squared_errors
+
+
+@kernel
+def median_of(values: Array, chosen: BoolArray) -> float:
+    """Median of the chosen ones of values (n,); NaN if there are none."""
+    of = values[chosen]
+    middle = len(of) // 2
+    return float(np.partition(of, middle)[middle]) if len(of) > 0 else np.nan
+
+
+@inlined
+def median_point(points: Array, chosen: BoolArray) -> Array:
+    """Median (3,) of each coordinate over some of the points (n,3); zero if there are none."""
+    median = np.zeros(3)
+    if np.any(chosen):
+        for axis in range(3):
+            median[axis] = median_of(points[:, axis], chosen)
+    return median
+
+
+@kernel
+def median_depth(state: Array, points: Array, chosen: BoolArray) -> float:
+    """How far before the camera of a state (24,) the median of some points (n,3) is; NaN: none."""
+    depths = np.empty(len(points))
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        depths[i] = x * state[6] + y * state[7] + z * state[8] + state[11]
+    return median_of(depths, chosen)
+
+
+# Pixels may lie outside the image by this part of it: noise, and features at its border.
+_MARGIN = 0.05
+# Points that lie closer together than this (px) show no perspective.
+_LEAST_EXTENT = 5.0
+
+
+def checked(
+    points: ArrayLike, pixels: ArrayLike, scores: ArrayLike | None
+) -> tuple[Array, Array, Array | None]:
+    """Points (n,3), pixels (n,2) and scores (n,) as contiguous float64 arrays.
+
+    Raises:
+        ValueError: wrong shapes, or values that are not finite.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+    if points.size == 0 and pixels.size == 0:  # empty lists have no second dimension
+        points, pixels = points.reshape(0, 3), pixels.reshape(0, 2)
+    n = len(points)
+    if points.shape != (n, 3) or pixels.shape != (n, 2):
+        raise ValueError(
+            f"points must be (n,3) and pixels (n,2), got {points.shape} and {pixels.shape}"
+        )
+    checks = [("points", points), ("pixels", pixels)]
+    if scores is not None:
+        scores = np.ascontiguousarray(scores, dtype=np.float64)
+        if scores.shape != (n,):
+            raise ValueError(f"scores must be ({n},), got {scores.shape}")
+        checks.append(("scores", scores))
+    for name, array in checks:
+        if not np.all(np.isfinite(array)):
+            raise ValueError(f"{name} must be finite, found NaN or infinity")
+    return points, pixels, scores
+
+
+def distinct(points: Array, pixels: Array, chosen: IntArray) -> IntArray:
+    """The chosen correspondences without those that repeat another one: a copy says nothing new."""
+    # Equal pixels have equal keys; nearly always there are none, and one sort says so.
+    keys = np.sort(pixels[chosen, 0] + math.pi * pixels[chosen, 1])
+    if np.all(keys[1:] != keys[:-1]):
+        return chosen
+    pairs = np.hstack([points[chosen], pixels[chosen]])
+    first = np.unique(pairs, axis=0, return_index=True)[1]
+    return chosen[np.sort(first)]
+
+
+@kernel
+def near_image(pixels: Array, width: float, height: float) -> BoolArray:
+    """Which pixels (n,2) lie in the image, or as far outside as noise may have put them."""
+    near = np.empty(len(pixels), dtype=np.bool_)
+    across, down = _MARGIN * width, _MARGIN * height
+    for i in range(len(pixels)):
+        x, y = pixels[i, 0], pixels[i, 1]
+        near[i] = -across < x < width + across and -down < y < height + down
+    return near
+
+
+@kernel
+def _extent(pixels: Array, chosen: IntArray) -> float:
+    """Width or height of what the chosen pixels fill, whichever is the larger."""
+    largest = 0.0
+    for axis in range(2):
+        low, high = np.inf, -np.inf
+        for i in chosen:
+            low, high = min(low, pixels[i, axis]), max(high, pixels[i, axis])
+        largest = max(largest, high - low)
+    return largest
+
+
+def unfit(
+    camera: Camera, pixels: Array, usable: IntArray, shown: BoolArray, needed: int
+) -> Failure | None:
+    """Why points cannot carry a pose whatever the motion, or None.
+
+    Args:
+        pixels: (n,2) of all points.
+        usable: indices of those that can be used.
+        shown: (n,) which lie in the image.
+        needed: fewest points of a pose.
+    """
+    if len(usable) < needed:
+        outside = int(np.count_nonzero(~shown))
+        width, height = camera.size
+        hint = f"; {outside} lie outside the image of {width} x {height} pixels" if outside else ""
+        return Failure(
+            Reason.TOO_FEW_POINTS,
+            f"{len(usable)} usable points of {len(pixels)}, {needed} are needed{hint}",
+        )
+    extent = _extent(pixels, usable)
+    if extent < _LEAST_EXTENT:
+        return Failure(
+            Reason.DEGENERATE,
+            f"all {len(usable)} points lie within {extent:.2g} pixels; are these normalized "
+            "coordinates? Pixels of the raw image are needed",
+        )
+    return None
+
+
+@kernel
+def pack(points: Array, rays: Array, tau: Array, by_ray: Array) -> Array:
+    """Points in lanes: (blocks, values, LANES) of points (n,3), rays (n,2), row times (n,) and
+    derivatives of the pixel by the ray (n,2,2). The last block is filled up with weight zero.
+    """
+    count = len(points)
+    blocks = (count + LANES - 1) // LANES
+    data = np.empty((blocks, POINT_SIZE * LANES))
+    for block in range(blocks):
+        row = data[block]
+        for lane in range(LANES):
+            i = min(block * LANES + lane, count - 1)
+            for k in range(3):
+                row[k * LANES + lane] = points[i, k]
+            row[3 * LANES + lane] = rays[i, 0]
+            row[4 * LANES + lane] = rays[i, 1]
+            row[5 * LANES + lane] = tau[i]
+            for k in range(4):
+                row[(6 + k) * LANES + lane] = by_ray[i, k // 2, k % 2]
+            row[10 * LANES + lane] = 1.0 if block * LANES + lane < count else 0.0
+    return data
+
+
+@kernel
+def thin(data: Array, chosen: IntArray) -> Array:
+    """Only the chosen ones of the packed points, packed anew."""
+    count = len(chosen)
+    blocks = (count + LANES - 1) // LANES
+    thinned = np.empty((blocks, POINT_SIZE * LANES))
+    for place in range(blocks * LANES):
+        i = chosen[min(place, count - 1)]
+        for k in range(POINT_SIZE):
+            value = data[i // LANES, k * LANES + i % LANES]
+            if k == POINT_SIZE - 1 and place >= count:
+                value = 0.0
+            thinned[place // LANES, k * LANES + place % LANES] = value
+    return thinned
+
+
+@kernel
+def weighted(data: Array, weights: Array | BoolArray) -> Array:
+    """The packed points with these weights (n,): 1 or 0."""
+    data = data.copy()
+    for i in range(len(weights)):
+        data[i // LANES, 10 * LANES + i % LANES] = weights[i]
+    return data
+
+
+def warm_up() -> None:
+    """Compile what frames with many points come to."""
+    thin(np.zeros((1, POINT_SIZE * LANES)), np.zeros(1, np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,6 +213,7 @@ class Observations:
     row_range: float  # of tau
     row_time_gradient: Array  # (2,) per pixel
     packed: Array
+    count: int
 
     @classmethod
     def of(
@@ -28,7 +221,9 @@ class Observations:
     ) -> Observations:
         """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2)."""
         packed = pack(points, rays, tau, by_ray)
-        return cls(points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed)
+        return cls(
+            points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed, len(points)
+        )  # fmt: skip
 
     def thinned(self, count: int) -> Observations:
         """So many of the points, evenly taken."""
@@ -36,18 +231,172 @@ class Observations:
         packed = thin(self.packed, chosen)
         return Observations(
             self.points[chosen], self.rays[chosen], self.tau[chosen], self.row_range,
-            self.row_time_gradient, packed,
+            self.row_time_gradient, packed, count,
         )  # fmt: skip
 
     def __len__(self) -> int:
-        return len(self.points)
+        return self.count
 
     def squared_errors(self, state: Array) -> Array:
         """Squared reprojection errors (n,) in raw pixels."""
-        errors: Array = squared_errors(self.packed, len(self), state, self.row_time_gradient)
+        errors: Array = squared_errors(self.packed, self.count, state, self.row_time_gradient)
         return errors
 
     def row_paces(self, state: Array) -> Array:
         """How much faster than the image points the rows move (n,): 1 at rest, 0 in step."""
-        paces: Array = row_paces(self.packed, len(self), state, self.row_time_gradient)
+        paces: Array = row_paces(self.packed, self.count, state, self.row_time_gradient)
         return paces
+
+
+# What fewer points see of it is lost in their noise.
+_MANY = 300
+# Errors beyond which (px) the motion says nothing of where a point ought to be.
+_NEAR = 10.0
+
+
+def relinearized(
+    camera: Camera,
+    observations: Observations,
+    state: Array,
+    turn: KnownTurn | None,
+    fewest: int = _MANY,
+) -> Observations:
+    """The same observations with derivatives at a motion near the best; few points as they are.
+
+    Taken where the points were measured, derivatives of pixels by rays have the noise of the points
+    in them. Through a lens that bends much (a fisheye), and by a known turn, that makes the columns
+    of a motion differ a little from fields of errors that it can mimic, in step with the errors:
+    thousands of points take it for a map or a lens that is wrong.
+
+    Args:
+        state: (24,) of the motion.
+        turn: what the observations are compensated by.
+        fewest: points that are not few.
+    """
+    count = observations.count
+    if count < fewest or (len(camera.D) == 0 and turn is None):
+        return observations
+    gradient = observations.row_time_gradient
+    lines = linearized(observations.packed, count, state, gradient, np.zeros((count, 6)))
+    near = np.abs(lines.errors).max(axis=1) < _NEAR  # NaN compares false
+    rays = np.where(near[:, None], lines.image, observations.rays)
+    if turn is None:
+        by_ray = camera.pixel_jacobian(rays)
+    else:
+        local = np.einsum(
+            "nij,nj->ni", turn.at_rows(observations.tau)[0], np.column_stack([rays, np.ones(count)])
+        )
+        raw = local[:, :2] / local[:, 2:]
+        by_ray = gyro_compensated(
+            raw, observations.tau, camera.pixel_jacobian(raw), gradient, turn
+        )[1]
+    return Observations.of(
+        observations.points, observations.rays, observations.tau, by_ray, gradient
+    )
+
+
+# Points farther away than this (m) are faults, and their squares would be infinite.
+_FARTHEST_POINT = 1e9
+
+
+class Usable(NamedTuple):
+    """What can be used of the points."""
+
+    indices: IntArray  # of those that are finite, distinct and inside the image
+    shown: BoolArray  # (n,) which lie in the image
+    centre: Array  # (3,) map frame: the median of the points
+    rays: Array  # (n,2), compensated
+    by_ray: Array  # (n,2,2) derivatives of the pixels by them
+    tau: Array  # (n,) row times
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighted:
+    """The points of one image as they were given, and what of them can be used."""
+
+    camera: Camera
+    points: Array  # (n,3)
+    pixels: Array  # (n,2)
+    usable: Usable
+    turn: KnownTurn | None  # what the rays are compensated by
+
+    def by(self, camera: Camera) -> Observations | None:
+        """The same points through another lens; None where it has no bearing for one."""
+        rays, by_ray = _rays(camera, self.pixels, self.usable.tau, self.turn)
+        if not np.all(np.isfinite(rays[self.usable.indices])):
+            return None
+        return packed(camera, self.points, self.usable._replace(rays=rays, by_ray=by_ray))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """The points of one image on their way through the steps, and what is known beside them."""
+
+    observations: Observations
+    usable: IntArray  # which of the given points are observed
+    count: int  # of the given points
+    centre: Array  # (3,) map frame: origin of the observed points
+    ranking: IntArray | None  # observed points from the best to the worst
+    terms: PriorTerms  # velocity prior and whatever else is known but the pose
+    random: Random
+    assumed: Assumed
+    sighted: Sighted
+    lens: LensError | None = None  # what its camera lacked
+    asks_lens: bool = False  # what the frame says of that
+
+
+def find_usable(camera: Camera, points: Array, pixels: Array, turn: KnownTurn | None) -> Usable:
+    """Find the usable ones of points (n,3) and pixels (n,2); a known turn is taken out of these."""
+    tau = camera.row_time(pixels)
+    rays, by_ray = _rays(camera, pixels, tau, turn)
+    width, height = camera.size
+    shown = near_image(pixels, float(width), float(height))
+    centre, candidates = _candidates(points, rays, shown)
+    return Usable(distinct(points, pixels, candidates), shown, centre, rays, by_ray, tau)
+
+
+def _rays(camera: Camera, pixels: Array, tau: Array, turn: KnownTurn | None) -> tuple[Array, Array]:
+    """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, compensated."""
+    rays, by_ray = bearings(camera, pixels)
+    if turn is None:
+        return rays, by_ray
+    return gyro_compensated(rays, tau, by_ray, camera.row_time_gradient, turn)
+
+
+@kernel
+def _candidates(points: Array, rays: Array, shown: BoolArray) -> tuple[Array, IntArray]:
+    """The median (3,) of the points with a bearing, and which of these that are shown are near."""
+    count = len(points)
+    seen = np.empty(count, dtype=np.bool_)
+    for i in range(count):
+        seen[i] = np.isfinite(rays[i, 0])
+    centre = median_point(points, seen)
+    for i in range(count):
+        farthest = 0.0
+        for axis in range(3):
+            farthest = max(farthest, abs(points[i, axis] - centre[axis]))
+        seen[i] = seen[i] and shown[i] and farthest < _FARTHEST_POINT
+    return centre, np.flatnonzero(seen)
+
+
+def packed(camera: Camera, points: Array, usable: Usable) -> Observations:
+    """The usable points (of these (n,3)), relative to their median."""
+    indices, _, centre, rays, by_ray, tau = usable
+    found = _packed(points, rays, tau, by_ray, indices, centre)
+    near, bearing, times, row_range, lanes = found
+    return Observations(
+        near, bearing, times, row_range, camera.row_time_gradient, lanes, len(near)
+    )  # fmt: skip
+
+
+@kernel
+def _packed(
+    points: Array, rays: Array, tau: Array, by_ray: Array, indices: IntArray, centre: Array
+) -> tuple[Array, Array, Array, float, Array]:
+    """Points, bearings and row times at these indices, the range of the times, and all packed."""
+    near, bearing, times = points[indices], rays[indices], tau[indices]
+    for i in range(len(near)):
+        for axis in range(3):
+            near[i, axis] -= centre[axis]
+    row_range = np.max(times) - np.min(times) if len(times) > 0 else 0.0
+    return near, bearing, times, row_range, pack(near, bearing, times, by_ray[indices])

@@ -12,9 +12,8 @@ from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.scales import Scales
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.state import PARAMETERS
-from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.packing import weighted
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.observations import Observations, weighted
+from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import (
     EXPECTED_NOISE,
     LEAST_NOISE,
@@ -223,7 +222,7 @@ def maximum_a_posteriori(
     return Posterior(
         *_rounds(
             observations.packed,
-            len(observations),
+            observations.count,
             start,
             observations.row_time_gradient,
             prior,

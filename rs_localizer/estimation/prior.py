@@ -1,9 +1,16 @@
-"""What is known of the motion before the image: Gaussian priors and the direction of gravity."""
+"""What is known of the motion before the image: Gaussian priors and the direction of gravity.
+
+:class:`Prior` is what a user gives, :class:`PriorTerms` what kernels take, and :func:`add_prior`
+what it adds to the normal equations.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,8 +18,133 @@ from numpy.typing import ArrayLike
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.scales import Scales
-from rs_localizer.core.shutter import Motion
-from rs_localizer.estimation.prior_checks import check_covariance, check_motion
+from rs_localizer.core.shutter import Motion, Numbers, numbers_of
+from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.so3 import log
+from rs_localizer.core.state import (
+    ACCELERATIONS,
+    ANGULAR,
+    LINEAR,
+    MOTION_PARAMETERS,
+    PARAMETERS,
+    STATE_ANGULAR,
+    STATE_SIZE,
+    rotation_of,
+)
+
+# Numbers whose squares are finite.
+_MOST = 1e100
+_OF_MOTION = (
+    "rotation", "translation", "angular_velocity", "linear_velocity",
+    "angular_acceleration", "linear_acceleration",
+)  # fmt: skip
+_ORTHONORMAL, _SYMMETRIC = 1e-6, 1e-6
+# Least eigenvalue of a covariance scaled to a unit diagonal.
+_LEAST_EIGENVALUE = 1e-12
+_FAULTS = ("", "finite where its diagonal is", "symmetric", "positive definite")
+
+
+def check_motion(motion: Motion) -> None:
+    """Whether a motion may be one that is expected.
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, a rotation that is none.
+    """
+    for name in _OF_MOTION:
+        shape = (3, 3) if name == "rotation" else (3,)
+        if np.shape(getattr(motion, name)) != shape:
+            raise ValueError(
+                f"the prior motion's {name} must be of shape {shape}, "
+                f"got {np.shape(getattr(motion, name))}"
+            )
+    numbers = numbers_of(motion)
+    if not _is_finite(numbers):
+        name = next(n for n in _OF_MOTION if not np.all(np.abs(getattr(motion, n)) < _MOST))
+        raise ValueError(f"the prior motion's {name} is not finite: {getattr(motion, name)}")
+    if not _is_rotation(numbers[0]):
+        found = numbers[0].tolist()
+        raise ValueError(f"the prior motion's rotation is not orthonormal: {found}")
+
+
+def check_covariance(covariance: Array) -> None:
+    """Whether an array may be a prior motion's covariance; infinite variances know nothing.
+
+    Raises:
+        ValueError: wrong shape, values that are not finite, no covariance.
+    """
+    if covariance.shape not in ((MOTION_PARAMETERS,) * 2, (PARAMETERS,) * 2):
+        raise ValueError(f"covariance must be (12,12) or (18,18), got {covariance.shape}")
+    fault = _FAULTS[_fault_of(np.ascontiguousarray(covariance))]
+    if fault:
+        raise ValueError(f"covariance must be {fault}")
+
+
+@kernel
+def _is_finite(numbers: Numbers) -> bool:
+    rotation, translation, angular, linear, change, acceleration = numbers
+    finite = True
+    for i in range(3):
+        for j in range(3):
+            finite &= abs(rotation[i, j]) < _MOST
+        finite &= abs(translation[i]) < _MOST and abs(angular[i]) < _MOST
+        finite &= abs(linear[i]) < _MOST and abs(change[i]) < _MOST
+        finite &= abs(acceleration[i]) < _MOST
+    return finite
+
+
+@kernel
+def _is_rotation(matrix: Array) -> bool:
+    off = 0.0
+    for i in range(3):
+        for j in range(3):
+            total = -1.0 if i == j else 0.0
+            for k in range(3):
+                total += matrix[i, k] * matrix[j, k]
+            off = max(off, abs(total))
+    x, y, z = matrix[0], matrix[1], matrix[2]
+    determinant = (
+        (x[1] * y[2] - x[2] * y[1]) * z[0]
+        + (x[2] * y[0] - x[0] * y[2]) * z[1]
+        + (x[0] * y[1] - x[1] * y[0]) * z[2]
+    )
+    return off <= _ORTHONORMAL and determinant > 0.0
+
+
+@kernel
+def _fault_of(covariance: Array) -> int:
+    """Place in ``_FAULTS`` of what is wrong with a covariance (k,k); 0: nothing."""
+    known = np.flatnonzero(~np.isinf(np.diag(covariance)))
+    block = covariance[known][:, known].copy()
+    if not np.all(np.isfinite(block)):
+        return 1
+    scale = np.sqrt(np.abs(np.diag(block)))
+    for i in range(len(known)):
+        for j in range(i):
+            if not abs(block[i, j] - block[j, i]) <= _SYMMETRIC * scale[i] * scale[j]:
+                return 2
+    return 0 if _is_positive(block, scale) else 3
+
+
+@inlined
+def _is_positive(matrix: Array, scale: Array) -> bool:
+    """Whether a matrix, scaled to a unit diagonal, is positive definite; by Cholesky."""
+    size = len(matrix)
+    factor = np.empty((size, size))
+    for i in range(size):
+        if not matrix[i, i] > 0.0:
+            return False
+        for j in range(i + 1):
+            total = matrix[i, j] / (scale[i] * scale[j])
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = total / factor[j, j]
+            elif total > _LEAST_EIGENVALUE:
+                factor[i, i] = np.sqrt(total - _LEAST_EIGENVALUE)
+            else:
+                return False
+    return True
+
 
 _LEAST_DEVIATION = 1e-9
 
@@ -85,3 +217,336 @@ def state_in(motion: Motion, centre: Array) -> Array:
             motion.angular_acceleration, motion.linear_acceleration,
         ]
     )  # fmt: skip
+
+
+# A precision that holds a velocity at its mean whatever the points say.
+_HOLDING = 1e18
+# A tenth of the speed goes with the accelerations of the whole.
+_JOLTS = 10.0
+WALKING = 0.1
+"""Least part of the configured linear velocity that goes with a slower turn."""
+
+
+class PriorTerms(NamedTuple):
+    """A prior as the kernels take it: a sum of Gaussians, and a direction."""
+
+    informations: Array  # (k,18,18)
+    references: Array  # (k,24) states of their means
+    gravity: Array  # (7,) in the map, in the camera, precision
+
+
+_NO_GRAVITY = np.zeros(7)
+_STILL = np.concatenate([np.eye(3).ravel(), np.zeros(STATE_SIZE - 9)])
+
+
+def motion_terms(velocities: Sequence[float], accelerations: Sequence[float]) -> PriorTerms:
+    """Zero-mean prior of these standard deviations, each angular and linear; 0: none.
+
+    Args:
+        velocities: rad and m per readout.
+        accelerations: rad and m per readout squared.
+    """
+    precisions = [0.0 if d == 0.0 else d**-2 for d in (*velocities, *accelerations)]
+    return _single(np.diag(np.concatenate([np.zeros(6), np.repeat(precisions, 3)])), _STILL)
+
+
+@cache
+def held_terms() -> PriorTerms:
+    """A global shutter: velocities and accelerations are zero."""
+    return _single(np.diag(np.concatenate([np.zeros(6), np.full(12, _HOLDING)])), _STILL)
+
+
+@kernel
+def terms_at(terms: PriorTerms, speed: float, turn_known: bool) -> PriorTerms:
+    """The prior of a typical speed, a part of the configured one; 0: of a camera at rest.
+
+    Neither travel nor accelerations slow down as much as turns: who hardly turns may walk, and
+    jolts come at any speed. At rest, only gravity is as in the terms. What a gyroscope leaves of a
+    turn does not depend on the speed.
+    """
+    informations, references = terms.informations.copy(), terms.references
+    if speed == 0.0:
+        informations = np.zeros((1, PARAMETERS, PARAMETERS))
+        references = references[:1].copy()
+        for i in range(6, PARAMETERS):
+            informations[0, i, i] = _HOLDING
+    else:
+        informations[0, ANGULAR] /= speed**2
+        informations[0, LINEAR] /= max(speed, WALKING) ** 2
+        informations[0, ACCELERATIONS] /= min(_JOLTS * speed, 1.0) ** 2
+    if turn_known:
+        for i in range(6):
+            for j in range(6):
+                row, column = _turning(i), _turning(j)
+                informations[0, row, column] = terms.informations[0, row, column]
+    return PriorTerms(informations, references, terms.gravity)
+
+
+def with_turn(terms: PriorTerms, error: Array) -> PriorTerms:
+    """The terms of a motion beside a known turn; error (6,6): see ``KnownTurn.error``."""
+    return PriorTerms(_with_turn(terms.informations, error), terms.references, terms.gravity)
+
+
+@kernel
+def _with_turn(informations: Array, error: Array) -> Array:
+    changed, precision = informations.copy(), np.linalg.inv(error)
+    for i in range(6):
+        for j in range(6):
+            changed[0, _turning(i), _turning(j)] = precision[i, j]
+    return changed
+
+
+@kernel
+def _turning(i: int) -> int:
+    """Where a step has the turn rate, and its change six places behind it."""
+    place: int = 6 + i + i // 3 * 3
+    return place
+
+
+def gravity_cost(terms: PriorTerms, state: Array) -> float:
+    """What a state (24,) costs by the measured direction of gravity, in noise variances."""
+    gravity = terms.gravity
+    error = rotation_of(state) @ gravity[:3] - gravity[3:6]
+    return float(gravity[6] * (error @ error))
+
+
+def _single(information: Array, reference: Array) -> PriorTerms:
+    return PriorTerms(information[None], reference[None].copy(), _NO_GRAVITY)
+
+
+def with_measurements(terms: PriorTerms, prior: Prior) -> PriorTerms:
+    """The terms and what a prior says but for the motion: angular velocity and gravity."""
+    informations, references, gravity = terms
+    if prior.angular_velocity is not None:
+        information = np.zeros((PARAMETERS, PARAMETERS))
+        information[ANGULAR, ANGULAR] = np.eye(3) / prior.angular_velocity_deviation**2
+        reference = _STILL.copy()
+        reference[STATE_ANGULAR] = prior.angular_velocity
+        informations = np.concatenate([informations, information[None]])
+        references = np.concatenate([references, reference[None]])
+    if prior.gravity is not None:
+        gravity = np.concatenate(
+            [
+                _unit(prior.gravity_in_map),
+                _unit(prior.gravity),
+                [prior.gravity_deviation**-2],
+            ]
+        )
+    return PriorTerms(informations, references, gravity)
+
+
+def with_motion(
+    terms: PriorTerms, prior: Prior, centre: Array, turn_known: bool = False
+) -> PriorTerms:
+    """The terms and a prior's motion in the map frame, for points relative to ``centre`` (3,).
+
+    Its term, if it knows anything, is the last one. Beside a known turn it knows the gyroscope's
+    errors, too.
+    """
+    if prior.motion is None or prior.covariance is None:
+        return terms
+    if np.isinf(np.diagonal(prior.covariance)).all():
+        return terms  # the motion is a first guess
+    informations, references = _with_motion(
+        terms.informations,
+        terms.references,
+        np.ascontiguousarray(prior.covariance, np.float64),
+        state_in(prior.motion, centre),
+        turn_known,
+    )
+    return PriorTerms(informations, references, terms.gravity)
+
+
+@kernel
+def _with_motion(
+    informations: Array, references: Array, covariance: Array, reference: Array, turn_known: bool
+) -> tuple[Array, Array]:
+    count = len(informations)
+    found = np.empty((count + 1, PARAMETERS, PARAMETERS))
+    of = np.empty((count + 1, STATE_SIZE))
+    found[:count], of[:count] = informations, references
+    found[count], of[count] = _inverse(covariance), reference
+    if len(covariance) == PARAMETERS:  # it knows the accelerations better than a default
+        found[0, ACCELERATIONS] = 0.0
+        if turn_known:
+            for i in range(6):
+                for j in range(6):
+                    found[0, _turning(i), _turning(j)] = 0.0
+    return found, of
+
+
+@inlined
+def _inverse(covariance: Array) -> Array:
+    """Information (18,18) of a covariance, zero for parameters of infinite variance."""
+    places = np.flatnonzero(np.isfinite(np.diag(covariance)))
+    known = len(places)
+    block, information = np.empty((known, known)), np.zeros((PARAMETERS, PARAMETERS))
+    for i in range(known):
+        for j in range(known):
+            block[i, j] = covariance[places[i], places[j]]
+    inverse = np.linalg.inv(block)
+    for i in range(known):
+        for j in range(known):
+            information[places[i], places[j]] = inverse[i, j]
+    return information
+
+
+def _unit(vector: ArrayLike) -> Array:
+    array = np.asarray(vector, float)
+    array = array / np.abs(array).max()  # squares of very long vectors overflow
+    unit: Array = array / np.linalg.norm(array)
+    return unit
+
+
+@kernel
+def add_prior(
+    informations: Array,
+    references: Array,
+    gravity: Array,
+    state: Array,
+    weight: float,
+    information: Array,
+    slope: Array,
+) -> float:
+    """Add the prior's part, times ``weight``, to the normal equations; returns its cost.
+
+    These are of all 18 parameters, or of the first 12, while the accelerations are what they are.
+    """
+    cost = 0.0
+    size = len(slope)
+    offset = np.empty(PARAMETERS)
+    pulled = np.empty(PARAMETERS)
+    # Derivative of the offset by a step: identity but for the rotation and position blocks.
+    by_turn, by_move = np.empty((3, 3)), np.empty((3, 3))
+    for term in range(len(informations)):
+        prior, reference = informations[term], references[term]
+        posed = (
+            prior[0, 0] + prior[1, 1] + prior[2, 2] + prior[3, 3] + prior[4, 4] + prior[5, 5] > 0
+        )
+        first = 0 if posed else 6
+        for i in range(6):
+            offset[i] = 0.0
+        for i in range(6, PARAMETERS):
+            offset[i] = state[6 + i] - reference[6 + i]
+        if posed:
+            _pose_offset(state, reference, offset, by_turn, by_move)
+        for i in range(first, PARAMETERS):
+            total = 0.0
+            for j in range(first, PARAMETERS):
+                total += prior[i, j] * offset[j]
+            pulled[i] = weight * total
+            cost += offset[i] * pulled[i]
+        if not posed:
+            for i in range(6, size):
+                slope[i] += pulled[i]
+                for j in range(6, size):
+                    information[i, j] += weight * prior[i, j]
+            continue
+        _add_posed(prior, pulled, by_turn, by_move, weight, information, slope)
+    if gravity[6] > 0.0:
+        cost += _add_gravity(gravity, state, weight, information, slope)
+    return cost
+
+
+@inlined
+def _add_posed(
+    prior: Array,
+    pulled: Array,
+    by_turn: Array,
+    by_move: Array,
+    weight: float,
+    information: Array,
+    slope: Array,
+) -> None:
+    """Add J^T P J and J^T p, where J is the identity but for the blocks of turn and move."""
+    size = len(slope)
+    half = prior.copy()  # P J
+    for i in range(size):
+        for j in range(3):
+            turned, moved = 0.0, 0.0
+            for k in range(3):
+                turned += prior[i, k] * by_turn[k, j]
+                moved += prior[i, 3 + k] * by_move[k, j]
+            half[i, j], half[i, 3 + j] = turned, moved
+    for i in range(3):
+        for j in range(size):
+            turned, moved = 0.0, 0.0
+            for k in range(3):
+                turned += by_turn[k, i] * half[k, j]
+                moved += by_move[k, i] * half[3 + k, j]
+            information[i, j] += weight * turned
+            information[3 + i, j] += weight * moved
+        turned, moved = 0.0, 0.0
+        for k in range(3):
+            turned += by_turn[k, i] * pulled[k]
+            moved += by_move[k, i] * pulled[3 + k]
+        slope[i] += turned
+        slope[3 + i] += moved
+    for i in range(6, size):
+        slope[i] += pulled[i]
+        for j in range(size):
+            information[i, j] += weight * half[i, j]
+
+
+@inlined
+def _pose_offset(
+    state: Array, reference: Array, offset: Array, by_turn: Array, by_move: Array
+) -> None:
+    """The step (turn, move) from the reference pose to the state's and its derivatives."""
+    relative = np.empty((3, 3))  # reference from state: exp([turn]x)
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += reference[3 * i + k] * state[3 * j + k]
+            relative[i, j] = total
+            by_move[i, j] = total
+    turn = log(relative)
+    x, y, z = turn[0], turn[1], turn[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    # Inverse right Jacobian of the exponential; its second coefficient is 1/12 at zero.
+    if angle < 1e-3:
+        second = 1.0 / 12.0
+    else:
+        second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
+    by_turn[0, 0] = 1.0 - second * (y * y + z * z)
+    by_turn[1, 1] = 1.0 - second * (x * x + z * z)
+    by_turn[2, 2] = 1.0 - second * (x * x + y * y)
+    by_turn[0, 1], by_turn[1, 0] = -0.5 * z + second * x * y, 0.5 * z + second * x * y
+    by_turn[0, 2], by_turn[2, 0] = 0.5 * y + second * x * z, -0.5 * y + second * x * z
+    by_turn[1, 2], by_turn[2, 1] = -0.5 * x + second * y * z, 0.5 * x + second * y * z
+    for i in range(3):
+        offset[i] = turn[i]
+        moved = 0.0
+        for j in range(3):
+            moved += relative[i, j] * state[9 + j]
+        offset[3 + i] = reference[9 + i] - moved
+
+
+@inlined
+def _add_gravity(
+    gravity: Array, state: Array, weight: float, information: Array, slope: Array
+) -> float:
+    """Part of the measured direction: |R g - m|^2 times its precision."""
+    precision = weight * gravity[6]
+    seen = np.empty(3)
+    for i in range(3):
+        total = 0.0
+        for j in range(3):
+            total += state[3 * i + j] * gravity[j]
+        seen[i] = total
+    # A turn phi of the camera moves the direction by seen x phi.
+    derivative = np.zeros((3, 3))
+    derivative[0, 1], derivative[0, 2] = -seen[2], seen[1]
+    derivative[1, 0], derivative[1, 2] = seen[2], -seen[0]
+    derivative[2, 0], derivative[2, 1] = -seen[1], seen[0]
+    cost = 0.0
+    for k in range(3):
+        error = seen[k] - gravity[3 + k]
+        cost += precision * error * error
+        for i in range(3):
+            slope[i] += precision * derivative[k, i] * error
+            for j in range(3):
+                information[i, j] += precision * derivative[k, i] * derivative[k, j]
+    return cost

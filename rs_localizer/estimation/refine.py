@@ -12,8 +12,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.so3 import exp
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import PriorTerms
+from rs_localizer.estimation.prior import PriorTerms, add_prior
 from rs_localizer.estimation.residuals import normal_equations
 
 EXPECTED_NOISE = 0.5
@@ -138,7 +137,7 @@ def refine(
         scale, softness: of the robust loss, see :mod:`rs_localizer.estimation.residuals`.
         prior: see :mod:`rs_localizer.estimation.prior`.
         noise: standard deviation of the pixels, against which the prior is weighed.
-        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.estimation.view.View`);
+        looks: at each point's row, 1 or 2 (see :class:`rs_localizer.estimation.residuals.View`);
             1 holds the accelerations.
         iterations: most steps.
         tolerance: a step that gains less than this, in noise variances, is the last one, and

@@ -9,13 +9,20 @@ from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import at_rest, rotation_of
 from rs_localizer.estimation.mirror import facing
-from rs_localizer.estimation.observing import Observed
+from rs_localizer.estimation.observations import Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
-from rs_localizer.estimation.prior_terms import PriorTerms, held_terms
-from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses, search
+from rs_localizer.estimation.prior import PriorTerms, held_terms
+from rs_localizer.estimation.ransac import (
+    NOTHING,
+    Candidate,
+    Draws,
+    Hypotheses,
+    Pool,
+    descend,
+    optimize,
+    search,
+)
 from rs_localizer.estimation.refine import EXPECTED_NOISE
-from rs_localizer.estimation.sampling import Pool
-from rs_localizer.estimation.scoring import descend, optimize
 from rs_localizer.solvers.table import Solver
 
 # A global-shutter pose under motion misses the points of the first and last rows by a good part
@@ -46,10 +53,18 @@ class MotionSearch:
         self._solver = solver
         self._start = start  # a global-shutter solver
         self._focal_length = camera.focal_length
+        threshold = config.inlier_threshold
+        wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
+        if not solver.rolling_shutter:
+            scales = _SCORE_SCALE * threshold, threshold
+        else:
+            scales = wide, wide
+        self._starts = self._hypotheses(start, _GLOBAL_SHUTTER_BLOCK, *scales)
+        self._motions = self._hypotheses(solver, _BLOCK, _SCORE_SCALE * threshold, threshold)
 
     def find(self, observed: Observed) -> tuple[Candidate, Candidate]:
         """The global-shutter start and the motion found from it; the start may not be found."""
-        everything = np.arange(len(observed.observations))
+        everything = np.arange(observed.observations.count)
         most = self._config.max_iterations
         first = min(_FIRST_SAMPLES, most) if self._solver.rolling_shutter else most
         start = self._global_shutter(observed, everything, first)
@@ -77,7 +92,7 @@ class MotionSearch:
 
     def _inliers(self, observed: Observed, best: Candidate) -> BoolArray:
         if not best.found:
-            return np.zeros(len(observed.observations), dtype=np.bool_)
+            return np.zeros(observed.observations.count, dtype=np.bool_)
         errors = observed.observations.squared_errors(best.state)
         inliers: BoolArray = errors < self._config.inlier_threshold**2
         return inliers
@@ -126,18 +141,9 @@ class MotionSearch:
         self, observed: Observed, among: IntArray, most: int, before: Candidate = NOTHING
     ) -> Candidate:
         """A pose that fits all rows roughly, from some points and with a wide threshold."""
-        threshold = self._config.inlier_threshold
-        wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
-        if self._solver.rolling_shutter:
-            score_scale, final_scale = wide, wide
-        else:
-            score_scale, final_scale = _SCORE_SCALE * threshold, threshold
-        hypotheses = self._hypotheses(
-            self._start, _GLOBAL_SHUTTER_BLOCK, score_scale, final_scale, held_terms()
-        )
         pools = _pools(observed, among)
         draws = Draws([np.eye(3)], pools, self._config.confidence, most, observed.random)
-        return search(observed.observations, hypotheses, draws, before)
+        return search(observed.observations, self._starts, held_terms(), draws, before)
 
     def _motion(
         self, observed: Observed, start: Candidate, most: int, before: Candidate | None = None
@@ -145,20 +151,16 @@ class MotionSearch:
         """The motion that most points agree on, from the solver's hypotheses."""
         if not self._solver.rolling_shutter or not start.found:
             return start
-        threshold = self._config.inlier_threshold
         near = np.flatnonzero(self._near(observed, start))
         # The global-shutter pose is a hypothesis, too: at rest it is the best one.
         if before is None:
             scale = _POOL_SCALE * self._focal_length
             before = self.optimize(observed, start.state, scale, observed.terms)
             before = self._facing(observed, start, near, before)
-        hypotheses = self._hypotheses(
-            self._solver, _BLOCK, _SCORE_SCALE * threshold, threshold, observed.terms
-        )
         rotations = [rotation_of(start.state)]
-        pools = [Pool(near), *_pools(observed, np.arange(len(observed.observations)))]
+        pools = [Pool(near), *_pools(observed, np.arange(observed.observations.count))]
         draws = Draws(rotations, pools, self._config.confidence, most, observed.random)
-        return search(observed.observations, hypotheses, draws, before)
+        return search(observed.observations, self._motions, observed.terms, draws, before)
 
     def _facing(
         self, observed: Observed, start: Candidate, near: IntArray, found: Candidate
@@ -184,34 +186,17 @@ class MotionSearch:
         return Candidate(state, cost) if cost < found.cost else found
 
     def _hypotheses(
-        self,
-        solver: Solver,
-        block: int,
-        score_scale: float,
-        final_scale: float,
-        terms: PriorTerms,
+        self, solver: Solver, block: int, score_scale: float, final_scale: float
     ) -> Hypotheses:
-        iterations = self._config.solver_iterations
-
-        def solve(
-            points: Array,
-            rays: Array,
-            tau: Array,
-            samples: IntArray,
-            rotations: Array,
-            models: Array,
-        ) -> None:
-            solver.solve(points, rays, tau, samples, rotations, iterations, models)
-
         return Hypotheses(
-            solve=solve,
+            solve=solver.solve,
             sample_size=solver.sample_size,
             solutions=solver.solutions,
             block=block,
             score_scale=score_scale,
             final_scale=final_scale,
-            prior=terms,
             noise=EXPECTED_NOISE * self._config.inlier_threshold,
+            iterations=self._config.solver_iterations,
         )
 
     def optimize(

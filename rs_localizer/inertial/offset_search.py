@@ -7,7 +7,7 @@ so that a filter may lock on to a wrong period. Here each offset of a grid is su
 its cost, twice the negative logarithm of the likelihood, summed over the frames:
 
 * of the rows, what the motion that is best beside the turn of this offset leaves of the errors, as
-  in :mod:`rs_localizer.estimation.delay`;
+  in :mod:`rs_localizer.estimation.result`;
 * of the orientations ``R``, what a first orientation, a bias and the scales of the gyroscope leave
   of ``log(G^T R)``, with the turn ``G`` since the first frame (linear least squares; the normal
   matrix is the same for all offsets).

@@ -12,7 +12,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ACCELERATIONS, PARAMETERS, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate
-from rs_localizer.estimation.observing import find_usable, packed
+from rs_localizer.estimation.observations import find_usable, packed
 from rs_localizer.estimation.prior import state_in
 from rs_localizer.estimation.refine import LEAST_NOISE
 from rs_localizer.estimation.residuals import linearized

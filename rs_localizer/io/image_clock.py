@@ -71,6 +71,14 @@ class ImageClock:
             raise TimesError("the images have no times of their own: give --rate")
         return None if own_ns is None else self.start_ns + own_ns - self._first_ns
 
+    def at(self, own_ns: int) -> int | None:
+        """Stamp of a moment of a video's own clock, once its first image has come; None: with a
+        rate that is not its own.
+        """
+        if self.rate is not None or self.start_ns is None:
+            return None
+        return self.start_ns + own_ns - self._first_ns
+
     @property
     def own_rate(self) -> float | None:
         """Mean images per second by the file's own times; None: it has none."""

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rs_localizer.core.arrays import Array, IntArray
-from rs_localizer.io.messages import MessageError, frame_id, stamp_ns
+from rs_localizer.io.bags import make_message
+from rs_localizer.io.messages import MessageError, frame_id, make_header, stamp_ns
 
 _LATEST_NS = 2**63 - 1
 _COLUMNS = "time in ns, angular velocity x y z in rad/s, specific force x y z in m/s^2"
@@ -133,3 +134,29 @@ def _vector(vector: Any, name: str, unit: str, most: float) -> Vector:
             f"{name} is {values} {unit}, more than any IMU measures ({most:g}); is it in {unit}?"
         )
     return values
+
+
+def make_reading(
+    stamp_ns: int, rate: Array, force: Array, frame: str, variances: tuple[float, float] = (0, 0)
+) -> Any:
+    """A sensor_msgs/Imu of rosbags: rate (3,) in rad/s, force (3,) in m/s^2 (NaN: not measured),
+    their variances (0: not known); it knows no orientation.
+    """
+    known = [np.eye(3).ravel() * variance for variance in variances]
+    if not np.isfinite(force).all():
+        force, known[1] = np.zeros(3), np.array([_ABSENT, *[0.0] * 8])
+    return make_message(
+        "sensor_msgs/msg/Imu",
+        header=make_header(make_message, stamp_ns, frame),
+        orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=np.array([_ABSENT, *[0.0] * 8]),
+        angular_velocity=_vector3(rate),
+        angular_velocity_covariance=known[0],
+        linear_acceleration=_vector3(force),
+        linear_acceleration_covariance=known[1],
+    )
+
+
+def _vector3(vector: Array) -> Any:
+    x, y, z = vector.tolist()
+    return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -76,85 +76,57 @@ def each_message(
     frame: Localized, make: Make, wanted: Collection[str]
 ) -> Iterator[tuple[str, Any]]:
     """Those of these topics, one after the other; each is built when it is asked for."""
-    parts = _Parts(frame, make)
-    builders = _WITHOUT_TWIST if frame.twist is None else _BUILDERS
-    return ((name, build(parts)) for name, build in builders.items() if name in wanted)
+    twist = frame.twist
 
+    @cache
+    def header(name: str) -> Any:
+        return make_header(make, frame.stamp_ns, name)
 
-class _Parts:
-    """What the messages of a frame share, built when the first of them needs it."""
+    @cache
+    def pose() -> Any:
+        return _pose(make, frame.pose)
 
-    def __init__(self, frame: Localized, make: Make) -> None:
-        self.frame = frame
-        self.make = make
+    @cache
+    def pose_with_covariance() -> Any:
+        covariance = frame.pose.covariance.ravel()
+        kind = "geometry_msgs/msg/PoseWithCovariance"
+        return make(kind, pose=pose(), covariance=covariance)
 
-    @cached_property
-    def in_map(self) -> Any:
-        return make_header(self.make, self.frame.stamp_ns, self.frame.map_frame)
+    @cache
+    def velocity() -> Any:
+        assert twist is not None
+        linear, angular = _vector(make, twist.linear), _vector(make, twist.angular)
+        return make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
 
-    @cached_property
-    def in_body(self) -> Any:
-        return make_header(self.make, self.frame.stamp_ns, self.frame.body_frame)
+    @cache
+    def velocity_with_covariance() -> Any:
+        assert twist is not None
+        kind = "geometry_msgs/msg/TwistWithCovariance"
+        return make(kind, twist=velocity(), covariance=twist.covariance.ravel())
 
-    @cached_property
-    def pose(self) -> Any:
-        return _pose(self.make, self.frame.pose)
+    def odometry() -> dict[str, Any]:
+        parts = {"pose": pose_with_covariance(), "twist": velocity_with_covariance()}
+        return {"header": header(frame.map_frame), "child_frame_id": frame.body_frame, **parts}
 
-    @cached_property
-    def pose_with_covariance(self) -> Any:
-        return self.make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=self.pose,
-            covariance=self.frame.pose.covariance.ravel(),
-        )
-
-    @cached_property
-    def twist(self) -> Any:
-        return self.make(
-            "geometry_msgs/msg/Twist",
-            linear=_vector(self.make, self._twist.linear),
-            angular=_vector(self.make, self._twist.angular),
-        )
-
-    @cached_property
-    def twist_with_covariance(self) -> Any:
-        return self.make(
-            "geometry_msgs/msg/TwistWithCovariance",
-            twist=self.twist,
-            covariance=self._twist.covariance.ravel(),
-        )
-
-    @property
-    def _twist(self) -> Twist:
-        assert self.frame.twist is not None
-        return self.frame.twist
-
-
-_BUILDERS: dict[str, Callable[[_Parts], Any]] = {
-    topics.POSE: lambda of: of.make(TYPES[topics.POSE], header=of.in_map, pose=of.pose),
-    topics.POSE_WITH_COVARIANCE: lambda of: of.make(
-        TYPES[topics.POSE_WITH_COVARIANCE], header=of.in_map, pose=of.pose_with_covariance
-    ),
-    topics.TWIST: lambda of: of.make(TYPES[topics.TWIST], header=of.in_body, twist=of.twist),
-    topics.TWIST_WITH_COVARIANCE: lambda of: of.make(
-        TYPES[topics.TWIST_WITH_COVARIANCE], header=of.in_body, twist=of.twist_with_covariance
-    ),
-    topics.ODOMETRY: lambda of: of.make(
-        TYPES[topics.ODOMETRY],
-        header=of.in_map,
-        child_frame_id=of.frame.body_frame,
-        pose=of.pose_with_covariance,
-        twist=of.twist_with_covariance,
-    ),
-    topics.INLIERS: lambda of: make_cloud(
-        of.make, of.frame.input_stamp_ns, of.frame.map_frame, of.frame.inliers
-    ),
-}
-_WITHOUT_TWIST = {
-    name: build
-    for name, build in _BUILDERS.items()
-    if name not in (topics.TWIST, topics.TWIST_WITH_COVARIANCE, topics.ODOMETRY)
-}
+    poses: dict[str, Callable[[], dict[str, Any]]] = {
+        topics.POSE: lambda: {"header": header(frame.map_frame), "pose": pose()},
+        topics.POSE_WITH_COVARIANCE: lambda: {
+            "header": header(frame.map_frame), "pose": pose_with_covariance()
+        },
+    }  # fmt: skip
+    twists: dict[str, Callable[[], dict[str, Any]]] = {
+        topics.TWIST: lambda: {"header": header(frame.body_frame), "twist": velocity()},
+        topics.TWIST_WITH_COVARIANCE: lambda: {
+            "header": header(frame.body_frame), "twist": velocity_with_covariance()
+        },
+        topics.ODOMETRY: odometry,
+    }  # fmt: skip
+    for name, fields in (poses | ({} if twist is None else twists)).items():
+        if name in wanted:
+            yield name, make(TYPES[name], **fields())
+    if topics.INLIERS in wanted:
+        cloud = make_cloud(make, frame.input_stamp_ns, frame.map_frame, frame.inliers)
+        yield topics.INLIERS, cloud
 
 
 def _pose(make: Make, pose: Pose) -> Any:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io.maps.landmarks import Descriptors
 from rs_localizer.matching.kernels import (
+    Best,
+    Near,
     nearest_binary,
     nearest_binary_within,
     nearest_real_within,
@@ -136,13 +138,11 @@ def make_index(descriptors: Descriptors, *, binary: bool) -> Index:
 def _within(
     search: Any, rows: NDArray[Any], queries: NDArray[Any], pixels: Array, visible: Visible
 ) -> tuple[Nearest, IntArray]:
-    result = Nearest.none(len(queries))
-    rivals = np.full(len(visible.landmarks), np.inf)
-    owners = np.full(len(visible.landmarks), -1, np.int64)
-    search(
-        queries, pixels, rows, visible.landmarks, visible.pixels, visible.gate,
-        result.distances, result.landmarks, rivals, owners,
-    )  # fmt: skip
+    result, count = Nearest.none(len(queries)), len(visible.landmarks)
+    owners = np.full(count, -1, np.int64)
+    near = Near(pixels, visible.landmarks, visible.pixels, visible.gate)
+    best = Best(result.distances, result.landmarks, np.full(count, np.inf), owners)
+    search(queries, rows, near, best)
     return result, owners
 
 

@@ -6,13 +6,13 @@ written into distances (q,2), infinite before, and indices (q,2), -1 before.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.simd.jit import inlined, kernel
 
 _BLOCK = 256  # landmarks whose words stay in the first cache
@@ -88,74 +88,68 @@ def nearest_binary(queries: Any, columns: Any, distances: Array, indices: Any) -
                         second = distances[q, 1]
 
 
-@kernel
-def nearest_binary_within(
-    queries: Any,
-    pixels: Array,
-    rows: Any,
-    visible: Any,
-    predicted: Array,
-    gate: float,
-    distances: Array,
-    indices: Any,
-    rivals: Array,
-    owners: Any,
-) -> None:
-    """Among the landmarks ``visible`` (v,) of rows (n,w) that are predicted near the keypoint.
+class Near(NamedTuple):
+    """Keypoints, and the landmarks that may be near them."""
 
-    Args:
-        pixels: (q,2) of the keypoints.
-        predicted: (v,2) pixels of the landmarks, in the order of their second coordinate.
-        gate: px between the two.
-        rivals, owners: (v,) distance and index of the nearest keypoint of each landmark.
-    """
-    lines = predicted[:, 1].copy()
+    pixels: Array  # (q,2) of the keypoints
+    landmarks: IntArray  # (v,) rows of descriptors
+    predicted: Array  # (v,2) their pixels, in the order of the second coordinate
+    gate: float  # px between the two
+
+
+class Best(NamedTuple):
+    """What a search fills in."""
+
+    distances: Array  # (q,2)
+    indices: IntArray  # (q,2)
+    rivals: Array  # (v,) distance of the nearest keypoint of each landmark
+    owners: IntArray  # (v,) and its index
+
+
+@inlined
+def _enter(best: Best, near: Near, q: int, k: int, distance: float) -> None:
+    _insert(distance, near.landmarks[k], best.distances[q], best.indices[q])
+    if distance < best.rivals[k]:
+        best.rivals[k], best.owners[k] = distance, q
+
+
+@inlined
+def _is_near(near: Near, q: int, k: int) -> bool:
+    u, v = near.pixels[q, 0], near.pixels[q, 1]
+    square: float = (near.predicted[k, 0] - u) ** 2 + (near.predicted[k, 1] - v) ** 2
+    return not square > near.gate * near.gate
+
+
+@kernel
+def nearest_binary_within(queries: Any, rows: Any, near: Near, best: Best) -> None:
+    """Among the landmarks of rows (n,w) that are predicted near the keypoint."""
+    lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):
-        u, v = pixels[q, 0], pixels[q, 1]
-        for k in range(np.searchsorted(lines, v - gate), len(lines)):
-            if lines[k] > v + gate:
+        v = near.pixels[q, 1]
+        for k in range(np.searchsorted(lines, v - near.gate), len(lines)):
+            if lines[k] > v + near.gate:
                 break
-            if (predicted[k, 0] - u) ** 2 + (lines[k] - v) ** 2 > gate * gate:
-                continue
-            row = visible[k]
-            bits = 0
-            for word in range(queries.shape[1]):
-                bits += _count_bits(queries[q, word] ^ rows[row, word])
-            _insert(float(bits), row, distances[q], indices[q])
-            if bits < rivals[k]:
-                rivals[k], owners[k] = float(bits), q
+            if _is_near(near, q, k):
+                row, bits = near.landmarks[k], 0
+                for word in range(queries.shape[1]):
+                    bits += _count_bits(queries[q, word] ^ rows[row, word])
+                _enter(best, near, q, k, float(bits))
 
 
 @kernel
-def nearest_real_within(
-    queries: Any,
-    pixels: Array,
-    rows: Any,
-    visible: Any,
-    predicted: Array,
-    gate: float,
-    distances: Array,
-    indices: Any,
-    rivals: Array,
-    owners: Any,
-) -> None:
+def nearest_real_within(queries: Any, rows: Any, near: Near, best: Best) -> None:
     """As :func:`nearest_binary_within`, by the Euclidean distance of rows of numbers."""
-    lines = predicted[:, 1].copy()
+    lines = near.predicted[:, 1].copy()
     for q in range(len(queries)):
-        u, v = pixels[q, 0], pixels[q, 1]
-        for k in range(np.searchsorted(lines, v - gate), len(lines)):
-            if lines[k] > v + gate:
+        v = near.pixels[q, 1]
+        for k in range(np.searchsorted(lines, v - near.gate), len(lines)):
+            if lines[k] > v + near.gate:
                 break
-            if (predicted[k, 0] - u) ** 2 + (lines[k] - v) ** 2 > gate * gate:
-                continue
-            row = visible[k]
-            squared = 0.0
-            for i in range(queries.shape[1]):
-                squared += (queries[q, i] - rows[row, i]) ** 2
-            distance = np.sqrt(squared)
-            _insert(distance, row, distances[q], indices[q])
-            if distance < rivals[k]:
-                rivals[k], owners[k] = distance, q
+            if _is_near(near, q, k):
+                row, squared = near.landmarks[k], 0.0
+                for i in range(queries.shape[1]):
+                    squared += (queries[q, i] - rows[row, i]) ** 2
+                _enter(best, near, q, k, np.sqrt(squared))
 
 
 @kernel

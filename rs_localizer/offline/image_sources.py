@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,8 +15,11 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagReader, make_message
 from rs_localizer.io.image_clock import ImageClock
 from rs_localizer.io.images import Image, read_any_image
+from rs_localizer.io.imu import make_reading
 from rs_localizer.io.messages import make_header, stamp_ns
 from rs_localizer.io.recording import CAMERA_FRAME, make_camera_info
+from rs_localizer.io.telemetry import Telemetry
+from rs_localizer.io.topics import IMU
 from rs_localizer.io.video import read_video
 from rs_localizer.offline.replay import CARRIED_TYPES, as_tf2
 from rs_localizer.pipeline.refusal import Refusal, read_or_refuse
@@ -67,6 +70,28 @@ def from_video(path: Path, camera: Camera | None, clock: ImageClock) -> Iterator
             yield Shot(lost, _info(camera, 0), None, 0)
         else:
             yield _shot(Image(now, CAMERA_FRAME, gray), camera, jpeg, "jpeg")
+
+
+def with_telemetry(
+    shots: Iterable[Shot | Carried], telemetry: Telemetry, clock: ImageClock
+) -> Iterator[Shot | Carried]:
+    """The images of a video, and its gyroscope as ``imu``, in the axes and by the clock of the
+    camera; without a clock of its own, none.
+    """
+    times_ns = np.round(1e9 * telemetry.times).astype(np.int64)
+    sent = 0
+    for shot in shots:
+        if clock.at(0) is not None:
+            until = int(np.searchsorted(times_ns + (clock.at(0) or 0), shot.recorded_ns, "right"))
+            for k in range(sent, until):
+                stamp = clock.at(int(times_ns[k]))
+                if stamp is not None and stamp > 0:
+                    reading = make_reading(
+                        stamp, telemetry.rates[k], telemetry.forces[k], CAMERA_FRAME
+                    )
+                    yield Carried(f"/{IMU}", stamp, reading)
+            sent = max(sent, until)
+        yield shot
 
 
 def from_files(files: list[Path], camera: Camera | None, clock: ImageClock) -> Iterator[Shot]:

@@ -213,41 +213,6 @@ def lens_is_off(lens: LensError) -> str:
     )
 
 
-class StreamResets:
-    """Remembers the stamp of the last frame and the frame of its points."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, str] | None = None
-
-    def forget(self) -> None:
-        """The next frame is the first."""
-        self._last = None
-
-    def breaks(self, stamp_ns: int, frame: str) -> dict[Notice, str]:
-        """Why the next frame cannot follow, a sentence each; it is the last one now.
-
-        Args:
-            stamp_ns: of its image.
-            frame: of its points.
-        """
-        last, self._last = self._last, (stamp_ns, frame)
-        if last is None:
-            return {}
-        last_ns, last_frame = last
-        notices: dict[Notice, str] = {}
-        if stamp_ns < last_ns:
-            notices[Notice.TIME_WENT_BACK] = (
-                f"the stamp {stamp_ns * 1e-9:.3f} s lies {(last_ns - stamp_ns) * 1e-9:.3f} s "
-                "before the last one; the previous frames are forgotten"
-            )
-        if frame != last_frame:
-            notices[Notice.MAP_CHANGED] = (
-                f"the points are in frame {frame!r}, the last ones were in {last_frame!r}; "
-                "the previous frames are forgotten"
-            )
-        return notices
-
-
 ANY_CALIBRATION = Calibration(
     "camera", 640, 480, (500.0, 0.0, 319.5, 0.0, 500.0, 239.5, 0.0, 0.0, 1.0), (), "plumb_bob",
     (1, 1), None,
@@ -296,7 +261,7 @@ class FrameLocalizer:
         self.readout_watch = ReadoutWatch(notice)
         self._landmarks = Landmarks(notice)
         self._tags: Tags | None = None
-        self._resets = StreamResets()
+        self._last: tuple[int, str] | None = None  # stamp and map frame of the frame before
         self._calibration: Calibration | None = None
         self._too_many = False  # whether clouds above max_points have been noticed
         self._settings = config  # a readout time that is estimated takes the place of theirs
@@ -353,7 +318,7 @@ class FrameLocalizer:
 
     def reset(self) -> None:
         """Forget the previous frames."""
-        self._resets.forget()
+        self._last = None
         self._forget_motion()
 
     def _forget_motion(self) -> None:
@@ -509,6 +474,18 @@ class FrameLocalizer:
 
     def _follow(self, stamp_ns: int, frame: str) -> None:
         """Start afresh where this frame cannot follow the last one."""
-        for name, text in self._resets.breaks(stamp_ns, frame).items():
+        last, self._last = self._last, (stamp_ns, frame)
+        last_ns, last_frame = last or self._last
+        notices: dict[Notice, str] = {}
+        if stamp_ns < last_ns:
+            notices[Notice.TIME_WENT_BACK] = (
+                f"the stamp {stamp_ns * 1e-9:.3f} s lies {(last_ns - stamp_ns) * 1e-9:.3f} s "
+                "before the last one"
+            )
+        if frame != last_frame:
+            notices[Notice.MAP_CHANGED] = (
+                f"the points are in frame {frame!r}, the last ones were in {last_frame!r}"
+            )
+        for name, text in notices.items():
             self._forget_motion()
-            self._notice(name, text)
+            self._notice(name, f"{text}; the previous frames are forgotten")

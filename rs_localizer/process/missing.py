@@ -22,8 +22,15 @@ _EXTRAS = {
     "pyarrow": "table",
     "pycolmap": "mapping",
     "rerun": "view",
+    "telemetry_parser": "video",
 }
-_PIP = {"PIL": "Pillow", "cv2": "opencv-python-headless", "rerun": "rerun-sdk", "yaml": "PyYAML"}
+_PIP = {
+    "PIL": "Pillow",
+    "cv2": "opencv-python-headless",
+    "rerun": "rerun-sdk",
+    "telemetry_parser": "telemetry-parser",
+    "yaml": "PyYAML",
+}
 
 
 def explain(error: ImportError) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import sys
 from collections.abc import Callable, Sequence
 
@@ -30,19 +31,35 @@ def answer(name: str, words: Sequence[str]) -> str | None:
     return _help(name) if any(word in _HELP for word in own) else None
 
 
-def _help(name: str) -> str:
-    from rs_localizer.config import DetectorConfig, FeatureConfig, NodeConfig
-    from rs_localizer.settings import settings
+# Of each executable: name and class of its node, and what it makes.
+_NODES = {
+    "localizer": (
+        "rs_localizer",
+        "localizer.node.LocalizerNode",
+        "Poses and velocities from correspondences or keypoints.",
+    ),
+    "marker_detector": (
+        "marker_detector",
+        "detector.markers.MarkerDetectorNode",
+        "Correspondences from images of markers and boards.",
+    ),
+    "feature_detector": (
+        "feature_detector",
+        "detector.features.FeatureDetectorNode",
+        "Keypoints with descriptors from images.",
+    ),
+}
 
-    kind, what = {
-        "localizer": (NodeConfig, "Poses and velocities from correspondences or keypoints."),
-        "marker_detector": (DetectorConfig, "Correspondences from images of markers and boards."),
-        "feature_detector": (FeatureConfig, "Keypoints with descriptors from images."),
-    }[name]
+
+def _help(name: str) -> str:
+    from rs_localizer.settings import NODES, settings
+
+    node, _, about = _NODES[name]
+    (kind,) = (kind for kind, node_name in NODES.items() if node_name == node)
     lines = [
         f"usage: ros2 run rs_localizer {name} --ros-args [-p NAME:=VALUE] [--params-file FILE]",
         "",
-        f"{what} A ROS 2 node, which runs until Ctrl-C.",
+        f"{about} A ROS 2 node, which runs until Ctrl-C.",
         "The commands that need no ROS: rs_localizer --help.",
         "",
         "parameters (name: default):",
@@ -55,49 +72,35 @@ def _help(name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-Run = Callable[[StopRequest, list[str] | None], int]
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the localizer until Ctrl-C or SIGTERM, which end it with exit code 0 at any time."""
-
-    def load() -> Run:
-        from rs_localizer.ros.localizer.node import LocalizerNode
-        from rs_localizer.ros.node.managed import run
-        from rs_localizer.settings import NODE_NAME
-
-        return functools.partial(run, LocalizerNode, NODE_NAME)
-
-    return _guarded("localizer", load, args)
+    return _guarded("localizer", _run, args)
 
 
 def marker_detector(args: list[str] | None = None) -> int:
     """Run the marker detector likewise."""
-
-    def load() -> Run:
-        from rs_localizer.ros.detector.markers import MarkerDetectorNode
-        from rs_localizer.ros.node.managed import run
-        from rs_localizer.settings import DETECTOR_NAME
-
-        return functools.partial(run, MarkerDetectorNode, DETECTOR_NAME)
-
-    return _guarded("marker_detector", load, args)
+    return _guarded("marker_detector", _run, args)
 
 
 def feature_detector(args: list[str] | None = None) -> int:
     """Run the feature detector likewise."""
-
-    def load() -> Run:
-        from rs_localizer.ros.detector.features import FeatureDetectorNode
-        from rs_localizer.ros.node.managed import run
-        from rs_localizer.settings import FEATURES_NAME
-
-        return functools.partial(run, FeatureDetectorNode, FEATURES_NAME)
-
-    return _guarded("feature_detector", load, args)
+    return _guarded("feature_detector", _run, args)
 
 
-def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:
+def _run(name: str) -> Run:
+    """What runs a node; imports it, which takes long."""
+    from rs_localizer.ros.node.managed import run
+
+    node, path, _ = _NODES[name]
+    module, _, kind = path.rpartition(".")
+    make = getattr(importlib.import_module(f"rs_localizer.ros.{module}"), kind)
+    return functools.partial(run, make, node)
+
+
+Run = Callable[[StopRequest, list[str] | None], int]
+
+
+def _guarded(name: str, load: Callable[[str], Run], args: list[str] | None) -> int:
     threads.limit()
     with StopRequest() as stop:
         try:
@@ -106,7 +109,7 @@ def _guarded(name: str, load: Callable[[], Run], args: list[str] | None) -> int:
                 if text is not None:
                     sys.stdout.write(text)
                     return 0
-                run = load()
+                run = load(name)
         except ImportError as error:
             sys.stderr.write(f"{name}: {explain(error)}\n")
             return 1

@@ -18,7 +18,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.io import topics
 from rs_localizer.io.bags import BagWriter, make_message
-from rs_localizer.io.messages import make_header
+from rs_localizer.io.imu import make_reading
 from rs_localizer.io.recording import CAMERA_FRAME
 from rs_localizer.io.transforms import Transform, make_transform
 from rs_localizer.simulation.true_motion import BODY_FROM_CAMERA, TrueMotion
@@ -189,17 +189,8 @@ def make_imu(
 ) -> Any:
     """A sensor_msgs/Imu: rate (3,) in rad/s, force (3,) in m/s^2; it knows no orientation."""
     densities = (settings.gyroscope_noise, settings.accelerometer_noise)
-    variances = [np.eye(3).ravel() * density**2 * settings.rate for density in densities]
-    return make_message(
-        "sensor_msgs/msg/Imu",
-        header=make_header(make_message, stamp_ns, frame),
-        orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=np.array([-1.0, *[0.0] * 8]),
-        angular_velocity=_vector(rate),
-        angular_velocity_covariance=variances[0],
-        linear_acceleration=_vector(force),
-        linear_acceleration_covariance=variances[1],
-    )
+    gyroscope, accelerometer = (density**2 * settings.rate for density in densities)
+    return make_reading(stamp_ns, rate, force, frame, (gyroscope, accelerometer))
 
 
 def mounting(lever: Lever) -> Any:
@@ -207,8 +198,3 @@ def mounting(lever: Lever) -> Any:
     camera_from_imu = Transform(lever.rotation, lever.position)
     transform = make_transform(make_message, 0, CAMERA_FRAME, IMU_FRAME, camera_from_imu)
     return make_message("tf2_msgs/msg/TFMessage", transforms=[transform])
-
-
-def _vector(vector: Array) -> Any:
-    x, y, z = vector.tolist()
-    return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -181,6 +181,20 @@ def disagreement(values: Array, deviations: Array) -> float:
     return max(math.sqrt(squared / freedoms), float(scatter) * math.sqrt(total))
 
 
+def discrepancy(value: float, values: Array, deviations: Array) -> float:
+    """By how much the value of the whole differs from the mean of its parts (b,), beyond the noise
+    of that mean.
+
+    Corners that are off in all images of a part alike bend its lens and shape. The shorter it is,
+    the more of the shutter is taken for those: then the whole lies beside all of its parts.
+    """
+    if len(values) == 0:
+        return 0.0
+    weights = deviations**-2.0
+    mean = weights @ values / weights.sum()
+    return math.sqrt(max(float((value - mean) ** 2 - 1.0 / weights.sum()), 0.0))
+
+
 _LEAST_IMAGES = 20
 # A board: few landmarks, seen often. Each is where it should be to about this part of its size (a
 # quarter of a millimetre of an A4 sheet), beside what bends all of it.
@@ -197,9 +211,8 @@ _INTERVAL_SHARE = 0.5
 # estimate itself a slow motion, which makes it too long, would make it better known. Nor do slow
 # cameras have slow sensors.
 _DETERMINED_SHARE, _LONGEST_INTERVAL = 0.05, 1.0 / 30.0
-# A part says something that is known to this part of the interval; so many have to, or the
-# recording has to be so long (s).
-_TELLING_SHARE, _LEAST_TELLING, _LONG = 0.15, 3, 9.0
+# So many parts have to determine it by themselves, or the recording has to be so long (s).
+_LEAST_TELLING, _LONG = 3, 9.0
 # A global shutter has 0 within so many deviations, and these within this (s): the fastest rolling
 # shutters take 4 ms.
 _GLOBAL_SIGMAS, _GLOBAL = 3.0, 2e-3
@@ -254,9 +267,8 @@ class Calibration:
 
     @property
     def telling(self) -> int:
-        """How many blocks say something by themselves."""
-        limit = _TELLING_SHARE * min(self.stamps.interval, _LONGEST_INTERVAL)
-        return sum(block.deviation < limit for block in self.blocks)
+        """How many blocks determine it by themselves."""
+        return sum(block.deviation < self.limit for block in self.blocks)
 
     @property
     def long_enough(self) -> bool:
@@ -278,6 +290,12 @@ class Calibration:
         """Whether nothing else than a global shutter is left."""
         sure = _GLOBAL_SIGMAS * self.deviation < _GLOBAL and self.inflation == 1.0
         return self.determined and self.near_zero and sure and self.own_stamps
+
+    @property
+    def too_fast(self) -> bool:
+        """Whether it is a readout that no sensor has, by stamps that a file was given."""
+        slowest = abs(self.readout_time) + _GLOBAL_SIGMAS * self.deviation
+        return not (self.near_zero or self.own_stamps) and slowest < _GLOBAL
 
     @property
     def held(self) -> int:
@@ -465,9 +483,10 @@ def _judged(
     opposite = cost_at(camera, seen, found, -found.state.readout_time)
     blocks, halves = blocks_of(camera, seen, found), blocks_of(camera, seen, found, 2)
     formal = found.readout_time_deviation
-    inflation, mount = _disagreement(blocks, "readout_time", "deviation"), None
+    values, deviations = _of(blocks, "readout_time"), _of(blocks, "deviation")
+    inflation, mount = disagreement(values, deviations), None
     if seen.gyro is not None:
-        doubt = _disagreement(blocks, "delay", "delay_deviation")
+        doubt = disagreement(_of(blocks, "delay"), _of(blocks, "delay_deviation"))
         mount = mount_of(camera, found, seen.gyro, doubt)
     at = slice(1, 1 + len(found.state.lens))
     lens = lens_errors(found.camera, inflation**2 * found.border_covariance[at, at])
@@ -476,7 +495,10 @@ def _judged(
     return Calibration(
         readout_time=found.state.readout_time,
         deviation=math.hypot(
-            formal * inflation, _interval_deviation(found, stamps), 0.5 * _apart(halves)[0]
+            formal * inflation,
+            _interval_deviation(found, stamps),
+            0.5 * _apart(halves)[0],
+            discrepancy(found.state.readout_time, values, inflation * deviations),
         ),
         formal_deviation=formal,
         blocks=blocks,
@@ -493,10 +515,8 @@ def _judged(
     )
 
 
-def _disagreement(blocks: tuple[Block, ...], value: str, deviation: str) -> float:
-    return disagreement(
-        *(np.array([getattr(block, name) for block in blocks]) for name in (value, deviation))
-    )
+def _of(blocks: tuple[Block, ...], name: str) -> Array:
+    return np.array([getattr(block, name) for block in blocks])
 
 
 def _interval_deviation(found: Fit, stamps: Stamps) -> float:

@@ -74,6 +74,8 @@ def first_lens(size: tuple[int, int], images: list[Observed]) -> Camera:
     best, least = None, np.inf
     for candidate in _CANDIDATES:
         lens = _calibrated(size, chosen, candidate)
+        if lens is not None and best is not None and _folds(lens):
+            continue
         error = np.inf if lens is None else _unseen_error(lens, chosen, candidate)
         if error < least:
             best, least = lens, _RICHER * error
@@ -172,6 +174,16 @@ def _calibrated(
         return Camera(width=size[0], height=size[1], K=best[1], D=best[2], distortion_model=model)
     except ValueError:  # numbers that no camera has
         return None
+
+
+def _folds(lens: Camera) -> bool:
+    """Whether pixels of the image have no ray: a series that fits the middle of the image, where
+    the board was shown, may turn back towards the rim.
+    """
+    if lens.distortion_model == DistortionModel.EQUIDISTANT:  # looks sideways there, and has none
+        return False
+    rim = np.array([(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]) * lens.size
+    return not np.isfinite(lens.rays(rim)).all()
 
 
 def _slow(images: list[Observed]) -> list[Observed]:

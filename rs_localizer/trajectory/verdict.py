@@ -70,6 +70,11 @@ def refusal(found: Calibration) -> str:
             f"not observable: {value}, known to less than {1e3 * found.limit:.1f} ms it would be; "
             "move the camera faster, turn it to and fro about all axes, and for longer"
         )
+    if found.too_fast:
+        return (
+            f"not observable: {value}; no rolling shutter is that fast: was the video stabilised "
+            "or processed?"
+        )
     if found.near_zero and not found.global_shutter:
         reason = (
             "three deviations are more than 2 ms" if found.inflation == 1.0 and found.own_stamps

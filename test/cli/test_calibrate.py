@@ -1,5 +1,6 @@
 """``rs_localizer calibrate``, ``readout`` and ``replay --smooth``: the real recording, faults."""
 
+import csv
 from pathlib import Path
 
 import cv2
@@ -50,9 +51,14 @@ def test_the_webcam(tmp_path, capsys):
 def test_a_simulated_flight_against_the_assumed_direction(flight, tmp_path):
     out = tmp_path / "camera.yaml"
     words = ["-p", "scan_direction:=bottom_to_top", "--out", str(out)]
-    assert main(["calibrate", str(flight), *words]) == 0
+    share = ["--share", "Maker One", "--firmware", "2.10"]
+    assert main(["calibrate", str(flight), *words, *share]) == 0
     values = load_params_file(out)
     assert values["scan_direction"] == "top_to_bottom"
+    (row,) = csv.DictReader((tmp_path / "camera_share.csv").read_text().splitlines())
+    assert (row["name"], row["mode"]) == ("Maker One", "640x480 30 Hz")
+    assert float(row["median_ms"]) == pytest.approx(1e3 * values["readout_time"], abs=6e-4)
+    assert row["source"].endswith(" ms, firmware 2.10)")
     assert abs(values["readout_time"] - 0.02) < 4.0 * values["readout_time_deviation"]
 
 
@@ -95,6 +101,7 @@ def test_an_imu(inertial_flight, flight, tmp_path, capsys):
 def test_faults(flight, tmp_path, capsys):
     assert main(["calibrate", str(tmp_path / "nothing")]) == 1
     assert main(["calibrate", str(flight), "--out", str(tmp_path / "x.txt")]) == 2
+    assert main(["calibrate", str(flight), "--share", "Maker One"]) == 2
     assert main(["calibrate", str(flight), "--board", "5x4", "--square", "0.1"]) == 2
     video, nothing = tmp_path / "video.mjpeg", tmp_path / "nothing.mp4"
     video.write_bytes(2 * cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes())

@@ -8,7 +8,7 @@ import pytest
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
-from rs_localizer.estimation import packing
+from rs_localizer.estimation import observations
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]])
 
@@ -56,7 +56,7 @@ def frame(direction="top_to_bottom", speed=0.15, noise=0.0, count=21, seed=0, ac
 
 def pack(camera, points, pixels):
     rays = camera.rays(pixels)
-    return packing.pack(points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays))
+    return observations.pack(points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays))
 
 
 @pytest.fixture

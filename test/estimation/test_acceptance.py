@@ -9,7 +9,7 @@ from rs_localizer.core.reasons import Reason
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori
-from rs_localizer.estimation.prior_terms import motion_terms
+from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.localizer import Localizer
 
 PRIOR = motion_terms((0.18, 0.09), (0.009, 0.0036))

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.state import PARAMETERS, step_between
-from rs_localizer.estimation.averaging import averaged, longest_axis
+from rs_localizer.estimation.mirror import longest_axis
+from rs_localizer.estimation.modes import averaged
 from rs_localizer.estimation.refine import apply_step
 
 STATE = np.concatenate([np.eye(3).ravel(), [0.0, 0.0, 2.0], np.zeros(12)])

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.frames.conditions import named
 from benchmarks.frames.judged import judge
 from rs_localizer.core.state import step_between
-from rs_localizer.estimation.curvature import along_arcs, told_from
+from rs_localizer.estimation.modes import along_arcs, told_from
 from rs_localizer.estimation.refine import apply_step
 
 CENTRE = np.array([0.3, -0.2, 3.0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.estimation import packing, residuals
+from rs_localizer.estimation import observations, residuals
 
 from .projection import (
     AXIS,
@@ -27,7 +27,7 @@ def packed(points, rays, direction, shift=0.0):
     by_ray = jacobian_of(rays)
     moved = rays + np.linalg.solve(by_ray, np.broadcast_to(shift, rays.shape)[..., None])[..., 0]
     tau = row_time(pixels_of(moved), direction)
-    return packing.pack(points, moved, tau, jacobian_of(moved)), tau
+    return observations.pack(points, moved, tau, jacobian_of(moved)), tau
 
 
 def numerical(state, points, direction, coefficients=STILL, h=1e-5):

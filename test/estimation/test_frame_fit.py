@@ -22,8 +22,7 @@ from rs_localizer.estimation.frame_fit import (
 )
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import motion_terms
+from rs_localizer.estimation.prior import add_prior, motion_terms
 from rs_localizer.estimation.refine import apply_step
 from rs_localizer.estimation.residuals import Lines, linearized
 

@@ -20,7 +20,7 @@ from rs_localizer.core.state import step_between
 from rs_localizer.estimation.acceptance import refusal
 from rs_localizer.estimation.frame_posterior import _look, frame_posterior
 from rs_localizer.estimation.posterior import maximum_a_posteriori
-from rs_localizer.estimation.prior_terms import held_terms
+from rs_localizer.estimation.prior import held_terms
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Tracker
 

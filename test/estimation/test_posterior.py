@@ -3,7 +3,7 @@ import pytest
 
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import decided, maximum_a_posteriori, noise_deviation
-from rs_localizer.estimation.prior_terms import held_terms, motion_terms
+from rs_localizer.estimation.prior import held_terms, motion_terms
 from rs_localizer.estimation.refine import inverted
 
 # Per readout of 0.03 s: the defaults.

@@ -5,13 +5,13 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.shutter import Motion
-from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.prior_kernels import add_prior
-from rs_localizer.estimation.prior_terms import (
-    held_beside,
+from rs_localizer.estimation.prior import (
+    Prior,
+    add_prior,
     held_terms,
     motion_terms,
-    slower_terms,
+    state_in,
+    terms_at,
     with_measurements,
     with_motion,
 )
@@ -185,10 +185,10 @@ def test_a_slower_motion_is_a_narrower_prior_and_rest_the_narrowest():
     precisions = np.diag(own.informations[0])
     # Who hardly turns may walk, at a tenth of the speed; that has all the jolts.
     for part, walk, jolts in ((0.3, 0.3, 1.0), (0.01, 0.1, 0.1)):
-        slower = np.diag(slower_terms(own, part).informations[0])
+        slower = np.diag(terms_at(own, part, False).informations[0])
         np.testing.assert_allclose(slower[6:9], precisions[6:9] / part**2)
         np.testing.assert_allclose(slower[9:12], precisions[9:12] / walk**2)
         np.testing.assert_allclose(slower[12:], precisions[12:] / jolts**2)
-    resting = held_beside(own)
+    resting = terms_at(own, 0.0, False)
     np.testing.assert_array_equal(resting.gravity, own.gravity)
     assert np.diag(resting.informations[0])[6:].min() > 1e15

@@ -4,11 +4,19 @@ import numpy as np
 import pytest
 
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.prior_terms import motion_terms
-from rs_localizer.estimation.ransac import NOTHING, Candidate, Draws, Hypotheses, search
-from rs_localizer.estimation.sampling import Pool, generator
+from rs_localizer.estimation.prior import motion_terms
+from rs_localizer.estimation.ransac import (
+    NOTHING,
+    Candidate,
+    Draws,
+    Hypotheses,
+    Pool,
+    generator,
+    search,
+)
 
 IDENTITY = np.eye(3)
+FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
 
 
 class Solver:
@@ -18,7 +26,7 @@ class Solver:
         self.model, self.outliers, self.always_wrong = model, outliers, always_wrong
         self.samples, self.rotations = [], []
 
-    def __call__(self, points, rays, tau, samples, rotations, models):
+    def __call__(self, points, rays, tau, samples, rotations, iterations, models):
         self.samples.append(samples.copy())
         self.rotations.append(rotations[0].copy())
         good = ~self.outliers[samples].any(axis=1) & (not self.always_wrong)
@@ -51,10 +59,10 @@ def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotation
         start=NOTHING, seed=1):  # fmt: skip
     hypotheses = Hypotheses(
         solve=solver, sample_size=6, solutions=1, block=50, score_scale=8.0, final_scale=2.0,
-        prior=motion_terms((0.0, 0.0), (0.0, 0.0)), noise=1.0,
+        noise=1.0,
     )  # fmt: skip
     draws = Draws(rotations, pools, confidence, max_samples, generator(seed))
-    return search(observations, hypotheses, draws, start)
+    return search(observations, hypotheses, FREE, draws, start)
 
 
 def everything(observations):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core import so3
-from rs_localizer.estimation.prior_terms import held_terms, motion_terms
+from rs_localizer.estimation.prior import held_terms, motion_terms
 from rs_localizer.estimation.refine import (
     apply_step,
     inverted,

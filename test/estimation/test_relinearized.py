@@ -8,9 +8,8 @@ from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Motion
 from rs_localizer.estimation.experience import Experience
-from rs_localizer.estimation.observing import find_usable, packed
+from rs_localizer.estimation.observations import find_usable, packed, relinearized
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.estimation.relinearized import relinearized
 from rs_localizer.localizer import Localizer
 from rs_localizer.simulation.frames import FrameSettings, simulate_frames
 from rs_localizer.simulation.scene import room

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rs_localizer.estimation import packing, residuals
+from rs_localizer.estimation import observations, residuals
 from rs_localizer.estimation.refine import apply_step
 
 DIRECTIONS = ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
@@ -102,7 +102,7 @@ def test_weights_choose_the_points(scene):
     camera, motion, points, _, measured = scene.frame(noise=1.0)
     state, gradient = scene.state_of(motion), camera.row_time_gradient
     data = scene.pack(camera, points, measured)
-    data = packing.weighted(data, (np.arange(len(points)) < 13).astype(float))
+    data = observations.weighted(data, (np.arange(len(points)) < 13).astype(float))
     expected = residuals.truncated_cost(
         scene.pack(camera, points[:13], measured[:13]), state, gradient, 1e3, np.inf
     )

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rs_localizer.estimation.sampling import Pool, draw, generator
+from rs_localizer.estimation.ransac import Pool, draw, generator
 
 
 def samples_of(pool, count, size, tau=None, seed=0, prefixes=None):

@@ -1,9 +1,9 @@
 import numpy as np
 
 from rs_localizer.core.shutter import Motion
-from rs_localizer.estimation.prior_terms import motion_terms
+from rs_localizer.estimation.prior import motion_terms
+from rs_localizer.estimation.ransac import best_models, optimize, state_of_model
 from rs_localizer.estimation.residuals import truncated_cost
-from rs_localizer.estimation.scoring import best_models, optimize, state_of_model
 
 FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
 

@@ -38,6 +38,9 @@ def test_markers_give_frame_and_scale():
     assert placement.levelled
     assert np.allclose(placement.similarity(back(WALL.points)), WALL.points)
     assert placement.doubt == ""
+    points = WALL.points.copy()
+    points[:4] += [0.0, 0.02, 0.0]
+    assert "mm (rms) off their map" in placed(Anchors(WALL), back(points)).doubt
 
 
 def test_a_wrong_marker_map_is_refused():

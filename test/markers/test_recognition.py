@@ -1,8 +1,23 @@
 """What an image shows, for those whose map has nothing of it."""
 
+import numpy as np
 import pytest
 
+from rs_localizer.markers.dictionaries import pattern
+from rs_localizer.markers.families import family
+from rs_localizer.markers.poses import Pose
+from rs_localizer.markers.prints import Marker
 from rs_localizer.markers.recognition import chessboard_size, recognized
+
+
+@pytest.mark.parametrize("name", ["5x5_250", "apriltag_36h11"])
+def test_markers_are_named_with_their_family(name, render, look):
+    prints = []
+    for x, id_ in ((-0.07, 3), (0.07, 17)):
+        marker = Marker.at(name, id_, 0.1, Pose(np.array([x, 0.0, 0.0])))
+        prints.append((pattern(family(name), id_), marker.corners))
+    # By the smallest family that has such ids: the small ones are the beginning of the large ones.
+    assert recognized(render(prints, look(4.0, 5.0))) == [f"{name.replace('250', '50')} 3, 17"]
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(7, 5), (4, 3), (6, 6)])

@@ -23,7 +23,7 @@ print(*found)
 COMMAND = "import sys; sys.argv[1:] = ['--version']; from rs_localizer.__main__ import run; run()"
 NODE = """
 import rs_localizer.ros.main as program
-program._guarded("name", lambda: lambda stop, args: 0, None)
+program._guarded("name", lambda name: lambda stop, args: 0, None)
 """
 
 

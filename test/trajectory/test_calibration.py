@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.trajectory import verdict
-from rs_localizer.trajectory.calibration import Calibration, calibrate, examine
+from rs_localizer.trajectory.calibration import Calibration, calibrate, discrepancy, examine
 from rs_localizer.trajectory.first_lens import first_lens
 from rs_localizer.trajectory.lens import lens_difference
 from rs_localizer.trajectory.observe import Observed, in_order
@@ -109,6 +109,41 @@ def test_a_picture_that_is_turned_after_the_fact_makes_parts_disagree():
     assert found.stabilised
     assert "stabilisation" in verdict.refusal(found)
     assert not any("times less likely" in remark for remark in verdict.remarks(found))
+
+
+def test_what_nothing_can_contradict_or_no_camera_has_is_refused():
+    found = calibrate(CAMERA, list(recording(0.02)))
+    assert verdict.refusal(found) == ""
+    # A part that does not determine it as well as the whole must is no witness.
+    vague = tuple(replace(block, deviation=0.06 / 30.0) for block in found.blocks[1:])
+    short = replace(found, blocks=(found.blocks[0], *vague))
+    assert f"1 of {len(found.blocks)} parts" in verdict.refusal(short)
+    assert "longer than the interval" in verdict.refusal(replace(found, readout_time=0.04))
+    fit = found.fit
+    off = replace(fit.camera, K=fit.camera.K + np.outer([1.0, 0.0, 0.0], [0.0, 0.0, 5e3]))
+    assert "outside the image" in verdict.refusal(replace(found, fit=replace(fit, camera=off)))
+    moved = replace(fit, freedom=replace(fit.freedom, stamps=1.1e-3))
+    assert "beside their stamps" in verdict.refusal(replace(found, fit=moved))
+    # No rolling shutter takes a millisecond; a camera that stamps its images is to be believed.
+    fast = replace(found, readout_time=1e-3, deviation=1e-4)
+    assert verdict.refusal(fast) == ""
+    assert "no rolling shutter is that fast" in verdict.refusal(replace(fast, own_stamps=False))
+
+
+def test_a_whole_that_lies_beside_all_of_its_parts_is_known_less_well():
+    parts, deviations = np.array([1.0, 1.2, 1.1]), np.full(3, 0.1)
+    assert discrepancy(1.15, parts, deviations) == 0.0  # within the noise of their mean
+    assert discrepancy(2.1, parts, deviations) == pytest.approx(np.sqrt(1.0 - 0.01 / 3.0))
+    assert discrepancy(2.1, parts[:0], deviations[:0]) == 0.0
+
+
+def test_images_without_the_board_are_not_missing():
+    images = list(recording(0.02))
+    nothing = np.zeros((0, 3)), np.zeros((0, 2))
+    images[30:33] = [Observed(image.stamp_ns, *nothing) for image in images[30:33]]
+    found = calibrate(CAMERA, images)
+    assert found.stamps.missing == 0
+    assert found.images == len(images) - 3
 
 
 def test_a_bent_board_is_found_and_its_lens_with_it():

@@ -206,3 +206,14 @@ def test_another_ones_turns_are_no_mount():
         imu_extrinsics(GyroSamples(stamps, other.rates(stamps)), felt.spline(SECONDS))
     with pytest.raises(NoMount, match="0 samples"):
         imu_extrinsics(GyroSamples(np.zeros(0), np.zeros((0, 3))), felt.spline(SECONDS))
+
+
+def test_gaps_are_left_out():
+    felt = Felt.random(6)
+    stamps = felt.stamps(SECONDS)
+    kept = (stamps < 4.0) | (stamps > 4.3)
+    samples = ForceSamples(stamps[kept] + felt.delay, felt.forces(stamps[kept]))
+    rotation = felt.camera_from_imu.as_matrix()
+    parts = mean_accelerations(felt.spline(SECONDS), samples, rotation, 0.15)
+    times = np.concatenate([part.times for part in parts])
+    assert not np.any((times > 4.0 - 0.4) & (times < 4.3 + 0.4))

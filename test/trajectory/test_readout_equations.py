@@ -11,8 +11,6 @@ from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.trajectory.readout_equations import SIDE, Equations, View, equation, score
 from rs_localizer.trajectory.single_image_likelihood import single_image_likelihood
 
-CAMERA = Camera(projector.WIDTH, projector.HEIGHT, projector.K, projector.D)
-
 
 def covariance(rng: np.random.Generator, size: int) -> Array:
     root = rng.normal(size=(size, 2 * size))

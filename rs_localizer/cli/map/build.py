@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,14 +12,17 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, add_overwrite, replaced
+from rs_localizer.cli import UsageError, add_overwrite, replaced, stage
 from rs_localizer.cli.image_input import (
     add_source_arguments,
     opened,
     shutter_values,
+    telemetry_of,
     tell_left_out,
+    tell_telemetry,
     time_faults,
 )
+from rs_localizer.cli.marker_map import read_checked_map
 from rs_localizer.config import FeatureConfig
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.scanning import ScanDirection
@@ -30,10 +30,12 @@ from rs_localizer.evaluation.map_pictures import save_pictures
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import is_bag, open_bag
 from rs_localizer.io.calibration import write_calibration
+from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.io.images import Image
 from rs_localizer.io.imu import read_imu_csv
 from rs_localizer.io.maps.npz import write_npz
 from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
+from rs_localizer.io.telemetry import Telemetry
 from rs_localizer.io.topics import IMU
 from rs_localizer.io.trajectories import Trajectory, write_tum
 from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
@@ -42,9 +44,6 @@ from rs_localizer.mapping.colmap import Effort, require
 from rs_localizer.mapping.inertial_metres import GivenImu
 from rs_localizer.mapping.report import advice, rows, written
 from rs_localizer.mapping.views import Looker, View
-from rs_localizer.markers.consistency import other_units
-from rs_localizer.markers.map_files import read_marker_map
-from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.offline.detect import Cameras
 from rs_localizer.offline.image_sources import Carried
 from rs_localizer.offline.imu_recording import optical_frame, read_imu_recording
@@ -159,8 +158,8 @@ def add_imu_arguments(group: argparse._ArgumentGroup) -> None:
         const="",
         metavar="TOPIC|FILE.csv",
         help="the IMU that went along: no map without its scale. A topic of the bag (default: the "
-        "only one; used without this option, too, if it gives a scale); beside a video or a folder "
-        "a file as EuRoC's imu0/data.csv, with the clock of the images",
+        "only one; used without this option, too, if it gives a scale), or that inside a video; "
+        "beside a video or a folder a file as EuRoC's imu0/data.csv, with the clock of the images",
     )
     group.add_argument("--no-imu", action="store_true", help="without that of the bag")
 
@@ -178,12 +177,22 @@ def imu_of(args: argparse.Namespace) -> GivenImu | None:
         return None
     if is_bag(args.images):
         return _of_bag(args)
-    if args.imu is None:
-        return None
     if not args.imu:
-        raise UsageError("a video or folder has no IMU of its own: give --imu FILE.csv")
+        telemetry = telemetry_of(args.images, args)
+        if telemetry is not None and args.rate is None:
+            return _of_video(telemetry, args)
+        if args.imu is None:
+            return None
+        raise UsageError("this video or folder has no IMU of its own: give --imu FILE.csv")
     stamps, rates, forces = read_imu_csv(Path(args.imu))
     return GivenImu(ImuRecording(stamps, rates, specific_forces=forces), asked=True)
+
+
+def _of_video(telemetry: Telemetry, args: argparse.Namespace) -> GivenImu:
+    start_ns = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
+    stamps = start_ns + np.round(1e9 * telemetry.times).astype(np.int64)
+    recording = ImuRecording(stamps, telemetry.rates, np.eye(3), telemetry.forces)
+    return GivenImu(recording, asked=args.imu is not None)
 
 
 def _of_bag(args: argparse.Namespace) -> GivenImu | None:
@@ -272,7 +281,8 @@ def run(args: argparse.Namespace) -> None:
     require()
     if not args.images.exists():
         raise ValueError(f"{args.images} does not exist")
-    markers = None if args.markers is None else _marker_map(args.markers)
+    markers = None if args.markers is None else read_checked_map(args.markers)
+    tell_telemetry(args)
     shutter, imu = shutter_of(args), imu_of(args)
     with atomic_directory(args.out, replaced(args, MAP)) as out:
         out.mkdir()
@@ -285,7 +295,7 @@ def run(args: argparse.Namespace) -> None:
             )  # fmt: skip
             folder = out / COLMAP
             folder.mkdir()
-            built = build_map(inputs, Workshop(folder, Effort(args.threads, args.seed), _stage))
+            built = build_map(inputs, Workshop(folder, Effort(args.threads, args.seed), stage))
         _write(out, built, looked)
     _tell(args, built, looked)
 
@@ -301,19 +311,6 @@ def _check_points(args: argparse.Namespace) -> None:
                 f"--distance: the point {name} must be given by --point in two images or more, "
                 f"it is in {names.count(name)}"
             )
-
-
-def _marker_map(path: Path) -> MarkerMap:
-    marker_map = read_marker_map(path)
-    for fault in other_units(marker_map):
-        print(f"warning: {path}: {fault}", file=sys.stderr)
-    return marker_map
-
-
-@contextmanager
-def _stage(name: str, total: int) -> Iterator[Callable[[int], object]]:
-    with tqdm(total=total, desc=name, disable=None) as bar:
-        yield bar.update
 
 
 def _write(out: Path, built: Built, looked: Looked) -> None:

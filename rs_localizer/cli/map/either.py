@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, refuse_existing
 from rs_localizer.io.atomic_files import atomic_files
 from rs_localizer.io.maps.files import WRITERS, read_map_file
 from rs_localizer.io.maps.landmarks import Map, make_map
@@ -87,8 +87,7 @@ def check_output(args: argparse.Namespace) -> None:
         raise UsageError(f"{args.to} is written to {'.json' if args.to == 'wpilib' else '.yaml'}")
     if args.to is not None and suffix in WRITERS:
         raise UsageError("--to is for markers")
-    if args.out.exists() and not args.overwrite:
-        raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
+    refuse_existing(args)
 
 
 def write(args: argparse.Namespace, any_map: Map | MarkerMap) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, refuse_existing
 from rs_localizer.cli.map import contradiction
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.core.arrays import Array
@@ -79,8 +79,7 @@ def run(args: argparse.Namespace) -> None:
     if args.out.suffix not in WRITERS:
         raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
     config = given_settings(args)
-    if args.out.exists() and not args.overwrite:
-        raise ValueError(f"{args.out} exists; choose another OUT, or --overwrite")
+    refuse_existing(args)
     landmarks = None if args.map is None else read_map_file(args.map, config.map_frame)
     with open_bag(args.recording) as bag:
         topics = find_topics(bag, given_topics(args, but=(IMU,))).without(IMU)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError
+from rs_localizer.cli import UsageError, refuse_existing
 from rs_localizer.cli.image_input import opened, tell_times
 from rs_localizer.cli.map import contradiction
 from rs_localizer.cli.settings_args import add_settings, given_settings
@@ -89,8 +89,7 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError(f"--out must end in .yaml, got {args.out}")
     config, markers = given_settings(args), _markers(args)
     origin = _origin(args, markers)
-    if args.out.exists() and not args.overwrite:
-        raise ValueError(f"{args.out} exists; choose another --out, or --overwrite")
+    refuse_existing(args)
     if not args.recording.exists():
         raise ValueError(f"{args.recording} does not exist")
     camera, spotted = _spotted(args, config, Spotter(markers, args.min_side))

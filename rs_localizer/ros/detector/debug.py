@@ -21,6 +21,7 @@ from rs_localizer.io.topics import CAMERA_INFO, ODOMETRY, POSE
 from rs_localizer.markers.overlay import CameraPath, Picture, draw_detections, draw_world
 from rs_localizer.markers.poses import rotation_of_quaternion
 from rs_localizer.pipeline.images import Detected
+from rs_localizer.ros.node.conversion import xyz
 from rs_localizer.ros.node.inputs import LATCHED, Topic
 from rs_localizer.ros.node.refusals import Refusals
 from rs_localizer.ros.node.worker import Worker
@@ -86,7 +87,7 @@ class DebugPictures:
             return
         self._unanswered = 0
         twist = message.twist.twist
-        path = _path(message, message.pose.pose, _vector(twist.linear), _vector(twist.angular))
+        path = _path(message, message.pose.pose, xyz(twist.linear), xyz(twist.angular))
         for item in self._waiting:
             if self._belongs(path, item, config):
                 while self._waiting[0] is not item:
@@ -122,14 +123,10 @@ class DebugPictures:
             return None
 
 
-def _vector(vector: Any) -> Any:
-    return np.array([vector.x, vector.y, vector.z])
-
-
 def _path(message: Any, pose: Any, linear: Any, angular: Any) -> CameraPath:
     q = pose.orientation
     rotation = rotation_of_quaternion([q.x, q.y, q.z, q.w])
-    return CameraPath(stamp_ns(message), _vector(pose.position), rotation, linear, angular)
+    return CameraPath(stamp_ns(message), xyz(pose.position), rotation, linear, angular)
 
 
 def picture_topics(

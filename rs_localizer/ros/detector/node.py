@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 from sensor_msgs.msg import CompressedImage, PointCloud2
 from sensor_msgs.msg import Image as ImageMessage
@@ -28,7 +26,7 @@ from rs_localizer.io.images import Image
 from rs_localizer.io.messages import Make, make_header
 from rs_localizer.io.topics import COMPRESSED_IMAGE, IMAGE
 from rs_localizer.pipeline.refusal import Refusal
-from rs_localizer.ros.node.conversion import make_message
+from rs_localizer.ros.node.conversion import create_output, make_message
 from rs_localizer.ros.node.health import (
     SOME,
     Health,
@@ -327,7 +325,6 @@ def _image_topics(worker: Worker[Work[Settings, Result], Result]) -> dict[str, T
     return {name: Topic(kind, images(name)) for name, kind in _IMAGES.items()}
 
 
-_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
 _JPEG_QUALITY = 85
 
 Picture = NDArray[np.uint8]  # (h,w,3) blue, green, red
@@ -350,9 +347,9 @@ class ImageOutputs(Generic[Result]):
     ) -> None:
         self._node = node
         self._make_cloud = make_cloud
-        self._clouds = self._create(PointCloud2, topic)
-        self._pictures = self._create(ImageMessage, f"~/{topics.DEBUG_IMAGE}")
-        self._jpegs = self._create(CompressedImage, f"~/{topics.COMPRESSED_DEBUG_IMAGE}")
+        self._clouds = create_output(node, PointCloud2, topic)
+        self._pictures = create_output(node, ImageMessage, f"~/{topics.DEBUG_IMAGE}")
+        self._jpegs = create_output(node, CompressedImage, f"~/{topics.COMPRESSED_DEBUG_IMAGE}")
         # Held while publishing: after close() nothing is published any more.
         self._lock = threading.Lock()
         self._closed = False
@@ -391,14 +388,6 @@ class ImageOutputs(Generic[Result]):
             self._closed = True
             for publisher in (self._clouds, self._pictures, self._jpegs):
                 self._node.destroy_lifecycle_publisher(publisher)
-
-    def _create(self, kind: type, topic: str) -> Any:
-        return self._node.create_lifecycle_publisher(
-            kind,
-            topic,
-            QoSProfile(**_QOS),  # a new one each: overrides are written into it
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
 
 
 def _raw(header: Any, picture: Picture) -> Any:

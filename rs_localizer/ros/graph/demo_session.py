@@ -27,7 +27,7 @@ from rs_localizer.io import topics
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.topics import CAMERA_INFO, CORRESPONDENCES
 from rs_localizer.process.stopping import StopSignals
-from rs_localizer.ros.node.conversion import copy_message
+from rs_localizer.ros.node.conversion import copy_message, xyz
 from rs_localizer.settings import NODE_NAME
 
 # Of the diagnostics: frames that will never be answered.
@@ -87,10 +87,10 @@ class Listener:
             input_stamp_ns=stamp,
             latency=self._arrived[stamp] - self._sent[stamp],
             stamp_ns=stamp_ns(pose),
-            position=_xyz(pose.pose.position),
-            quaternion=np.append(_xyz(pose.pose.orientation), pose.pose.orientation.w),
-            angular=None if twist is None else _xyz(twist.twist.angular),
-            linear=None if twist is None else _xyz(twist.twist.linear),
+            position=xyz(pose.pose.position),
+            quaternion=np.append(xyz(pose.pose.orientation), pose.pose.orientation.w),
+            angular=None if twist is None else xyz(twist.twist.angular),
+            linear=None if twist is None else xyz(twist.twist.linear),
             residuals=_residuals(self._inliers[stamp]),
         )
 
@@ -110,10 +110,6 @@ class Listener:
 
     def _take_inliers(self, message: PointCloud2) -> None:
         self._inliers[stamp_ns(message)] = message
-
-
-def _xyz(vector: Any) -> np.ndarray:
-    return np.array([vector.x, vector.y, vector.z])
 
 
 def _residuals(cloud: PointCloud2) -> np.ndarray:

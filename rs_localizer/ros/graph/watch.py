@@ -24,6 +24,7 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.io import topics
 from rs_localizer.io.outputs import TYPES
 from rs_localizer.process.stopping import StopRequest
+from rs_localizer.ros.node.conversion import xyz
 
 # Rates are those of the last seconds; a pose that is older than this is said to be.
 _WINDOW, _OLD = 5.0, 1.0
@@ -205,12 +206,12 @@ def _run(
 def _subscribe(node: Any, watched: Watched) -> None:
     def take_pose(message: PoseWithCovarianceStamped) -> None:
         at = message.pose.pose
-        turn = euler(np.append(_xyz(at.orientation), at.orientation.w))
-        watched.arrived(_values(_xyz(at.position), turn, message.pose), time.monotonic())
+        turn = euler(np.append(xyz(at.orientation), at.orientation.w))
+        watched.arrived(_values(xyz(at.position), turn, message.pose), time.monotonic())
 
     def take_twist(message: TwistWithCovarianceStamped) -> None:
         speed = message.twist.twist
-        watched.twist = _values(_xyz(speed.linear), _xyz(speed.angular), message.twist)
+        watched.twist = _values(xyz(speed.linear), xyz(speed.angular), message.twist)
 
     task = f"{watched.node.lstrip('/')}: localizer"
 
@@ -273,7 +274,3 @@ class _Screen:
 def _values(linear: np.ndarray, angular: np.ndarray, message: Any) -> Values:
     variances = np.diag(np.reshape(message.covariance, (6, 6)))
     return Values(linear, angular, np.sqrt(np.maximum(variances, 0.0)))
-
-
-def _xyz(vector: Any) -> np.ndarray:
-    return np.array([vector.x, vector.y, vector.z])

@@ -9,8 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from std_srvs.srv import Trigger
@@ -34,7 +32,7 @@ from rs_localizer.ros.localizer.health import (
     tell,
 )
 from rs_localizer.ros.localizer.transforms import Broadcaster
-from rs_localizer.ros.node.conversion import installed, make_message, message_class
+from rs_localizer.ros.node.conversion import create_output, installed, make_message, message_class
 from rs_localizer.ros.node.health import Health
 from rs_localizer.ros.node.inputs import FAST_DATA, LATCHED, SENSOR_DATA, Topic
 from rs_localizer.ros.node.managed import ManagedNode
@@ -201,9 +199,6 @@ def warm_up(frames: FrameLocalizer) -> float:
     return time.monotonic() - started
 
 
-_QOS = {"depth": 10, "reliability": ReliabilityPolicy.RELIABLE}
-
-
 class Outputs:
     """Publishes frames on the topics of :data:`rs_localizer.io.outputs.TYPES`.
 
@@ -218,12 +213,7 @@ class Outputs:
         self._node = node
         self._afterwards = afterwards
         self._publishers = {
-            name: node.create_lifecycle_publisher(
-                message_class(type_name),
-                f"~/{name}",
-                QoSProfile(**_QOS),  # a new one each: overrides are written into it
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+            name: create_output(node, message_class(type_name), f"~/{name}")
             for name, type_name in TYPES.items()
         }
 

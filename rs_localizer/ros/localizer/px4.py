@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from rs_localizer.config import NodeConfig, Px4Odometry
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.topics import VEHICLE_ODOMETRY
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.px4 import TYPE, Jumps, vehicle_odometry
-from rs_localizer.ros.node.conversion import make_message, message_class
+from rs_localizer.ros.node.conversion import create_output, make_message, message_class
 
 
 def check(config: NodeConfig) -> None:
@@ -39,12 +37,7 @@ class Px4Output:
         self._node = node
         self._world = frames.config.px4_odometry
         self._jumps = Jumps(lambda: frames.config)
-        self._publisher = node.create_lifecycle_publisher(
-            message_class(TYPE),
-            f"~/{VEHICLE_ODOMETRY}",
-            QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        self._publisher = create_output(node, message_class(TYPE), f"~/{VEHICLE_ODOMETRY}")
 
     def publish(self, frame: Localized) -> None:
         """Publish a frame; jumps are counted whether anybody listens or not."""

@@ -1,4 +1,4 @@
-"""rclpy messages, made by type name or copied from those of a recording."""
+"""rclpy messages, made by type name or copied from those of a recording, and their publishers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 
 @cache
@@ -55,6 +58,21 @@ def copy_message(source: Any, type_name: str) -> Any:
         else:
             fields[name] = copy_message(value, _full_name(kind))
     return make_message(type_name, **fields)
+
+
+def xyz(vector: Any) -> Any:
+    """The numbers (3,) of a Point, a Vector3 or a Quaternion without its w."""
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def create_output(node: LifecycleNode, kind: type, topic: str) -> Any:
+    """A reliable publisher that publishes while the node is active; its QoS can be overridden."""
+    return node.create_lifecycle_publisher(
+        kind,
+        topic,
+        QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE),
+        qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+    )
 
 
 def _full_name(kind: str) -> str:

@@ -21,24 +21,9 @@ import numpy as np
 import pytest
 
 from rs_localizer.io.maps.files import read_map_file
-from rs_localizer.io.maps.landmarks import Map, MapError
+from rs_localizer.io.maps.landmarks import MapError
 
 COLMAP = Path(__file__).parent / "colmap"
-
-
-def landmarks(ids: str | None, descriptors: str | None, count: int = 7) -> Map:
-    rng = np.random.default_rng(0)
-    numbers = {
-        None: None,
-        "unsigned": rng.permutation(2**32 - 1 - np.arange(count)),
-        "signed": rng.permutation(np.arange(count) - 2**31),
-    }[ids]
-    rows = {
-        None: None,
-        "binary": rng.integers(0, 256, (count, 32), dtype=np.uint8),
-        "float": rng.normal(size=(count, 5)).astype(np.float32),
-    }[descriptors]
-    return Map(rng.normal(size=(count, 3)) * 1e5, numbers, rows, "hall")
 
 
 VERTICES = [(i, 9, -i, 7 + i, 2.5 * i, 3, i, 1, 2, -1) for i in range(4)]

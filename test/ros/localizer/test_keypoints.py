@@ -75,14 +75,6 @@ class Talk:
                 self.status = {item.key: item.value for item in status.values}
                 self.status["message"] = status.message
 
-    def send_map(self, landmarks: Map) -> Any:
-        message = make_cloud(make_message, 0, landmarks.frame, map_rows(landmarks))
-        self._maps.publish(message)
-        return message
-
-    def send_raw_map(self, message: Any) -> None:
-        self._maps.publish(message)
-
     def connect(self) -> None:
         publishers = (self._infos, self._maps, self._keypoints)
         assert self.peer.spin_until(

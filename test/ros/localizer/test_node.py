@@ -1,6 +1,5 @@
 """The node as its users meet it: its own process, real DDS, signals, parameters, life cycle."""
 
-import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -56,18 +55,6 @@ def test_parameters_of_a_running_node(recording, start_node, peer):
     assert robot.set("readout_time", READOUT_TIME) == (True, "")
     robot.localize(None, cloud)
     assert len(robot.answers["odometry"]) > 0
-    for name, value, reason in (
-        ("solver", "epnp", "solver must be one of"),
-        ("readout_time", 1.0, "out of range"),
-        ("autostart", False, "read-only"),
-    ):
-        successful, text = robot.set(name, value)
-        assert not successful
-        assert re.search(reason, text)
-    # The old ones are still there and work.
-    before = len(robot.answers["odometry"])
-    robot.localize(None, cloud)
-    assert len(robot.answers["odometry"]) > before
     changes = [
         Parameter("solver", value="p3p").to_parameter_msg(),
         # A single pose fits this motion badly.
@@ -109,6 +96,8 @@ def test_life_cycle(recording, start_node, peer):
     assert state(peer) == State.PRIMARY_STATE_FINALIZED
     assert node.stop() == 0
     assert "Traceback" not in node.log
+    assert "ignored" not in node.log
+    assert "readout_time is 0" not in node.log
 
 
 def test_what_is_fixed_can_be_set_while_it_is_unconfigured(start_node, peer, tmp_path):
@@ -125,25 +114,6 @@ def test_what_is_fixed_can_be_set_while_it_is_unconfigured(start_node, peer, tmp
     assert robot.set("map_frame", "hall")[0]  # as it is
     assert change_state(peer, Transition.TRANSITION_CLEANUP)
     assert robot.set("map_frame", "cellar")[0]
-    assert node.stop() == 0
-
-
-def test_a_failing_callback_does_not_end_the_node(recording, start_node, peer):
-    # A bug, for once: the first frame raises.
-    broken = (
-        "import sys; from rs_localizer.pipeline.frames import FrameLocalizer as F\n"
-        "localize = F.localize\n"
-        "def fail(self, message): F.localize = localize; raise TypeError('a bug')\n"
-        "F.localize = fail\n"
-        "from rs_localizer.ros.main import main; sys.exit(main())"
-    )
-    node = start_node(*SHUTTER, run=broken)
-    robot = Robot(peer)
-    robot.connect()
-    info, cloud = inputs(recording)[0]
-    assert not robot.send(info, cloud)
-    node.wait_for_log("internal_error: TypeError('a bug') in fail")
-    robot.localize(info, cloud)
     assert node.stop() == 0
 
 

@@ -1,0 +1,418 @@
+"""Modes of a frame without an in-frame turn: Gaussians about its optima, and their mixture.
+
+Typical speeds and the two leans of a plane are starts of one fit (docs/estimator.md); each becomes
+a Gaussian with its evidence (Laplace's approximation), and the mixture one Gaussian.
+
+The points say precisely in which direction they are and roughly how far away. A camera whose
+orientation they hardly tell is somewhere on an arc about them, and arcs leave their tangents: by
+half of 3 m times the square of 4 degrees, 7 mm, where the ellipsoid is thinner than 1 mm. In the
+terms of a step (turn ``phi``, move ``rho``; see :mod:`rs_localizer.estimation.refine`), points at
+``p`` in camera axes that move there by ``d`` are seen from
+
+    rho = p - exp([phi]x) (p + d)
+        = -d - phi x p - (phi x (phi x p) / 2 + phi x d) - ...
+
+of which the ellipsoid has the first two. Arcs also turn the axes: a step from one point of an arc,
+told from another one, moves along other axes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, BoolArray, IntArray
+from rs_localizer.core.blocks import write
+from rs_localizer.core.scales import SPEEDS
+from rs_localizer.core.simd.jit import inlined, kernel
+from rs_localizer.core.so3 import exp
+from rs_localizer.core.state import MOVE, PARAMETERS, STATE_SIZE, TURN, step_between
+from rs_localizer.estimation.frame_fit import fit_frame, log_determinant_of_inverse
+from rs_localizer.estimation.mirror import leaning_less
+from rs_localizer.estimation.observations import weighted
+from rs_localizer.estimation.posterior import WIDEST_GATE
+from rs_localizer.estimation.prior import PriorTerms, terms_at
+from rs_localizer.estimation.refine import apply_step, inverted, refine
+
+# More steps of Gauss-Newton than any fit needs that ends.
+STEPS = 25
+# Logarithm of the odds of rest against each typical speed before any frame: errors of maps that no
+# polynomial of the image follows look like motion, and a hundred to one is what surveyed tags ask
+# for (benchmarks.honesty tags).
+_REST_ODDS = math.log(100.0)
+# Logarithm of the odds of a typical speed beside a better one, beyond which no faster one is tried.
+FAR_LESS_PROBABLE = 9.0
+# The pose is the mean of the posterior. Its region is that of the posterior with probabilities to
+# this power, about the same mean: it holds for a camera that moves so little that rest is more
+# probable (1 would hold on average over all cameras, and not for that one). The odds against an
+# in-frame turn have no part in it.
+TEMPER = 0.25
+# Optima nearer than this part of a deviation are one.
+_SAME = 1e-2
+# Part of the squared errors that is left at least: of a camera that shakes, noise is a tenth.
+_MOST_BETTER = 0.01
+# No frame says more than this against a typical speed.
+_LEAST_LIKELY = -10.0
+_FITS, _FINE = 4, 1e-6
+_NO_SCALE, _ITERATIONS = 1e6, 50
+# Probabilities that have no part in the covariance.
+_NO_PART = 1e-5
+
+
+@kernel
+def along_arcs(covariance: Array, centre: Array) -> Array:
+    """The covariance with the second order of the move; that of the turn has none.
+
+    The mean stays where the points fit best, so that the mean of the second order counts, too: for
+    ``s_i = y^T H_i y`` of Gaussians ``y`` with covariance ``C``, ``E[s_i s_j]`` is
+    ``tr(H_i C) tr(H_j C) + 2 tr(H_i C H_j C)``.
+
+    Args:
+        covariance: (18,18), or more, of a step.
+        centre: (3,) of the points, in camera axes.
+    """
+    # y = (phi, d): d = -rho + [p]x phi.
+    by_step = np.zeros((6, 6))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        by_step[i, i], by_step[3 + i, 3 + i] = 1.0, -1.0
+        by_step[3 + j, i], by_step[3 + k, i] = centre[k], -centre[j]
+    both = by_step @ np.ascontiguousarray(covariance[:6, :6]) @ by_step.T
+    forms = np.zeros((3, 6, 6))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        # (phi x (phi x p))_i = phi_i (phi . p) - p_i (phi . phi)
+        for m in range(3):
+            forms[i, i, m] -= 0.25 * centre[m]
+            forms[i, m, i] -= 0.25 * centre[m]
+            forms[i, m, m] += 0.5 * centre[i]
+        forms[i, j, 3 + k] = forms[i, 3 + k, j] = -0.5
+        forms[i, k, 3 + j] = forms[i, 3 + j, k] = 0.5
+    products = np.empty((3, 6, 6))
+    for i in range(3):
+        products[i] = forms[i] @ both
+    farther = covariance.copy()
+    for i in range(3):
+        for j in range(3):
+            second = np.trace(products[i]) * np.trace(products[j])
+            second += 2.0 * np.sum(products[i] * products[j].T)
+            farther[MOVE, MOVE][i, j] += second
+    return farther
+
+
+@inlined
+def told_from(covariance: Array, turn: Array) -> Array:
+    """The covariance (n,n) of steps from one state as that of steps from another one.
+
+    With the turn ``a`` from the other state to the one, steps from the other one are
+
+        log(exp([a]x) exp([phi]x)) = a + J(a)^-1 phi + ...   and   ... + exp([a]x) rho,
+
+    where J is the right Jacobian of SO(3).
+
+    Args:
+        turn: (3,) first part of the step from the other state to the one.
+    """
+    x, y, z = turn[0], turn[1], turn[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    second = 1.0 / 12.0
+    if angle > 1e-3:
+        second = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / squared
+    # Of the Jacobian only two blocks are not those of the identity.
+    blocks = np.zeros((2, 3, 3))
+    part = np.array([x, y, z])
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        blocks[0, i, i] = 1.0 - second * squared
+        blocks[0, j, k], blocks[0, k, j] = -0.5 * part[i], 0.5 * part[i]
+    for i in range(3):
+        for j in range(3):
+            blocks[0, i, j] += second * part[i] * part[j]
+    blocks[1] = exp(turn)
+    told = covariance
+    for _ in range(2):  # the rows, then those of the transpose
+        rows = told.copy()
+        for i in range(6):
+            block, first = blocks[i // 3, i % 3], i // 3 * 3
+            for j in range(len(covariance)):
+                rows[i, j] = 0.0
+                for k in range(3):
+                    rows[i, j] += block[k] * told[first + k, j]
+        told = rows.T.copy()
+    return told
+
+
+@kernel
+def averaged(
+    states: Array, covariances: Array, best: int, counting: Array, possible: Array
+) -> tuple[Array, Array, Array]:
+    """Mean (24,) of Gaussians by the ones probabilities (k,), covariance (18,18) by the others.
+
+    And the steps (k,18) from the best one to all.
+    """
+    count = len(states)
+    steps, mean = np.empty((count, PARAMETERS)), np.empty(PARAMETERS)
+    for k in range(count):
+        write(steps[k], step_between(states[best], states[k]))
+    for i in range(PARAMETERS):
+        total = 0.0
+        for k in range(count):
+            total += counting[k] * steps[k, i]
+        mean[i] = total
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    for k in range(count):
+        offset = steps[k] - mean
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
+                covariance[i, j] += possible[k] * offset[i] * offset[j]
+        if possible[k] > _NO_PART:
+            covariance += possible[k] * told_from(covariances[k], offset[TURN])
+    return apply_step(states[best], mean), covariance, steps
+
+
+class Mode(NamedTuple):
+    """A Gaussian about an optimum, and its evidence."""
+
+    state: Array  # (24,)
+    covariance: Array  # (18,18)
+    evidence: float  # logarithm; minus infinity: nothing was found
+    cost: float  # noise variances
+    smooth: float  # px, scale of the smooth error
+
+
+class _Modes(NamedTuple):
+    states: Array  # (k,24)
+    covariances: Array  # (k,18,18)
+    evidences: Array  # (k,)
+    costs: Array  # (k,)
+    speeds: IntArray  # (k,) indices of SPEEDS
+    smooth: float  # px, of the last one
+
+
+class Mixture(NamedTuple):
+    """All modes of a frame."""
+
+    state: Array  # (24,) their mean
+    covariance: Array  # (18,18)
+    evidence: float  # logarithm of the sum
+    speeds: Array  # (5,) weights of the typical speeds in the covariance
+    log_likelihoods: Array  # (5,) of the typical speeds
+    smooth: float  # px, of the fastest: at rest, what moves looks like an error of the map
+    evidences: Array  # (k,) of the modes
+    costs: Array  # (k,) noise variances
+    steps: Array  # (k,18) to them from the most probable one
+
+
+class Inliers(NamedTuple):
+    """The points of a frame that its best motion leaves, and what it says of their noise."""
+
+    data: Array  # packed, all points
+    points: Array  # (n,3)
+    gradient: Array  # (2,) row time by pixel
+    chosen: BoolArray  # (n,)
+    noise: float  # px
+    freedom: float
+    cost: float  # noise variances
+    inflation: float  # of variances, for the noise is an estimate
+    focal_length: float  # px
+    threshold: float  # px
+
+
+class SmoothError(NamedTuple):
+    """Whether a smooth error is fitted, and what is known of the scales (15,), see `fit_frame`."""
+
+    fitted: bool
+    first: Array
+    mean: Array
+    precision: Array
+    bend: Array  # (n,b), or (n,0)
+
+
+@kernel
+def mixture_of(
+    inliers: Inliers, start: Array, terms: PriorTerms, odds: Array, by_turn: Array, slowest: int,
+    turn_known: bool, planar: bool, smooth: SmoothError,
+) -> Mixture:  # fmt: skip
+    """The modes of typical speeds and leans near a motion, and their mixture.
+
+    Args:
+        start: state (24,).
+        terms: of the configured speed.
+        odds: (5,) logarithms, of the typical speeds before this frame.
+        by_turn: (5,) log-likelihoods of them by what a gyroscope knows of this frame.
+        slowest: index of the first typical speed; the others follow.
+        turn_known: whether a gyroscope knows the turn.
+        planar: whether the mirrored lean is a start, too.
+    """
+    modes = _modes(
+        inliers, start, terms, odds + by_turn, slowest, turn_known, planar, smooth
+    )  # fmt: skip
+    count, evidences = len(modes.speeds), modes.evidences
+    log_likelihoods, weights = np.full(len(SPEEDS), -np.inf), np.zeros(len(SPEEDS))
+    total, probable = -np.inf, evidences.copy()
+    for k in range(count):
+        speed = modes.speeds[k]
+        if SPEEDS[speed] == 0.0:
+            probable[k] += _REST_ODDS
+        own = evidences[k] - odds[speed]
+        log_likelihoods[speed] = _log_sum(log_likelihoods[speed], own)
+        total = _log_sum(total, evidences[k])
+    if total == -np.inf:
+        return Mixture(
+            start, modes.covariances[0], total, weights, weights, 0.0, evidences, modes.costs,
+            np.zeros((count, PARAMETERS)),
+        )  # fmt: skip
+    first = int(np.argmax(probable))
+    probable = np.exp(probable - probable[first])
+    possible = probable**TEMPER
+    probable, possible = probable / np.sum(probable), possible / np.sum(possible)
+    state, covariance, steps = averaged(modes.states, modes.covariances, first, probable, possible)
+    for k in range(count):
+        weights[modes.speeds[k]] += possible[k]
+    log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), _LEAST_LIKELY)
+    return Mixture(
+        state, covariance, total, weights, log_likelihoods, modes.smooth, evidences, modes.costs,
+        steps,
+    )  # fmt: skip
+
+
+@inlined
+def _log_sum(one: float, other: float) -> float:
+    """Logarithm of the sum of two numbers whose logarithms these are."""
+    most, least = max(one, other), min(one, other)
+    return most if least == -np.inf else most + math.log1p(math.exp(least - most))
+
+
+@inlined
+def _modes(
+    inliers: Inliers, start: Array, terms: PriorTerms, odds: Array, slowest: int, turn_known: bool,
+    planar: bool, smooth: SmoothError,
+) -> _Modes:  # fmt: skip
+    """A Gaussian for each typical speed and each lean of a plane.
+
+    The valleys of the two leans join where the camera is free to move: a mirrored start that leads
+    back to the other lean would do so at every higher speed (so it did in 217 of 217 cases of
+    benchmarks.frames planes).
+    """
+    data, most = weighted(inliers.data, inliers.chosen), 2 * len(SPEEDS)
+    modes = _Modes(
+        np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
+        np.empty(most), np.empty(most, np.int64), 0.0,
+    )  # fmt: skip
+    near, count, best, scale = start.copy(), 0, -np.inf, 0.0
+    if slowest == 0:
+        near[12:] = 0.0
+    leans, twin, has_twin = planar, start, False
+    for speed in range(slowest, len(SPEEDS)):
+        prior = terms_at(terms, SPEEDS[speed], turn_known)
+        mode = _mode(data, inliers, near, prior, odds[speed], smooth)
+        count, scale = _keep(modes, count, speed, mode), mode.smooth
+        near, here = mode.state, mode.evidence
+        other = has_twin
+        if leans and not has_twin:
+            other, twin = leaning_less(inliers.points, inliers.chosen, near, 2.0)
+        if other:
+            second = _mode(data, inliers, twin, prior, odds[speed], smooth)
+            leans = has_twin = _apart(mode, second)
+            if has_twin:
+                count, scale = _keep(modes, count, speed, second), second.smooth
+                twin, here = second.state, max(here, second.evidence)
+        best = max(best, here)
+        if here < best - FAR_LESS_PROBABLE / TEMPER:
+            break
+    return _Modes(
+        modes.states[:count], modes.covariances[:count], modes.evidences[:count],
+        modes.costs[:count], modes.speeds[:count], scale,
+    )  # fmt: skip
+
+
+@inlined
+def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
+    """Write a mode behind so many others; their new number."""
+    write(modes.states[count], mode.state)
+    modes.covariances[count] = mode.covariance
+    modes.evidences[count], modes.costs[count] = mode.evidence, mode.cost
+    modes.speeds[count] = speed
+    return count + 1
+
+
+@inlined
+def _apart(mode: Mode, other: Mode) -> bool:
+    """Whether two modes are not the same optimum: by the squared angle between them, rad^2, for
+    small ones.
+    """
+    squared, spread = 0.0, 0.0
+    for i in range(9):
+        squared += 0.5 * (mode.state[i] - other.state[i]) ** 2
+    for i in range(3):
+        spread += mode.covariance[i, i]
+    return math.sqrt(squared) > _SAME * math.sqrt(max(spread, 0.0))
+
+
+@kernel
+def _mode(
+    data: Array, inliers: Inliers, start: Array, terms: PriorTerms, odds: float,
+    smooth: SmoothError,
+) -> Mode:  # fmt: skip
+    """The Gaussian about the optimum near a state (24,)."""
+    noise, variance = inliers.noise, inliers.noise * inliers.noise
+    state, information, cost = start, np.empty((PARAMETERS, PARAMETERS)), 0.0
+    for _ in range(_FITS):
+        state, information, cost, converged = refine(
+            data, state, inliers.gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
+        )
+        if converged:
+            break
+    covariance, cost = variance * inverted(information), cost / variance
+    # Of unknown noise (Student): what it leaves beyond the best motion tells the less, the fewer
+    # the points.
+    freedom = max(inliers.freedom, 6.0)
+    beyond = max((cost - inliers.cost) / freedom, _MOST_BETTER - 1.0)
+    left = inliers.cost + freedom * math.log1p(beyond)
+    volume = log_determinant_of_inverse(covariance)
+    evidence = log_evidence(volume, left, terms, inliers, inliers.chosen, noise)
+    scale = 0.0
+    if smooth.fitted and np.isfinite(evidence):
+        fit = fit_frame(
+            inliers.data, len(inliers.chosen), state, inliers.gradient, terms, inliers.threshold,
+            WIDEST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
+            False, True, smooth.bend, STEPS,
+        )  # fmt: skip
+        if fit.finite:
+            state, covariance, scale = fit.state, fit.covariance, fit.smooth
+            cost = fit.left + fit.prior_cost
+            evidence = log_evidence(
+                fit.log_determinant, cost, terms, inliers, fit.inliers, fit.noise
+            )
+    if not (np.isfinite(evidence) and np.all(np.isfinite(covariance))):
+        return Mode(start, np.zeros((PARAMETERS, PARAMETERS)), -np.inf, np.inf, 0.0)
+    covariance = along_arcs(inliers.inflation * covariance, state[9:12])
+    return Mode(state, covariance, evidence + odds, cost, scale)
+
+
+@kernel
+def log_evidence(
+    log_determinant: float, cost: float, terms: PriorTerms, inliers: Inliers, chosen: BoolArray,
+    noise: float,
+) -> float:  # fmt: skip
+    """Logarithm of the probability of all pixels, but for a constant of the frame (Laplace).
+
+    Args:
+        log_determinant: of the covariance, over that of the prior of what stands behind the motion.
+        cost: noise variances.
+        terms: of the motion.
+        chosen: (n,) inliers, about the motion at their best; others are anywhere in an image of a
+            focal length squared.
+        noise: px.
+    """
+    volume = 0.5 * log_determinant
+    for k in range(PARAMETERS):
+        if terms.informations[0, k, k] > 0.0:
+            volume += 0.5 * math.log(terms.informations[0, k, k])
+    count = np.count_nonzero(chosen)
+    others = len(chosen) - count
+    density = count * math.log(2.0 * math.pi * noise * noise)
+    return volume - 0.5 * cost - density - 2.0 * others * math.log(inliers.focal_length)

@@ -1,0 +1,223 @@
+"""Gyroscopes and readout times inside videos: axes, units, clock, and what is said of them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("telemetry_parser", reason="needs telemetry-parser (rs_localizer[video])")
+
+from rs_localizer.cli import image_input
+from rs_localizer.cli.main import main
+from rs_localizer.cli.map import build
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.messages import stamp_ns
+from rs_localizer.io.telemetry import (
+    Telemetry,
+    TelemetryError,
+    has_telemetry,
+    read_telemetry,
+)
+from rs_localizer.settings import load_params_file
+
+SAMPLES = os.environ.get("RS_LOCALIZER_SAMPLES", "")
+RATE = 200.0
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A log of gyroflow: a camera upright, that turns about the vertical, then about its axis."""
+    lines = [
+        "GYROFLOW IMU LOG", "version,1.3", "id,tester", "orientation,XYZ", "tscale,0.001",
+        "gscale,1", "ascale,1", "frame_readout_time,20.5", "t,gx,gy,gz,ax,ay,az",
+    ]  # fmt: skip
+    for k in range(400):
+        turn = (0.5, 0.0, 0.0) if k < 200 else (0.0, 0.1, 0.3)
+        lines.append(",".join(map(str, (1000 * k / RATE, *turn, 1.0, 0.0, 0.0))))
+    path = tmp_path / "log.gcsv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_readings_are_in_the_axes_of_the_camera(log: Path) -> None:
+    found = read_telemetry(log)
+    assert found is not None
+    assert (found.rate, len(found.times), found.times[0]) == (pytest.approx(RATE), 400, 0.0)
+    assert found.readout_time == pytest.approx(0.0205)
+    assert found.stabilizer == ""
+    # telemetry-parser has x up: gravity pulls along +y of the camera, the table pushes along -y.
+    np.testing.assert_allclose(found.forces[0], [0.0, -9.80665, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found.rates[0], [0.0, -0.5, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found.rates[-1], [-0.1, 0.0, -0.3], atol=1e-9)
+
+
+def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "broken.mp4"
+    path.write_bytes(b"gpmd" + bytes(100))
+    assert has_telemetry(path)
+    with pytest.raises(TelemetryError, match=r"broken\.mp4: its telemetry cannot be read"):
+        read_telemetry(path)
+    path.write_bytes(bytes(2**20))
+    assert not has_telemetry(path)
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """A second of noise at 20 Hz that says that it has telemetry."""
+    path = tmp_path / "ride.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 20.0, (160, 120))
+    noise = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
+    for k in range(20):
+        writer.write(cv2.resize(np.roll(noise, k, 1), (160, 120), interpolation=cv2.INTER_NEAREST))
+    writer.release()
+    with path.open("ab") as file:
+        file.write(b"\0\0\0\x0cfreegpmd")
+    K = [[150, 0, 79.5], [0, 150, 59.5], [0, 0, 1]]
+    (tmp_path / "camera.json").write_text(
+        json.dumps({"K": K, "D": [0, 0, 0, 0], "width": 160, "height": 120})
+    )
+    return path
+
+
+def detect(video: Path, *words: str) -> Path:
+    out = video.parent / "seen"
+    calibration = ["--calibration", str(video.parent / "camera.json")]
+    found = ["detect", str(video), *calibration, "--features", "orb", "--out", str(out)]
+    assert main([*found, "--overwrite", *words]) == 0
+    return out
+
+
+@pytest.fixture
+def telemetry(log: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Gives the video the telemetry of the log, changed."""
+
+    def give(**changes: Any) -> Telemetry:
+        found = read_telemetry(log)
+        assert found is not None
+        changed = replace(found, **changes)
+        monkeypatch.setattr(image_input, "read_telemetry", lambda path: changed)
+        return changed
+
+    return give
+
+
+def test_detect_takes_gyroscope_and_readout_time(
+    video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    telemetry(exposure=0.002)
+    out = detect(video)
+    assert (
+        "gcsv tester: gyroscope at 200 Hz, readout time 20.50 ms, exposure 2.00 ms "
+        "(median); --no-telemetry ignores them\n"
+    ) in capsys.readouterr().out
+    assert load_params_file(out / "parameters.yaml")["readout_time"] == pytest.approx(0.0205)
+    with open_bag(out) as bag:
+        readings = [message for _, _, message in bag.messages(["/imu"])]
+        images = [stamp_ns(message) for _, _, message in bag.messages(["/keypoints"])]
+        frames = {m.header.frame_id for _, _, m in bag.messages(["/camera_info"])}
+    assert {message.header.frame_id for message in readings} == frames
+    stamps = np.array([stamp_ns(message) for message in readings])
+    # The first image is at 1 s of the recording and at 0 of the video, as is the first reading.
+    assert (images[0], stamps[0]) == (10**9, 10**9)
+    np.testing.assert_allclose(np.diff(stamps), 5_000_000, atol=1)
+    assert 190 <= len(stamps) <= 192  # until the last image, at 0.95 s
+    assert readings[0].angular_velocity.y == pytest.approx(-0.5)
+
+
+def test_what_is_given_goes_before(
+    video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    telemetry()
+    out = detect(video, "--readout-time", "0.03")
+    said = capsys.readouterr().out
+    assert "readout time 20.50 ms (not used: 30.00 ms was given)" in said
+    assert load_params_file(out / "parameters.yaml")["readout_time"] == 0.03
+    out = detect(video, "--no-telemetry")
+    assert "gyroscope" not in capsys.readouterr().out
+    with open_bag(out) as bag:
+        assert "/imu" not in bag.topics
+    detect(video, "--rate", "50")  # slowed down: nobody knows when the readings were
+    with open_bag(out) as bag:
+        assert "/imu" not in bag.topics
+
+
+def test_a_stabilized_video_is_named(
+    video: Path, telemetry: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    telemetry(stabilizer="HS HLevel")
+    out = detect(video)
+    assert "has stabilized this video (HS HLevel): its rows are not" in capsys.readouterr().out
+    with open_bag(out) as bag:
+        assert "/imu" not in bag.topics
+    assert not (out / "parameters.yaml").exists()
+
+
+def test_maps_take_the_gyroscope_of_a_video(video: Path, telemetry: Any) -> None:
+    found = telemetry()
+    parser = argparse.ArgumentParser()
+    build.add_arguments(parser)
+    given = parser.parse_args([str(video), "--out", "map"])
+    imu = build.imu_of(given)
+    assert imu is not None
+    assert not imu.asked
+    np.testing.assert_array_equal(imu.recording.camera_from_imu, np.eye(3))
+    np.testing.assert_array_equal(imu.recording.angular_velocities, found.rates)
+    assert imu.recording.stamps_ns[0] == 10**9
+    assert build.shutter_of(given).readout_time == pytest.approx(0.0205)
+    assert build.imu_of(parser.parse_args([str(video), "--out", "map", "--no-telemetry"])) is None
+
+
+@pytest.mark.skipif(not SAMPLES, reason="RS_LOCALIZER_SAMPLES: karma.mp4 and max-heromode.mp4 of "
+                    "gopro/gpmf-parser, which are not ours to give away")  # fmt: skip
+def test_real_videos() -> None:
+    found = read_telemetry(Path(SAMPLES) / "karma.mp4")
+    assert found is not None
+    assert (found.camera, found.stabilizer) == ("GoPro HERO5 Black", "")
+    assert found.rate == pytest.approx(397.5, abs=0.5)
+    np.testing.assert_allclose(np.median(found.forces, axis=0), [0, -9.8, 0], atol=0.25)
+    times, turns = image_turns(Path(SAMPLES) / "karma.mp4")
+    smooth = [np.convolve(column, np.ones(13) / 13, "same") for column in found.rates.T]
+    felt = np.stack([np.interp(times, found.times, column) for column in smooth], axis=1)
+    # Its gimbal leaves a turn about the vertical.
+    assert np.corrcoef(turns[:, 1], felt[:, 1])[0, 1] > 0.95
+    other = read_telemetry(Path(SAMPLES) / "max-heromode.mp4")
+    assert other is not None
+    assert other.readout_time == pytest.approx(0.0206, abs=1e-4)
+    assert other.stabilizer == "HS HLevel"
+
+
+def image_turns(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) between images, and how a camera that only turns would do it there (n,3)."""
+    film, last, times, turns = cv2.VideoCapture(str(path)), None, [], []
+    while True:
+        more, image = film.read()
+        if not more:
+            return np.array(times), np.array(turns)
+        now = 1e-3 * film.get(cv2.CAP_PROP_POS_MSEC)
+        gray = cv2.cvtColor(cv2.resize(image, (480, 270)), cv2.COLOR_BGR2GRAY)
+        if last is not None:
+            points = cv2.goodFeaturesToTrack(last[1], 150, 0.01, 12)
+            moved, kept, _ = cv2.calcOpticalFlowPyrLK(last[1], gray, points, None)
+            before, after = points[kept == 1], moved[kept == 1]
+            focal = 0.65 * 480  # about that of a HERO5
+            x, y = ((before - (240.0, 135.0)) / focal).T
+            rows = np.empty((2 * len(x), 3))
+            rows[0::2] = np.c_[x * y, -(1 + x * x), y]
+            rows[1::2] = np.c_[1 + y * y, -x * y, -x]
+            flow = ((after - before) / focal).ravel()
+            fit = np.ones(len(flow), bool)
+            for _ in range(4):
+                turn = np.linalg.lstsq(rows[fit], flow[fit], rcond=None)[0]
+                errors = np.abs(rows @ turn - flow)
+                fit = errors < 3 * np.median(errors) + 1e-6
+            times.append(0.5 * (now + last[0]))
+            turns.append(turn / (now - last[0]))
+        last = now, gray
