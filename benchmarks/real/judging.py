@@ -19,7 +19,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.core.shutter import project_rolling
-from rs_localizer.core.state import ANGULAR, PARAMETERS, POSE, TURN
+from rs_localizer.core.state import ANGULAR, POSE, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.localizer import Localizer
 from rs_localizer.tracking import Memory, Tracker
@@ -163,7 +163,7 @@ def _halves(
     row: dict[str, float] = {}
     for name in ("single", "tracked"):
         sides = [localized(name, camera, part, config) for part in _parts(images, _sides)]
-        row |= {f"{name}_{key}": x for key, x in _agreement(*sides).items()}
+        row |= {f"{name}_{key}": x for key, x in _agreement(*sides, shared=False).items()}
     parts = _parts(images, lambda image, seed: halved(len(image.points), seed))
     reverse = replace(camera, scan_direction=str(REVERSED[ScanDirection(camera.scan_direction)]))
     cameras = {"single": camera, "tracked": camera, "reversed": reverse, "p3p": camera}
@@ -172,7 +172,8 @@ def _halves(
         for name, by in cameras.items()
     }
     others = localized("tracked", camera, parts[1], config)
-    row["random_turn_claimed"] = _agreement(fits["tracked"], others).get("turn_claimed", math.nan)
+    halves = _agreement(fits["tracked"], others, shared=True)
+    row["random_turn_claimed"] = halves.get("turn_claimed", math.nan)
     errors = {name: _errors(by, fits[name], parts[1]) for name, by in cameras.items()}
     for name in ("single", "tracked", "reversed"):
         low, middle, high = _ratio(errors[name], errors["p3p"])
@@ -231,11 +232,14 @@ def _shutter_gain(clip: Clip) -> dict[str, float]:
     return row
 
 
-def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
+def _agreement(ones: Poses, others: Poses, *, shared: bool) -> dict[str, float]:
     """How two poses of each image agree, and whether their covariances say so.
 
     Poses are compared at the same motion: what the prior says of the velocities is the same
     in both, and would be a part of both regions and of no difference.
+
+    Args:
+        shared: errors of calibration and declared map are the same in both.
     """
     inside, turns, moves = [], [], []
     for one, other in zip(ones, others, strict=True):
@@ -247,7 +251,8 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
                 one.rotation @ (other.position - one.position),
             ]
         )
-        (first, _), (second, gain) = _at_known_motion(one), _at_known_motion(other)
+        first, _ = _at_known_motion(one, shared)
+        second, gain = _at_known_motion(other, shared)
         step = step + gain @ (_motion(one) - _motion(other))
         spread = first + second
         inside.append(step @ np.linalg.solve(spread, step) < _INSIDE)
@@ -264,20 +269,17 @@ def _agreement(ones: Poses, others: Poses) -> dict[str, float]:
 
 
 def _motion(estimate: Estimate) -> Array:
-    """Velocities and accelerations (12,)."""
-    return np.concatenate([
-        estimate.angular_velocity, estimate.linear_velocity,
-        estimate.angular_acceleration, estimate.linear_acceleration,
-    ])  # fmt: skip
+    """Velocities (6,)."""
+    return np.concatenate([estimate.angular_velocity, estimate.linear_velocity])
 
 
-def _at_known_motion(estimate: Estimate) -> tuple[Array, Array]:
-    """Covariance (6,6) of the pose at a given motion, without what all images of a calibration
-    share; and how the pose follows the motion (6,12).
+def _at_known_motion(estimate: Estimate, shared: bool) -> tuple[Array, Array]:
+    """Covariance (6,6) of the pose at given velocities, without what all images of a calibration
+    share if the other pose has that, too; and how the pose follows the velocities (6,6).
     """
-    joint = estimate.joint_covariance[:PARAMETERS, :PARAMETERS]
-    gain = joint[POSE, POSE.stop :] @ np.linalg.inv(joint[POSE.stop :, POSE.stop :])
-    return joint[POSE, POSE] - gain @ joint[POSE.stop :, POSE], gain
+    covariance = estimate.covariance - (estimate.calibration_covariance if shared else 0.0)
+    gain = covariance[POSE, VELOCITIES] @ np.linalg.inv(covariance[VELOCITIES, VELOCITIES])
+    return covariance[POSE, POSE] - gain @ covariance[VELOCITIES, POSE], gain
 
 
 def _errors(camera: Camera, poses: Poses, held_out: Sequence[Observed]) -> Array:

@@ -167,7 +167,8 @@ def build_map(given: Given, work: Workshop) -> Built:
     with work.stage("track", len(given.views)) as step:
         tracked = track_on_map(given.views, structure, camera, lambda: step(1))
     refined, shutter, rows = _refined(given, tracked, structure, camera, work)
-    _check_fit(refined)
+    estimated = None if given.camera is not None else structure.camera.focal_length
+    check_fit(float(np.mean(refined.inliers)), estimated)
     motion = Motion(rows, refined.times, refined)
     shown = motion.sights(tracked.views[tracked.images], tracked.points, tracked.pixels)
     triangulated = triangulate(refined.camera, shown, len(structure.points))
@@ -323,15 +324,27 @@ def _corners(given: Given, stamps_ns: IntArray) -> MapObservations:
     return MapObservations(stamps_ns, images[known], corners[known], pixels[known])
 
 
-def _check_fit(refined: RefinedMap) -> None:
-    """Images too far apart leave the motion between them open, and the map may follow it."""
-    share = float(np.mean(refined.inliers))
-    if share < _LEAST_FIT:
-        raise MappingError(
-            f"after the refinement {100 * share:.0f} % of the keypoints fit the map, "
-            f"{100 * _LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
-            "check the readout time and the calibration"
-        )
+def check_fit(share: float, focal_length: float | None) -> None:
+    """Images too far apart leave the motion between them open, and the map may follow it.
+
+    Args:
+        share: of the keypoints that fit.
+        focal_length: px, that COLMAP found; None: it was given.
+
+    Raises:
+        MappingError: saying what to do.
+    """
+    if share >= _LEAST_FIT:
+        return
+    lens = "" if focal_length is None else (
+        f"; COLMAP found a focal length of {focal_length:.0f} px, which a flat scene does not "
+        "determine: give --calibration, or show more depth"
+    )  # fmt: skip
+    raise MappingError(
+        f"after the refinement {100 * share:.0f} % of the keypoints fit the map, "
+        f"{100 * _LEAST_FIT:.0f} % should: use more images per second, film more slowly, or "
+        f"check the readout time and the calibration{lens}"
+    )
 
 
 def _placement(given: Given, motion: Motion) -> Placement:

@@ -80,3 +80,10 @@ def test_a_model_of_colmap(tmp_path):
     inverse = np.linalg.inv(pose)
     expected = camera.project((inverse[:3, :3] @ points[0] + inverse[:3, 3])[None])[0] + 0.5
     np.testing.assert_allclose(seen, expected, atol=1e-6)
+
+
+def test_coefficients_that_colmap_cannot_say_are_refused(tmp_path):
+    """Twelve were once cut to eight."""
+    camera = Camera(WIDTH, HEIGHT, K, np.full(12, 0.01), "rational_polynomial")
+    with pytest.raises(ValueError, match=r"COLMAP knows 8 coefficients .* the lens has 12"):
+        write_gsplat(tmp_path, camera, ["a"], np.eye(4)[None, None].repeat(3, 1), np.zeros((0, 3)))

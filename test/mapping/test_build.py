@@ -19,8 +19,9 @@ from rs_localizer.evaluation.room_mapping import Errors, Piece, Room, without_re
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.trajectories import read_tum
+from rs_localizer.mapping import MappingError
 from rs_localizer.mapping.anchors import Anchors
-from rs_localizer.mapping.build import Built, Given, Workshop, build_map
+from rs_localizer.mapping.build import Built, Given, Workshop, build_map, check_fit
 from rs_localizer.mapping.colmap import DATABASE, SPARSE, Effort
 from rs_localizer.mapping.gauge import through
 from rs_localizer.mapping.inertial_metres import InertialPlace, inertial_metres
@@ -167,3 +168,14 @@ def test_the_model_of_colmap_can_be_read(built, folder):
     read = read_map_file(folder / SPARSE, "map")
     assert len(read) == len(built.structure.points)
     assert read.descriptors is not None
+
+
+def test_a_map_that_its_images_do_not_fit_is_refused_with_the_lens_that_may_be_why():
+    check_fit(0.81, 207.0)
+    with pytest.raises(
+        MappingError, match=r"64 % of the keypoints .* focal length of 207 px"
+    ) as of:
+        check_fit(0.64, 207.0)
+    assert "--calibration" in str(of.value)
+    with pytest.raises(MappingError, match=r"the readout time and the calibration$"):
+        check_fit(0.64, None)

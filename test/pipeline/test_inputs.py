@@ -7,13 +7,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rs_localizer.config import NodeConfig
+from rs_localizer.core.reasons import Reason
 from rs_localizer.io.bags import BagError
+from rs_localizer.io.clouds import Correspondences, EmptyCloudError
 from rs_localizer.offline.replay import NO_FRAMES, find_topics
 from rs_localizer.pipeline.frames import FrameLocalizer
-from rs_localizer.pipeline.inputs import INPUTS, Role
+from rs_localizer.pipeline.inputs import INPUTS, Input, Role
 from rs_localizer.pipeline.reasons import REASONS
 from rs_localizer.pipeline.refusal import Refusal
 
@@ -83,3 +86,21 @@ def test_what_is_not_there_or_not_clear_is_said():
         find_topics(bag(camera_info=INFO, a=CLOUD), {"correspondences": "/camera_info"})
     with pytest.raises(BagError, match="choose one with --correspondences"):
         find_topics(bag(camera_info=INFO, a=CLOUD, b=CLOUD))
+
+
+def test_a_reader_of_correspondences_is_all_that_frames_of_another_kind_need():
+    def read(message: Any) -> Correspondences:
+        if not message:
+            raise EmptyCloudError("no point")
+        points = np.zeros((1, 3))
+        return Correspondences(0, "map", points, points[:, :2], None, 0, np.zeros(1, "<f8"))
+
+    item = Input(
+        "others", CLOUD, "of a test", Role.FRAMES, refused=Reason.BAD_CLOUD, read=read,
+        use=lambda localizer, cloud: localizer.localize_cloud(cloud),
+    )  # fmt: skip
+    frames = FrameLocalizer(NodeConfig())
+    empty, early = item.take(frames, ""), item.take(frames, "a message")
+    assert isinstance(empty, Refusal)
+    assert isinstance(early, Refusal)
+    assert (empty.reason, early.reason) == (Reason.EMPTY_CLOUD, Reason.NO_CAMERA_INFO)
