@@ -106,3 +106,26 @@ def test_nodes_do_not_know_each_other():
             bad = (used & folders) - ROS_MAY_IMPORT[folder] - {folder}
             wrong += [f"{path.relative_to(PACKAGE.parent)} imports ros.{name}" for name in bad]
     assert wrong == []
+
+
+def test_every_module_has_a_client() -> None:
+    """Imported, or named where it is imported late; commands are found by their names."""
+    texts = {path: path.read_text() for path in PACKAGE.rglob("*.py")}
+    names = {
+        name
+        for path, text in texts.items()
+        for name in imported(text, ".".join(path.relative_to(PACKAGE.parent).parts[:-1]))
+    }
+    launch = [path.read_text() for path in PACKAGE.parent.glob("launch/*.py")]
+    orphans = []
+    for path in texts:
+        module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+        late = (".".join(module.split(".")[-2:]), f'"{path.stem}"', path.name)
+        if path.name.startswith("__") or module.startswith("rs_localizer.cli."):
+            continue
+        if any(f"{name}.".startswith(f"{module}.") for name in names):
+            continue
+        others = [*launch, *(text for where, text in texts.items() if where != path)]
+        if not any(name in text for name in late for text in others):
+            orphans.append(module)
+    assert orphans == []

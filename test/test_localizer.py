@@ -315,3 +315,34 @@ def test_pixels_outside_the_image_are_not_used():
     failure = rsl.Localizer(turned).localize(points[pixels[:, 1] > 800.0], far)
     assert failure.reason == rsl.Reason.TOO_FEW_POINTS
     assert f"{len(far)} lie outside the image of 1280 x 600 pixels" in failure.detail
+
+
+def test_pixels_beyond_the_lens_are_left_out_and_marked():
+    cam = camera(D=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
+    points, pixels, _ = frame(camera(D=np.zeros(0)), Path(0, 0, 0), 40)
+    pixels[0] = (3000.0, 239.5)
+    result = rsl.Localizer(cam, inlier_threshold=500.0).localize(points, pixels)
+    assert result
+    assert not result.inliers[0]
+    assert np.isnan(result.residuals[0])
+    assert np.isfinite(result.residuals[1:]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((np.zeros((4, 2)), np.zeros((4, 2))), r"points must be \(n,3\)"),
+        ((np.zeros((4, 3)), np.zeros((5, 2))), r"got \(4, 3\) and \(5, 2\)"),
+        ((np.zeros((4, 3)), np.full((4, 2), np.nan)), "pixels must be finite"),
+        ((np.full((4, 3), np.inf), np.zeros((4, 2))), "points must be finite"),
+        ((np.zeros((4, 3)), np.zeros((4, 2)), np.zeros(3)), r"scores must be \(4,\), got \(3,\)"),
+    ],
+)
+def test_wrong_arrays_are_refused_with_what_was_found(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        rsl.Localizer(camera()).localize(*arguments)
+
+
+def test_config_and_settings_exclude_each_other():
+    with pytest.raises(ValueError, match="either config or settings, got both: seed"):
+        rsl.Localizer(camera(), rsl.LocalizerConfig(), seed=1)

@@ -11,7 +11,7 @@ from rs_localizer.core.scales import SCALES, Scales
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.prior import Prior
-from rs_localizer.tracking import _followed, _surprise, _Track
+from rs_localizer.tracking import _followed, _innovation, _Track
 
 SCALES_SAID = Scales.nothing()._replace(means=np.full(SCALES, -6.0), precisions=np.ones(SCALES))
 # Radians, metres, per readout and per readout squared.
@@ -63,7 +63,7 @@ def surprises(times, seen=slice(0, 18), frames=400, field=0.0):
         error = rng.multivariate_normal(np.zeros(18), noise)
         if field:
             error += rng.multivariate_normal(np.zeros(18), off)
-        found.append(_surprise(predicted(prior), at(gain @ measured @ (truth + error), joint)))
+        found.append(_innovation(predicted(prior), at(gain @ measured @ (truth + error), joint)))
     return np.array(found)
 
 
@@ -85,9 +85,9 @@ def test_a_map_that_is_off_hardly_surprises(field):
 
 def test_a_frame_that_decides_nothing_does_not_surprise():
     spread = covariance(np.random.default_rng(1))
-    assert _surprise(predicted(spread), at(np.zeros(18), spread)) == pytest.approx(0.0, abs=1e-9)
+    assert _innovation(predicted(spread), at(np.zeros(18), spread)) == pytest.approx(0.0, abs=1e-9)
     # Rounding errors are not divided by the nothing that was expected.
-    assert np.all(_surprise(predicted(spread), at(1e-6 * UNITS, spread)) < 1e-6)
+    assert np.all(_innovation(predicted(spread), at(1e-6 * UNITS, spread)) < 1e-6)
 
 
 TURN = np.r_[0:3, 6:9, 12:15]
@@ -108,17 +108,17 @@ def followed(times_deviation, tracked=True, jolts=1.0, of=None):
 
 
 def test_surprises_raise_what_is_expected_and_calm_lowers_it():
-    assert followed(1.0).jolts == pytest.approx([1.0, 1.0], abs=0.01)
-    assert followed(10.0).jolts == pytest.approx([10.0, 10.0], rel=0.02)
-    assert followed(0.1, jolts=20.0).jolts == pytest.approx([2.0, 2.0], rel=0.02)
+    assert followed(1.0).process_noise_scale == pytest.approx([1.0, 1.0], abs=0.01)
+    assert followed(10.0).process_noise_scale == pytest.approx([10.0, 10.0], rel=0.02)
+    assert followed(0.1, jolts=20.0).process_noise_scale == pytest.approx([2.0, 2.0], rel=0.02)
     # Never below what the configuration says, nor without bound.
-    assert followed(0.0).jolts == pytest.approx([0.3, 0.3])  # a calm camera
-    assert followed(100.0, jolts=9e3).jolts == pytest.approx([1e4, 1e4])
+    assert followed(0.0).process_noise_scale == pytest.approx([0.3, 0.3])  # a calm camera
+    assert followed(100.0, jolts=9e3).process_noise_scale == pytest.approx([1e4, 1e4])
 
 
 @pytest.mark.parametrize(("of", "raised"), [(TURN, 0), (WAY, 1)])
 def test_turns_and_moves_surprise_apart(of, raised):
-    jolts = followed(10.0, of=of).jolts
+    jolts = followed(10.0, of=of).process_noise_scale
     assert jolts[raised] == pytest.approx(10.0, rel=0.02)
     assert jolts[1 - raised] <= 1.0
 
@@ -127,7 +127,7 @@ def test_a_first_frame_is_taken_as_it_is():
     found = at(np.zeros(18), np.eye(18))
     track = _followed(None, None, found, 7)
     assert track.experience.scales is found.scales
-    assert (track.time_ns, track.share, *track.jolts) == (7, 1.0, 1.0, 1.0)
+    assert (track.time_ns, track.share, *track.process_noise_scale) == (7, 1.0, 1.0, 1.0)
 
 
 def test_the_share_of_inliers_follows_tracked_frames_slowly():

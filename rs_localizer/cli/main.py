@@ -103,6 +103,12 @@ COMMANDS = {
         "make a map of a room or of markers; refine, align, convert and describe it",
         "rs_localizer map build walk.mp4 --calibration lens.yaml --params shutter.yaml --out room",
     ),
+    "rectify": Command(
+        "rs_localizer.cli.rectify",
+        "images as a global shutter would have taken them, from the poses of replay",
+        "rs_localizer rectify video.mp4 --calibration lens.yaml --params shutter.yaml "
+        "--poses poses --depth plane --map wall.yaml --out global",
+    ),
     "watch": Command(
         "rs_localizer.cli.watch",
         "how a live localizer is: rate, pose, speeds, deviations, state; refreshed in place",

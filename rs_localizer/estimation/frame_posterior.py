@@ -190,8 +190,11 @@ def _of_points(
     if smooth:
         bend = _bend(observations.points, best.inliers, depth / assumed.focal_length)
         of_map = frame._replace(bend=bend)
-        # A bent map leaves more open: it is left out only where it is far less probable.
-        if declared > 0.0 or _evidence_of(of_map) > _evidence_of(frame) - FAR_LESS_PROBABLE:
+        # Before a plane both explain alike. In depth a bent map leaves more open: it is left out
+        # only where it is far less probable.
+        if declared > 0.0 or (
+            not frame.planar and _evidence_of(of_map) > _evidence_of(frame) - FAR_LESS_PROBABLE
+        ):
             frame = of_map
     shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
     weighed = frame.smooth or frame.planar

@@ -1,8 +1,9 @@
 """Stamps of images: their own, or those of a rate; and what speaks against it."""
 
 import numpy as np
+import pytest
 
-from rs_localizer.io.image_clock import ImageClock, readout_fault
+from rs_localizer.io.image_clock import ImageClock, TimesError, readout_fault
 
 MS = 1_000_000
 # Milliseconds of a phone that leaves images out: 10 images/s on average.
@@ -34,6 +35,23 @@ def test_a_rate_overrides_and_is_compared():
     without = ImageClock(rate=30.0)
     assert without.relative(None) == 10**9
     assert without.fault() is None
+
+
+def test_names_that_are_times():
+    clock = ImageClock()
+    assert [clock.absolute(10**18 + k) for k in (0, 7)] == [10**18, 10**18 + 7]
+    assert "the names of the files" in clock.description()
+    moved = ImageClock(start_ns=3)
+    assert [moved.absolute(10**18 + k) for k in (0, 7)] == [3, 10]
+
+
+@pytest.mark.parametrize("first", [(), (0,)])  # the first of some files has a time, always
+def test_without_times_there_must_be_a_rate(first):
+    clock = ImageClock()
+    for own_ns in first:
+        clock.relative(own_ns)
+    with pytest.raises(TimesError, match="give --rate"):
+        clock.relative(None)
 
 
 def test_a_readout_longer_than_a_period():

@@ -208,3 +208,27 @@ def test_threads_change_nothing_but_the_time(minimal, name, one_rotation):
     for threads in (0, 2, 7, 200):
         for one, many in zip(solve(name, p), solve(name, p, threads=threads), strict=True):
             np.testing.assert_array_equal(one, many)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"points": np.zeros((2, 5, 3))}, r"takes points \(h,6,3\).* got \(2, 5, 3\)"),
+        ({"rays": np.zeros((2, 6, 3))}, r"rays \(h,6,2\)"),
+        ({"tau": np.zeros((1, 6))}, r"tau \(h,6\)"),
+        ({"rotation": np.eye(4)}, r"rotation must be \(3,3\) or \(2,3,3\), got \(4, 4\)"),
+        ({"iterations": 0}, "iterations must be 1 or more, got 0"),
+        ({"threads": -1}, "threads must be 0 .* got -1"),
+    ],
+)
+def test_wrong_input_is_refused_with_what_was_found(changes, said):
+    right = {"points": np.zeros((2, 6, 3)), "rays": np.zeros((2, 6, 2)), "tau": np.zeros((2, 6))}
+    with pytest.raises(ValueError, match=said):
+        solve_minimal("r6p_vcwt", **(right | changes))
+
+
+@pytest.mark.parametrize("name", list(SOLVERS))
+def test_no_samples_give_no_solutions(name):
+    n, k = find_solver(name).sample_size, find_solver(name).solutions
+    found = solve_minimal(name, np.zeros((0, n, 3)), np.zeros((0, n, 2)), np.zeros((0, n)))
+    assert [part.shape for part in found] == [(0, k, 3, 3), (0, k, 3), (0, k, 3), (0, k, 3)]

@@ -18,7 +18,7 @@ from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
 from rs_localizer.io.outputs import TYPES, Localized, each_message
-from rs_localizer.pipeline.compiling import is_compiled
+from rs_localizer.pipeline.compiling import compile_in_child, is_compiled
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.pipeline.inputs import INPUTS, Input, Role
 from rs_localizer.pipeline.refusal import Refusal
@@ -195,6 +195,7 @@ def described(landmarks: Map) -> str:
 def warm_up(frames: FrameLocalizer) -> float:
     """Compile all kernels that the settings need; how many seconds it took."""
     started = time.monotonic()
+    compile_in_child(frames.config.solver)
     frames.warm_up()
     return time.monotonic() - started
 
