@@ -79,9 +79,10 @@ _NARROW_SPACING = 0.025
 # way that knots cannot follow: by so many times the noise, and beyond the chance (so many standard
 # deviations) of its points. Where so much of the frames is, the motion between them is none.
 _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
-# So is one whose own in-frame turn moves its points by more than this part of its residual: one of
-# six numbers that fits the noise of n points moves them by sqrt(6 / 2n) of it, a third for n = 30.
-_IN_FRAME = 0.5
+# So is one whose own in-frame turn moves its points by more than its residual. Of a hand, 64 points
+# at 1 px, in-frame turns move them by 0 to 0.55 of it (99 of 100 frames by less than 0.5), of 0.3
+# deg at 60 Hz by 1.3 to 5.4.
+_IN_FRAME = 1.0
 _ROWS = np.linspace(-0.5, 0.5, 17)
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
