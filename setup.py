@@ -78,14 +78,16 @@ setup(
         "hloc": ["h5py"],
         "mapping": ["pycolmap"],
         "table": ["fsspec", "pyarrow"],
-        "video": ["telemetry-parser"],
+        # There is no wheel for 3.13, and a build needs Rust.
+        "video": ["telemetry-parser; python_version < '3.13'"],
         "view": ["rerun-sdk"],
         "test": [
             "build",
             "catkin_pkg",
             "codespell==2.4.*",
             "hypothesis",
-            "pupil-apriltags",  # the detector of AprilRobotics, for what it publishes
+            # AprilRobotics' detector, for what it publishes; elsewhere its build needs CMake.
+            "pupil-apriltags; platform_machine == 'x86_64'",
             "mypy==2.4.*",  # pinned, as is Ruff: what passes today passes with the next release
             "pytest",
             "pytest-timeout",

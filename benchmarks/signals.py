@@ -87,7 +87,7 @@ def _run(name: str, folder: Path, number: int | None, delay: float) -> _Result:
         if number is not None:
             time.sleep(delay)
             process.send_signal(number)
-        _, errors = process.communicate(timeout=600)
+        _, errors = process.communicate(timeout=3600)  # of a busy machine
         files = sorted(str(path.relative_to(work)) for path in set(work.rglob("*")) - before)
         return _Result(process.returncode, time.monotonic() - start, errors, tuple(files))
     finally:

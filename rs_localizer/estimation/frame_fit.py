@@ -296,9 +296,10 @@ def with_scales(
     right = np.empty(size)
     for i in range(size):
         matrix[i, i] *= _RIDGE
-        right[i] = normal.with_errors[i] / variance - slope[i]
+        total = normal.with_errors[i] / variance - slope[i]
         for k in range(q):
-            right[i] += matrix[i, PARAMETERS + k] * coefficients[k]
+            total += matrix[i, PARAMETERS + k] * coefficients[k]
+        right[i] = total
     of_motion, scale_of_motion, determined = half_inverse(matrix[:PARAMETERS, :PARAMETERS].copy())
     for i in range(PARAMETERS):
         for j in range(i + 1):
@@ -324,16 +325,14 @@ def with_scales(
             _extrapolate(step, before)
         scales, before = scales + step, step
     covariance, values = _joint(of_motion, beside, half, unit, active, right, best)
-    volume = _volume(of_motion, half, unit)
-    change, cost = values.copy(), 0.0
+    logarithms = scales[groups]
+    volume = _volume(of_motion, half, unit) - 2.0 * np.sum(logarithms[active])
+    cost = np.sum(values[PARAMETERS:] ** 2 * np.exp(-2.0 * logarithms))
+    change = values.copy()
+    change[PARAMETERS:] -= coefficients
     for k in range(q):
-        change[PARAMETERS + k] -= coefficients[k]
-        precision = math.exp(-2.0 * scales[groups[k]])
-        cost += values[PARAMETERS + k] ** 2 * precision
         if covariance[PARAMETERS + k, PARAMETERS + k] == 0.0:  # not active: as the prior has it
-            covariance[PARAMETERS + k, PARAMETERS + k] = 1.0 / precision
-        else:
-            volume -= 2.0 * scales[groups[k]]
+            covariance[PARAMETERS + k, PARAMETERS + k] = math.exp(2.0 * logarithms[k])
     left, used = _left(normal, change, covariance)
     freedom = max(equations - used / variance, 1.0)
     if not (determined and positive):
@@ -413,10 +412,12 @@ def _joint(
     inverse, pull = squared(half, unit), np.zeros((PARAMETERS, count))
     whitened = np.zeros(PARAMETERS)
     for a in range(PARAMETERS):
+        total = 0.0
         for b in range(a + 1):
-            whitened[a] += of_motion[a, b] * right[b]
+            total += of_motion[a, b] * right[b]
         for k in range(count):
-            whitened[a] -= beside[a, active[k]] * best[active[k]]
+            total -= beside[a, active[k]] * best[active[k]]
+        whitened[a] = total
     for a in range(PARAMETERS):
         for b in range(a + 1):
             values[b] += of_motion[a, b] * whitened[a]
@@ -425,10 +426,12 @@ def _joint(
     pulled = _multiplied(pull, inverse)
     for i in range(PARAMETERS):
         for j in range(PARAMETERS):
+            total = 0.0
             for a in range(max(i, j), PARAMETERS):
-                covariance[i, j] += of_motion[a, i] * of_motion[a, j]
+                total += of_motion[a, i] * of_motion[a, j]
             for k in range(count):
-                covariance[i, j] += pulled[i, k] * pull[j, k]
+                total += pulled[i, k] * pull[j, k]
+            covariance[i, j] = total
         for k in range(count):
             covariance[i, PARAMETERS + active[k]] = pulled[i, k]
             covariance[PARAMETERS + active[k], i] = pulled[i, k]
@@ -520,15 +523,14 @@ def _slope_of_scales(
     """Fill in the slope (15,) of the log evidence by each log-scale: squares in deviations, less
     how many coefficients of each scale the points decide (MacKay's gamma), filled in, too.
     """
-    decided[:], uphill[:] = 0.0, 0.0
-    for k in active:
-        g = groups[k]
-        precision = math.exp(-2.0 * scales[g])
-        uphill[g] += best[k] * best[k] * precision
-        decided[g] += 1.0 - spread[k] * precision
     for g in range(SCALES):
-        decided[g] = max(decided[g], 0.0)
-        uphill[g] -= decided[g]
+        precision, squares, known = math.exp(-2.0 * scales[g]), 0.0, 0.0
+        for k in active:
+            if groups[k] == g:
+                squares += best[k] * best[k] * precision
+                known += 1.0 - spread[k] * precision
+        decided[g] = max(known, 0.0)
+        uphill[g] = squares - decided[g]
 
 
 @inlined

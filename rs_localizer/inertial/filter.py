@@ -285,11 +285,28 @@ class GyroscopeFilter:
             readouts: from middle row to middle row.
             fading: of accelerations, in readouts.
         """
+        if not self._fits(covariance):
+            self.forget_motion()
         later, predicted, with_parameters = _carried(
             numbers_of(motion), covariance, self._with_motion, self.errors.covariance,
             between.numbers, within.numbers, float(readouts), float(fading),
         )  # fmt: skip
         return Predicted(motion_of(later), predicted, with_parameters)
+
+    def _fits(self, covariance: Array) -> bool:
+        """Whether what ties parameters and motion can stand beside this covariance of the motion.
+
+        Where the tracker has put another one in the place of that of the update, as of rest, a
+        smaller one would make the prediction indefinite, or a variance of the parameters negative.
+        """
+        with_motion = self._with_motion
+        joint = np.block([[covariance, with_motion], [with_motion.T, self.errors.covariance]])
+        scale = np.sqrt(joint.diagonal())
+        try:
+            np.linalg.cholesky(joint / np.outer(scale, scale))
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
     def update(self, predicted: Predicted, step: Array, posterior: Array) -> bool:
         """Take in a frame that was found near its prediction.

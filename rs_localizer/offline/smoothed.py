@@ -31,7 +31,7 @@ class SmoothedFrames:
     frames: list[Localized]
     bridged: IntArray  # (b,) ns, stamps of those without an image of their own
     undetermined: int  # moments that neighbours do not determine
-    shaken: int  # images that shake faster than a smooth motion, and keep their own poses
+    shaken: int  # images that no smooth motion follows, as they shake: they keep their own poses
 
 
 class _Window(NamedTuple):
@@ -160,7 +160,7 @@ def _smoothed(
     for k, estimate in enumerate(sampled.estimates):
         stamp = int(inputs[k])
         own = once.get(stamp)
-        if own is not None and stamp in own_poses:
+        if own is not None and (stamp in own_poses or not sampled.determined[k]):
             result.append(own)
             kept[k], shaken = True, shaken + 1
             continue

@@ -9,6 +9,7 @@ keypoints do not tell; and their squares are the sum of as many numbers only as 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,16 +18,19 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.shake import shake_at
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.motion_model import FADING
+from rs_localizer.inertial.settings import SCALE_DEVIATION
+from rs_localizer.inertial.turning import MOST_ROUGH
 from rs_localizer.trajectory.fit import Fit, cheaper, fit
 from rs_localizer.trajectory.model import Freedom, Observations, start_state
 from rs_localizer.trajectory.normal_kernels import changes
 from rs_localizer.trajectory.observe import Observed, collect
 from rs_localizer.trajectory.problem import LIMIT
 from rs_localizer.trajectory.sight_kernels import Curve
-from rs_localizer.trajectory.spline import LONGEST_SPACING, first_spline, refined
+from rs_localizer.trajectory.spline import LONGEST_SPACING, States, first_spline, refined
 
 # What is known beforehand: as much as so many numbers of this size (rad/s^2, m/s^2) would tell. A
 # few images that happen to lie on a line say nothing of those that follow.
@@ -75,8 +79,114 @@ _NARROW_SPACING = 0.025
 # way that knots cannot follow: by so many times the noise, and beyond the chance (so many standard
 # deviations) of its points. Where so much of the frames is, the motion between them is none.
 _SHAKEN, _SHAKEN_SIGMAS, _MOST_SHAKEN = 1.5, 5.0, 0.2
+# So are frames whose own in-frame turns move their points by more than their residual, as most of
+# those next to them do: of a hand, 65 points at 1 px, at most one in twenty does by chance, of 0.3
+# deg at 60 Hz all do, by 1.3 to 5.4 times.
+_IN_FRAME, _NEXT = 1.0, 9
+_ROWS = np.linspace(-0.5, 0.5, 17)
 # The expected accelerations are settled when they change by less than this part.
 _ALIKE, _ROUNDS = 0.05, 6
+
+
+# The gyroscopes' rates are taken at these steps (s), and what is slower than some 3 Hz is left to
+# the knots (a Gaussian's deviation, s): with 16, 50 and 100 ms smoothed orientations were off by
+# 0.042, 0.041, 0.041 deg and rates by 1.24, 1.15, 1.11 deg/s (tum_vi_room5 from 20 s on, 6 s,
+# 0.3 deg at 60 Hz); the longer it is, the more a wrong scale of the gyroscope counts.
+_STEP, _SLOW = 0.001, 0.05
+# Of the first images, which do not know the offset of the IMU's stamps as well as the others do
+# (standard deviations by the median), the rates are left out.
+_MOST_DELAY = 3.0
+# Rates may be missing for so long (s), a quarter of a period of 50 Hz, and in so much of the time.
+_LONGEST_LACK, _MOST_LACKING = 0.005, 0.2
+# Turns that move image points by less than this part of their noise are not worth it.
+_LEAST_SHARE = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FastTurn:
+    """The fast part of a camera's turn, as gyroscopes know it, beside which the motion is smooth.
+
+    ``rotation = smooth_rotation turn(t)``: of the rates ``w`` and the slow ones ``s`` among them
+    ``turn' = turn [w]x - [s]x turn``.
+    """
+
+    # Cubic splines, of the times (m,) and the order of a derivative.
+    turns: Callable[..., Array]  # (m,3) rotation vectors
+    rates: Callable[..., Array]  # (m,6) rad/s: all, and the slow ones
+    covered: BoolArray  # (f,) frames whose rates it has
+    vibrates: bool  # most of these frames turn in a way that no smooth motion follows
+    times: Array  # (f,) s, of the frames' middle rows
+    delays: Array  # (f,) s, standard deviations of their rates' times
+    rate_noise: float  # rad/s, of a rate at one moment
+    turn_noise: float  # rad, that it leaves in the turn
+
+    def rotations(self, times: Array) -> Array:
+        """Turns (m,3,3) at times (m,): from the camera's axes to those of the smooth motion."""
+        rotations: Array = so3.exp_many(np.ascontiguousarray(self.turns(times)))
+        return rotations
+
+    def angular(self, times: Array, rotations: Array, smooth: Array) -> Array:
+        """Body rates (m,3), rad/s, of the camera beside those of the smooth motion."""
+        rates = self.rates(times)
+        beside: Array = np.einsum("nji,nj->ni", rotations, smooth - rates[:, 3:]) + rates[:, :3]
+        return beside
+
+    def variances(self, times: Array) -> tuple[Array, Array]:
+        """Variances (m,3) of turn (rad^2) and rate (rad^2/s^2) by what gyroscopes are off by."""
+        turn, rate, change = (self.turns(times, order) for order in (0, 1, 2))
+        delay = np.interp(times, self.times, self.delays)[:, None]
+        return (
+            (delay * rate) ** 2 + (SCALE_DEVIATION * turn) ** 2 + self.turn_noise**2,
+            (delay * change) ** 2 + (SCALE_DEVIATION * rate) ** 2 + self.rate_noise**2,
+        )
+
+
+def fast_turn(times: Array, estimates: list[Estimate], readout_time: float) -> FastTurn | None:
+    """The fast part of the turns that gyroscopes know of frames at times (f,), s, of their middle
+    rows; None: too few of the frames have one, or frames lie too far apart.
+    """
+    # These take a third of a second, which programs that smooth nothing do not wait for.
+    from scipy.interpolate import CubicSpline
+    from scipy.ndimage import gaussian_filter1d
+
+    grid = np.arange(times[0] - readout_time, times[-1] + readout_time, _STEP)
+    nearest = np.clip(np.searchsorted(0.5 * (times[1:] + times[:-1]), grid), 0, len(times) - 1)
+    tau = (grid - times[nearest]) / readout_time
+    rates = np.full((len(grid), 3), np.nan)
+    delays = np.array([np.inf if one.turn is None else one.turn.delay for one in estimates])
+    covered = delays <= _MOST_DELAY * np.median(delays)
+    known = [(k, one.turn) for k, one in enumerate(estimates) if covered[k] and one.turn]
+    edges = np.searchsorted(nearest, np.arange(len(times) + 1))
+    for k, turn in known:
+        own = np.arange(edges[k], edges[k + 1])
+        own = own[(tau[own] >= turn.tau[0]) & (tau[own] <= turn.tau[-1])]
+        rates[own] = turn.at_rows(tau[own])[1] / readout_time
+    there = np.flatnonzero(np.isfinite(rates[:, 0]))
+    if len(there) < 2:
+        return None
+    lacks = np.diff(there) * _STEP
+    if lacks[lacks > _LONGEST_LACK].sum() > _MOST_LACKING * (grid[-1] - grid[0]):
+        return None
+    rates = np.column_stack([np.interp(grid, grid[there], rates[there, k]) for k in range(3)])
+    slow = gaussian_filter1d(rates, _SLOW / _STEP, axis=0, mode="nearest")
+    middles = [so3.exp_many(0.5 * _STEP * (r[1:] + r[:-1])) for r in (rates, slow)]
+    turns = np.empty((len(grid), 3, 3))
+    turns[0] = np.eye(3)
+    for k, (fast, back) in enumerate(zip(middles[0], middles[1], strict=True)):
+        turns[k + 1] = back.T @ turns[k] @ fast
+    vectors = np.array([so3.log(turn) for turn in turns])
+    noise = np.median([turn.rate_noise for _, turn in known])
+    period = readout_time * np.median([np.median(np.diff(turn.tau)) for _, turn in known])
+    return FastTurn(
+        CubicSpline(grid, vectors),
+        CubicSpline(grid, np.hstack([rates, slow])),
+        covered,
+        bool(np.median([turn.roughness for _, turn in known]) > MOST_ROUGH),
+        times[covered],
+        readout_time * delays[covered],
+        float(noise / readout_time),
+        float(noise / readout_time * np.sqrt(period * _SLOW)),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +208,7 @@ class Smoothed:
     times: Array  # (f,) s since then, of the images' middle rows
     # (f,) images that shake faster than the motion: their own estimates are better.
     shaken: BoolArray
+    fast: FastTurn | None = None  # beside which the fit is
 
     def sample(self, stamps_ns: IntArray) -> Sampled:
         """The camera's motion at times (m,) in ns."""
@@ -123,22 +234,35 @@ class Smoothed:
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         return self.times[after] - self.times[after - 1]
 
+    def _states(self, times: Array) -> tuple[States, Array]:
+        """Motion of the camera at times (m,), and turns (m,3,3) beside which it is smooth."""
+        states = self.fit.state.spline.states(times)
+        if self.fast is None:
+            return states, np.broadcast_to(np.eye(3), states.rotations.shape)
+        turns = self.fast.rotations(times)
+        angular = self.fast.angular(times, turns, states.angular)
+        return states._replace(rotations=states.rotations @ turns, angular=angular), turns
+
     def _in_camera(self, times: Array) -> Array:
         """Covariances (m,12,12) in the order and the axes of ``Estimate.covariance``, SI."""
-        states = self.fit.state.spline.states(times)
-        back = np.swapaxes(states.rotations, 1, 2)
+        states, turns = self._states(times)
+        back, beside = np.swapaxes(states.rotations, 1, 2), np.swapaxes(turns, 1, 2)
         velocities = np.einsum("nij,nj->ni", back, states.linear)
         to_camera = np.zeros((len(times), 12, 12))
-        to_camera[:, :3, :3] = to_camera[:, 6:9, 6:9] = np.eye(3)
+        to_camera[:, :3, :3] = to_camera[:, 6:9, 6:9] = beside
         to_camera[:, 3:6, 3:6] = to_camera[:, 9:, 9:] = back
-        to_camera[:, 9:, :3] = so3.hat(velocities)
+        to_camera[:, 9:, :3] = so3.hat(velocities) @ beside
         covariances: Array = (
             to_camera @ self.fit.state_covariances(times) @ np.swapaxes(to_camera, 1, 2)
         )
+        if self.fast is not None:
+            for first, added in zip((0, 6), self.fast.variances(times), strict=True):
+                at = np.arange(first, first + 3)
+                covariances[:, at, at] += added
         return covariances
 
     def _estimates(self, times: Array, covariances: Array) -> list[Estimate]:
-        states = self.fit.state.spline.states(times)
+        states, _ = self._states(times)
         scale = np.repeat([1.0, self.readout_time], 6)
         empty = np.zeros(0)
         # At a moment of its own nothing asks for accelerations.
@@ -200,8 +324,18 @@ def smooth(
     interval = float(np.median(np.diff(posed.times))) if len(posed.times) > 1 else 1.0
     fading = FADING if interval < 0.5 * FADING else 0.0
     spacing = min(_NARROW_SPACING if fading else LONGEST_SPACING, interval)
-    spline = first_spline(posed.times, posed.rotations, posed.positions, spacing, readout_time)
-    seen = seen.subset(spline.layout.inside(seen.times))
+    fast = fast_turn(posed.times, estimates, readout_time)
+    rotations = posed.rotations
+    if fast is not None:
+        turned = _turned_pixels(camera, seen, fast, readout_time)
+        moved = float(np.median(np.hypot(*(turned - seen.pixels).T)))
+        if moved < _LEAST_SHARE * np.median([one.residual_rms for one in estimates]):
+            fast = None
+        else:
+            seen = replace(seen, pixels=turned)
+            rotations = rotations @ np.swapaxes(fast.rotations(posed.times), 1, 2)
+    spline = first_spline(posed.times, rotations, posed.positions, spacing, readout_time)
+    seen = seen.subset(spline.layout.inside(seen.times) & np.isfinite(seen.pixels[:, 0]))
     state = start_state(camera, seen, spline, readout_time)
     found = _lively(
         camera, seen, fit(camera, seen, state, Freedom(readout_time=False, fading=fading))
@@ -210,8 +344,22 @@ def smooth(
     finer = _lively(camera, seen, fit(camera, seen, halved, found.freedom, found.deviation))
     more = np.sum(told(finer).numbers) - np.sum(told(found).numbers)
     best = finer if cheaper(finer, found, float(more)) else found
-    shaken = _shaken(best, seen, estimates)
-    return Smoothed(best, readout_time, posed.start_ns, posed.times, shaken)
+    shaken = _shaken(best, seen, estimates) | _turns_in_frame(camera, estimates)
+    counted = shaken if fast is None else shaken[fast.covered]
+    if counted.mean() > _MOST_SHAKEN:
+        shaken[:] = True
+    elif fast is not None and fast.vibrates:  # few images beside each other may look smooth
+        shaken |= ~fast.covered
+    return Smoothed(best, readout_time, posed.start_ns, posed.times, shaken, fast)
+
+
+def _turned_pixels(
+    camera: Camera, seen: Observations, fast: FastTurn, readout_time: float
+) -> Array:
+    """Where the pixels (n,2) would be without the fast turn; NaN where no image point is."""
+    rays = np.column_stack([camera.rays(seen.pixels), np.ones(len(seen.pixels))])
+    turns = fast.rotations(seen.times + readout_time * seen.row_times)
+    return camera.project(np.einsum("nij,nj->ni", turns, rays))
 
 
 def _shaken(found: Fit, seen: Observations, estimates: list[Estimate]) -> BoolArray:
@@ -224,8 +372,19 @@ def _shaken(found: Fit, seen: Observations, estimates: list[Estimate]) -> BoolAr
     # An estimate's errors are those of two coordinates, less what it took to fit them.
     left = np.maximum(1.0 - PARAMETERS / np.maximum(2 * count, 1), 0.1)
     limit = np.maximum(_SHAKEN**2, 1.0 + _SHAKEN_SIGMAS / np.sqrt(np.maximum(count, 1)))
-    shaken = np.asarray((count > 0) & (off > limit * own / left), np.bool_)
-    return np.ones_like(shaken) if shaken.mean() > _MOST_SHAKEN else shaken
+    return np.asarray((count > 0) & (off > limit * own / left), np.bool_)
+
+
+def _turns_in_frame(camera: Camera, estimates: list[Estimate]) -> BoolArray:
+    """Which images (f,) turn within their exposure in a way that knots follow only in part."""
+    turns = [
+        shake_at(_ROWS, one.shake)[:, :3] if len(one.shake) else np.zeros(3) for one in estimates
+    ]
+    moved = camera.focal_length * np.array([np.sqrt(np.mean(3.0 * turn**2)) for turn in turns])
+    turning = moved > _IN_FRAME * np.array([one.residual_rms for one in estimates])
+    around = np.ones(min(_NEXT, len(turning)))
+    near, count = (np.convolve(of, around, "same") for of in (turning, np.ones(len(turning))))
+    return np.asarray(turning & (near > 0.5 * count))
 
 
 def _lively(camera: Camera, seen: Observations, found: Fit) -> Fit:

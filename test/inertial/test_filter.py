@@ -1,10 +1,13 @@
 """The filter of bias and offset: as the whole Kalman filter, of motion and parameters at once."""
 
 import numpy as np
+import pytest
 
 from rs_localizer.core.shutter import Motion
 from rs_localizer.inertial.filter import GyroscopeFilter, Predicted
+from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
+from rs_localizer.inertial.turning import turn_between, turn_within
 
 STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
 
@@ -52,3 +55,22 @@ def test_an_offset_that_is_given_stays():
     assert gyroscope.errors.time_offset == 0.0
     gyroscope.walk(10.0)
     assert gyroscope.errors.covariance[3, 3] < 2e-8
+
+
+@pytest.mark.parametrize("smaller", [1e-9, 1e-4, 0.5, 1.0])
+def test_a_smaller_covariance_of_the_motion_leaves_all_definite(smaller):
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(22, 22)) / np.r_[np.full(18, 1.0), 30.0, 30.0, 30.0, 1e3][:, None]
+    joint = root @ root.T
+    gyroscope = GyroscopeFilter(InertialSettings(1e-4, 1e-4, True))
+    gyroscope._set(np.zeros(4), joint[18:, 18:])
+    gyroscope._with_motion = joint[:18, 18:].copy()
+    times = np.arange(-60, 30) * 2_000_000
+    samples = ImuSamples(times, rng.normal(size=(len(times), 3)))
+    within = turn_within(samples, 0, 0.02, gyroscope.errors)
+    between = turn_between(samples, -30_000_000, 0, gyroscope.errors)
+    predicted = gyroscope.predict(STILL, smaller * joint[:18, :18], between, within, 1.5, 5.0)
+    scale = np.sqrt(np.diag(predicted.covariance))
+    assert np.linalg.eigvalsh(predicted.covariance / np.outer(scale, scale)).min() > 0.0
+    gyroscope.update(predicted, np.zeros(18), 0.5 * predicted.covariance)
+    assert np.all(np.diag(gyroscope.errors.covariance) > 0.0)
