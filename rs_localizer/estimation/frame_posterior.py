@@ -205,13 +205,15 @@ def _of_points(
         posterior, evidence = replace(best, covariance=covariance), -math.inf
         if shaken is not None:
             evidence = _evidence_of(frame)
+    # A smooth error that is fitted explains the same errors: both together would count them twice.
+    of_vibration = min(vibration.log_evidence, 0.0 if smooth else math.inf)
     if shaken is not None:
         fitted, evidence_of_shaking = shaken
         # Scales at their most probable values say less than those that are integrated.
-        of_one = evidence + vibration.log_evidence
+        of_one = -math.inf if smooth else evidence + of_vibration
         posterior = _either(posterior, evidence, fitted, max(evidence_of_shaking, of_one))
     elif assumed.rolling and assumed.turn is None:
-        odds = TEMPER * vibration.log_evidence - _HIDDEN_ODDS
+        odds = TEMPER * of_vibration - _HIDDEN_ODDS
         may_shake = 1.0 / (1.0 + math.exp(-min(odds, 700.0)))
         posterior = replace(posterior, undetected=may_shake * vibration.covariance)
     return replace(posterior, scales=posterior.scales._replace(excess=excess))
