@@ -1,3 +1,6 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+#
 # make demo   the whole thing on the bundled recording: a table on the screen, pictures in out/
 # make test   lint, types and tests
 # make bench  the statistical tests, which take longer: coverage of regions, verdicts of experiments
@@ -69,6 +72,7 @@ lint: $(ready)
 	@$(python) -m ruff check --quiet --output-format concise .
 	@$(python) -m ruff format --quiet --check .
 	@$(python) -m codespell_lib
+	@$(python) .ci/notices.py
 	@$(python) -m mypy --no-error-summary
 
 $(ready): setup.py pyproject.toml Makefile

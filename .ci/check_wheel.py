@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Looks into a wheel: what has to be in it, what must not be, and nothing of anybody else's.
 
 check_wheel.py path/to/rs_localizer-*.whl

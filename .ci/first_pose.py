@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The first pose of a process, and how long it took.
 
 With ``-W error::RuntimeWarning`` and a cache that cannot be written it fails if it compiles.

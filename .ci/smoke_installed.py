@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Starts the installed `localizer`, publishes a rolling-shutter motion, compares with the truth.
 
     smoke_installed.py path/to/lib/rs_localizer/localizer

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks NAME``: the paper's experiments and ours, with a verdict on every claim.
 
 This is the only place that names them all.

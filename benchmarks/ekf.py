@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The extended Kalman filter of robot_localization, to see what it makes of our outputs.
 
 T. Moore, D. Stouch, "A Generalized Extended Kalman Filter Implementation for the Robot Operating

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Both live nodes in processes of their own: images go out, answers come in."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What frames cost, from message to result, and what the slow ones do, without ROS:
 ``python -m benchmarks.frame_times``.
 

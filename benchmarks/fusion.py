@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a filter downstream may be fed with: ``python -m benchmarks.fusion``.
 
 Simulated flights through the localizer, with and without tracking, and its poses and twists through

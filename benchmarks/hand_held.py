@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A hand-held camera in a room, as the measurements of time take it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every image of a rendered recording through both live nodes, held against replay's result.
 
     python -m benchmarks.image_flight flight poses -p pose_time:=mid_frame

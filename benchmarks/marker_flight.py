@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How well markers were detected and frames localized along a rendered flight, by its truth:
 
     rs_localizer simulate flight --images --trajectory tum_vi_room5 --exposure 0.005 --grey-noise 2

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where the time of a frame goes: ``python -m benchmarks.profiling``.
 
 200 points, half of them outliers, 10 degrees and 0.1 m per readout, default settings.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.signals``: commands that get signals at random moments.
 
 Each ends as the signal says or has finished; nothing stays under a final name that is not whole,

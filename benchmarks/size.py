@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.size``: how large the package is, and how much of it one frame needs.
 
 Numbers of lines and modules are shadows of how hard a house is to know; the table is for notes

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.start``: what a start of the node costs, beside a plain rclpy node.
 
 Resident memory and time until the node is active, with an empty cache of kernels and a warm one.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Sphinx builds README and the pages as they are: ``make docs``, or rosdoc2 (rosdoc2.yaml)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Writes the pages that repeat code: the reference of the library, and the reasons of refusals.
 
     python docs/make_api.py

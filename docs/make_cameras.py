@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Writes a page of each camera whose readout time is known, and all of them as JSON.
 
     python docs/make_cameras.py [FOLDER]

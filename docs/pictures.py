@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Draws the pictures of the pages: ``python docs/pictures.py`` writes the SVG files beside it.
 
 Plain text, so that a change shows in a diff and a test can compare every byte.

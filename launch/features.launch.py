@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From a camera to poses in a map of landmarks: camera driver, feature detector, localizer.
 
 ros2 launch rs_localizer features.launch.py camera:=v4l2_camera map_file:=$PWD/map.npz \

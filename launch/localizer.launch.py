@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Start the node of one camera.
 
 ros2 launch rs_localizer localizer.launch.py namespace:=front params_file:=front.yaml

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Start the nodes of two cameras, each in its own namespace.
 
 ros2 launch rs_localizer two_cameras.launch.py left:=front right:=rear left_params_file:=front.yaml

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Compiles the kernels for kinds of CPUs into the package, for a wheel whose users do not wait.
 
     python packaging/compile_kernels.py [--cpu x86-64-v3] ... [--solver r6p_vcwt] ...

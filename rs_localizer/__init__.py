@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rolling-shutter absolute pose: the camera's pose and velocities from 2D-3D correspondences."""
 
 import importlib

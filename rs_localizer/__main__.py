@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m rs_localizer`` and the executable: takes signals in hand, then imports the rest."""
 
 # PYTHON_ARGCOMPLETE_OK

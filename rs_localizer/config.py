@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every setting of the package and its default; nothing else in the package repeats one.
 
 The node declares its ROS parameters by walking these classes, so the names, descriptions and

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The method: from 2D-3D correspondences of one frame to a pose and its velocities."""
 
 from __future__ import annotations

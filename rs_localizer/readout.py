@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What others know of a camera's readout time, and how their conventions become ours.
 
 Ours: ``readout_time`` runs from the first row to the last, ``height - 1`` line times;

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The settings of :mod:`rs_localizer.config` by their dotted names, as ROS parameters have them.
 
 The node declares them, and a params file or ``-p name:=value`` of a command sets them.

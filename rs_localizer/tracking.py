@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From frame to frame: the last motion predicts the next, and its prior makes the next better.
 
 A single image sees the camera's velocity only through the shutter, and the linear part badly; two

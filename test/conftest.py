@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Messages for the tests, written from the definitions of ROS and not by the package's code."""
 
 import struct

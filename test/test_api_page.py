@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The reference of the library is that of the code, and lists all public names."""
 
 import importlib.util

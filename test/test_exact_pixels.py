@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pixels without noise, as a simulator sends them: what the motion model misses refuses nothing."""
 
 import numpy as np

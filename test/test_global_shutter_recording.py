@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The bundled recording of a real global shutter: nothing moves within its images."""
 
 from itertools import pairwise

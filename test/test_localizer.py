@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The whole method on simulated frames whose truth comes from elsewhere: SciPy's rotations, and a
 root finder that looks for the row which sees a point."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The package as ROS, colcon and pip see it: description, versions, content, import rule."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The recipes for other package systems name what setup.py and package.xml name."""
 
 import json

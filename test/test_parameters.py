@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """No function takes more than six parameters: what travels together has a name."""
 
 import ast

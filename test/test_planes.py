@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Planes, which a single rolling-shutter image hardly determines: the estimate must be the minimum
 of the exact problem, where each point is seen by its own row, and no collapsed motion may pass."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Predictions by themselves: how motions and errors are carried on, and what comes in between."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Laws that hold for any input: what is written is read, what is refused is said."""
 
 import tempfile

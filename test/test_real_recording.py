@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The bundled webcam recording: does a real shutter do what the model says, sign and all?"""
 
 import numpy as np

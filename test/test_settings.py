@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Settings by dotted name: the shipped params file, ROS 2 params files, assignments."""
 
 from pathlib import Path

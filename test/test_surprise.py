@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the tracker learns of a frame, against a Kalman filter that is known to be right."""
 
 from dataclasses import replace

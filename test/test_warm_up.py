@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """After warming up no frame waits for the compiler, and what is no camera is said to be none."""
 
 import subprocess

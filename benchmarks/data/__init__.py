@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Recordings that only benchmarks and tests use; each folder has an ATTRIBUTION.md."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Markers on three walls and a cube among them: how well each method's pose fits the images."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is said of the augmented-reality experiment, held against its figures."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From how far away the linear solvers find the pose."""
 
 from __future__ import annotations

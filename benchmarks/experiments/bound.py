@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whether the Localizer's estimate is as good as the points allow, and its covariance honest."""
 
 from __future__ import annotations

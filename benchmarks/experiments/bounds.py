@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The Cramer-Rao bound: no unbiased estimate of a motion is better than this."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Figures of the experiments: every method has its color, marker and line in all of them.
 
 The colors differ in lightness, and the markers and lines by themselves, so that a print in black

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Which solver to choose: one table from several experiments."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What else there is to find a pose: OpenCV's and, where it is installed, PoseLib's."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How far estimated motions are from the true ones."""
 
 from __future__ import annotations

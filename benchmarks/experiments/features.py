@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images to poses without a marker: keypoints of rendered images, matched with a map of their kind.
 
 The map is perfect but for its keypoints: what still images show, where their rays meet the scene.

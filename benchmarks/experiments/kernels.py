@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Loops over many frames of few points, compiled: scores, refinement, Fisher information."""
 
 from __future__ import annotations

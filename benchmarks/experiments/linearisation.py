@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors when the initial orientation is off: how far linearised rotations reach."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A room mapped from one walk, and other flights localized in it without markers:
 
     python -m benchmarks.experiments.mapped_room --out mapped_room

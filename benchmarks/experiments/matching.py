@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints in a large map: how fast from the message to the pose, and how well recognized."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whether the scores of matches by descriptor help the search where most matches are wrong."""
 
 from __future__ import annotations

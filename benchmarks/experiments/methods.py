@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The methods that are compared, and how each gets its estimate from a frame.
 
 Solvers with several solutions: the one with the least robust score over all points of the frame

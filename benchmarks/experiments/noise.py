@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors under pixel noise, how near they come to the bound, and what six points can see."""
 
 from __future__ import annotations

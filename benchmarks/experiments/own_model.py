@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """R9P scored by its own model, which is no rigid motion.
 
     lambda x = (I + [v]x) R0 X + C + r (R_RS R0 X + t)

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The rolling-shutter solvers start where P3P leaves off."""
 
 from __future__ import annotations

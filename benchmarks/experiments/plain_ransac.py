@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """RANSAC as in the paper: so many samples, the model with the most support, nothing else."""
 
 from __future__ import annotations

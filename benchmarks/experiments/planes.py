@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Planes: one image of a plane does not show a rolling shutter's velocities; a prior helps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a recording that is not as it should be does to the readout time, and what is said of it."""
 
 from __future__ import annotations

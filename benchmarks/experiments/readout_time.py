@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How well a recording tells the readout time of its camera."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Inliers per frame within RANSAC on sequences, with each solver."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the paper says of real sequences, held against inliers per frame."""
 
 from __future__ import annotations

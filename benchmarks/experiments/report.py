@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Results on disk: CSV, PNG, and a summary of all claims for people (md) and programs (json)."""
 
 from __future__ import annotations

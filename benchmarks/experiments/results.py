@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What an experiment returns: tables, figures, and claims with their verdicts."""
 
 from __future__ import annotations

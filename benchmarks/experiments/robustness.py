@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the Localizer bears: wrong matches of several kinds, few and many points, any camera."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Metres of a map by an IMU alone, in a room without markers:
 
     python -m benchmarks.experiments.room_by_imu --start 28 14

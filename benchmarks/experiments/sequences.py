@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The sequences on which solvers are compared within RANSAC: a recording and simulated flights."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How long a new process takes until its first pose: with nothing compiled, and from the cache."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Times of many subjects on a machine that has other things to do."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors of many methods while one thing varies."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What minimal problems cost, and the first pose; frames: ``python -m benchmarks.frames times``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What it brings to follow a moving camera from frame to frame."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The paper's synthetic set-up: frames of a moving rolling-shutter camera, many at once.
 
 Points are uniform in [-1, 1]^3, the camera stands at a distance of 2 to 3 from their centre and

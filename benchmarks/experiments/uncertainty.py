@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a limited number of trials can say: intervals around shares, medians and ratios.
 
 Intervals hold the true figure with a stated confidence, and verdicts are read off them

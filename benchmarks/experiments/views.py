@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Single frames for the Localizer, and how far its estimates are from the truth in sigmas."""
 
 from __future__ import annotations

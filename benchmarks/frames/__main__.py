@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The commands: ``python -m benchmarks.frames run``, ``compare`` and ``times``.
 
 Another version of the package is judged by the same benches from any other folder:

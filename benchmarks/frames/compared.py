@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Two versions on the same frames: what is certainly better or worse, and a picture."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of a condition: points, pixels and the truth, the same for the same seed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Conditions through the public interfaces of the package, and the figures of each."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What frames cost beside PoseLib's global-shutter estimate, and how many calls they take."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.fuzzing``: exit code 1 when something fails."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Calibration files of every program that is read, to be damaged."""
 
 from __future__ import annotations

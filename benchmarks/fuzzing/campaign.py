@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A run over all targets: counts what became of each input, and keeps what should not be."""
 
 from __future__ import annotations

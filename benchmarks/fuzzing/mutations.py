@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Small damages to bytes, texts and messages that were right."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Right input of every kind, small, to be damaged."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is fed with wrong input, and with which errors it may answer."""
 
 from __future__ import annotations

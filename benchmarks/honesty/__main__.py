@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Single benches, or single conditions of them, for who works on the estimator:
 
 python -m benchmarks.honesty p3p --only board 0.1px --frames 100

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Never worse than P3P: default against a global shutter, frame by frame, where maps and lenses
 are a little off and the readout time is short, zero or not known.
 """

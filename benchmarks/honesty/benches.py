@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The benches by name, each a list of conditions and what is measured of one of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is claimed of covariances and of P3P, and what the benches say of it.
 
 A condition on its own has too few frames to tell 92 from 95 %. So each claim is judged by all of

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of the independent simulator through the estimator's public interfaces."""
 
 from __future__ import annotations

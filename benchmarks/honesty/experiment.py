@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """All benches as one experiment, with a verdict on every claim."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rendered walls of markers along recorded hands, through the detector and the node's own code.
 
 Rendering and detection take minutes, the estimator seconds: detected corners and the truth are

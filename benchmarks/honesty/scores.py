@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors of estimates in their own units: what a covariance promises, against the truth."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A real global shutter before real tags: a rolling-shutter estimator must find no motion there."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A second simulator, to judge the estimator by: it shares no line with what it judges.
 
 Rotations, lens, shutter and motions are written anew in NumPy, and nothing else of the package is

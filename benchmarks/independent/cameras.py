@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A pinhole camera with Brown's distortion (``plumb_bob``) and a rolling shutter."""
 
 from __future__ import annotations

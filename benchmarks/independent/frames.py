@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of many short recordings, all projected at once."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a gyroscope and an accelerometer beside the camera show of its motion."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Motions of many cameras at once: sums of sines, sudden stops, hits, and recorded ones.
 
 The rotation vector of a camera and its place both are sums of sines in time plus a steady part

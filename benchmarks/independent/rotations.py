@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rotation vectors and matrices; every function takes any number of leading dimensions."""
 
 from __future__ import annotations

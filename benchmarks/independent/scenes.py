@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the cameras see: points all around, walls, small planes, boards and markers."""
 
 from __future__ import annotations

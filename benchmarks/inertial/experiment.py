@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The experiment: with a gyroscope and without, on the same frames."""
 
 from __future__ import annotations

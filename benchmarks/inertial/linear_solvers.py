@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Linear minimal solvers that know the turn rate, the vertical, or both; for comparison only.
 
 The double-linearised model of Kukelova, Albl, Sugimoto, Pajdla (ACCV 2018),

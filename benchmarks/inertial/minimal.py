@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whether minimal solvers for a known turn rate or a known vertical are worth having.
 
 The robust loop of the localizer with other solvers in it, on bearings that the gyroscope has turned

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of the independent simulator with a gyroscope, through tracker and localizer."""
 
 from __future__ import annotations

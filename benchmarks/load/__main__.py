@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Measure the node under load: ``python -m benchmarks.load --rate 100 --minutes 10``.
 
 Publisher, node and measuring subscriber are processes of their own on this machine. The exit code

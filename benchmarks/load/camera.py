@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The process that publishes: as a camera does, at a steady rate and whatever becomes of it."""
 
 from __future__ import annotations

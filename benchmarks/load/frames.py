@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated frames of a hand-held camera as serialized messages, to be published for ever."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Live nodes under load, in processes of their own, and what is heard of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Stop the node at random moments: ``python -m benchmarks.load.signals --times 100``.
 
 Each time a node is started, with kernels in the cache or without, while a camera publishes; after a

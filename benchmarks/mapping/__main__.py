@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The figures of ``docs/mapping.md`` and of an IMU in ``docs/map_build.md``:
 
 python -m benchmarks.mapping bend bound large surveys rendered coverage weighing

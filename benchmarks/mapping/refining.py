@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Maps refined with a global shutter, with the rolling one, and with its time found."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Corners of markers as the detector finds them in rendered images of a walk."""
 
 from __future__ import annotations

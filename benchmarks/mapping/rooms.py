@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A room, a walk through it and what a rolling shutter sees of it, none of it the package's own."""
 
 from __future__ import annotations

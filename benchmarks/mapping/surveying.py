@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Markers surveyed: a printed wall, and twelve around a room."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Metres of maps by an IMU: errors by the deviations that are told of them."""
 
 from __future__ import annotations

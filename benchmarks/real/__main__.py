@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``python -m benchmarks.real FOLDER``: a table and a picture of real videos of boards.
 
 FOLDER holds videos and ``index.csv``, a line for each: file, inner corners, side of a square (m),

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Calibrations of parts of each video against each other, and their lenses against OpenCV's.
 
 Halves and thirds of a video are calibrated on their own. Readout times that are accepted are held

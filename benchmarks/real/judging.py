@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the poses of one video say of themselves: nobody knows the truth."""
 
 from __future__ import annotations

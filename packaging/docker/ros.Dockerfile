@@ -1,3 +1,6 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+#
 # The nodes in a workspace of ROS 2, as docs/install.md says.
 #   docker build --file packaging/docker/ros.Dockerfile --tag rs_localizer:jazzy .
 #   docker build --file packaging/docker/ros.Dockerfile --build-arg ROS_DISTRO=lyrical --tag rs_localizer:lyrical .

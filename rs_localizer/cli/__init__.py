@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The commands: each one small file that parses, calls and prints."""
 
 from __future__ import annotations

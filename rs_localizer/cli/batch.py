@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``replay``, ``detect``, ``calibrate`` and ``evaluate`` of many recordings at once."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer calibrate``: a recording in motion -> readout time, direction, and the lens."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer demo``: the bundled recordings through live nodes; a table and pictures."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer detect``: images of markers, a board or anything -> a recording for ``replay``."""
 
 from __future__ import annotations

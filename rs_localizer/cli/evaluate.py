@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer evaluate``: errors of estimated poses and twists against the truth."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images that a command takes: a video, a folder, or a bag; their camera and their times."""
 
 from __future__ import annotations

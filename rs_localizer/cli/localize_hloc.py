@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer localize-hloc``: what hloc has matched -> poses and velocities."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer readout``: what others say of a camera's readout time."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer rectify``: images as a global shutter would have taken them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer replay``: a recording -> poses and twists, offline or through the graph."""
 
 from __future__ import annotations

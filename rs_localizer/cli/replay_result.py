@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What replay makes of a recording: poses, twists, a bag, and a summary.
 
 Frames are written as they come; of each, some numbers stay (250 bytes).

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Arguments that say with which settings, and from which topics of a recording."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer simulate``: a bag with ground truth of a simulated rolling-shutter camera."""
 
 from __future__ import annotations

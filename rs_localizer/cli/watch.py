@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer watch``: how a live localizer node is, on a terminal."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The kinds of arrays that pass through the package, and a check of what callers pass."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bearings of many pixels at once, by Newton's method on OpenCV's pinhole lenses.
 
 OpenCV's fixed point takes tens of iterations to the same digits, and its derivatives come with a

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Blocks of matrices, for kernels: Numba's slices ask each time whether shapes and memory fit."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Camera: raw pixels to bearings and row times, and back.
 
 A raw pixel is what the driver delivers: distorted, with the centre of the first pixel at (0, 0),

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Image points as a camera without the known turn would see them.
 
 Row by row the bearings are turned back into the axes of the middle row, so that all that follows

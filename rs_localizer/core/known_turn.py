@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How the camera turned during the readout, as a gyroscope knows it.
 
 The body rate is a natural cubic spline through the samples (:mod:`rs_localizer.core.rate_spline`).

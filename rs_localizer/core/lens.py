@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a calibration lacks: distortion, focal lengths, centre.
 
 Most of what a calibration may have wrong is radial: an image point at ``r`` from the axis moves

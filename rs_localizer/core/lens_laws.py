@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Lens laws: where a bearing falls on the sensor, and back. The three of sensor_msgs/CameraInfo.
 
 A new law is a file with its own :class:`LensLaw`, and a row in

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Names of what users are told: THE lists. docs/reasons.md says what each means and what to do."""
 
 from __future__ import annotations

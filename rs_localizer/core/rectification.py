@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pixels as a global shutter would have seen them: what the rows' motion did, undone.
 
 With the poses ``R, t`` camera_from_map of two row times, what the camera has before it at ``tau``,

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is known of how much a camera shakes and how fast it moves: it goes from frame to frame."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How the shutter moves over the image; settings name it without loading a camera model."""
 
 from __future__ import annotations

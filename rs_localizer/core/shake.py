@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """In-frame turn: what the camera turns beside a motion of constant acceleration.
 
 A sum of cosines and sines of the row time at fixed frequencies, half a cycle per readout apart:

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The rolling-shutter motion model: row time -> pose -> camera point -> pixel.
 
 Row time ``tau`` is -0.5 at the first exposed row (or column) of the full sensor image and 0.5 at

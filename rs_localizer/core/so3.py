@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rotations: exponential, logarithm and the Jacobian of the exponential.
 
 Rotation vectors are in radians; matrices act on column vectors. The kernels may be called from

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where the numbers of a motion stand: in its state, and in a step or a covariance.
 
 A state holds rotation (9, row-major) and translation (3), camera_from_map at the middle row, the

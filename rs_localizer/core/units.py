@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """An estimate in SI units and in the map: where the camera is, and how fast it moves.
 
 The estimator counts time in readouts and has its poses as ``camera_from_map``, as its solvers do.

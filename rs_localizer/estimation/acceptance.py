@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whether an estimate may be published: nothing rather than a wrong pose."""
 
 from __future__ import annotations

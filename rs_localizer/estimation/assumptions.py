@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is assumed of a motion and its camera before the points have their say."""
 
 from __future__ import annotations

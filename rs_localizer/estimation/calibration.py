@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What errors of the calibration and of the map, the same in all frames, do to a pose.
 
 Centre, focal length and distortion of an ordinary calibration have errors; so has a map that is

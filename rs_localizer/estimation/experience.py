@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the frames so far say of shaking and of errors of map and lens: the next ones share them."""
 
 from __future__ import annotations

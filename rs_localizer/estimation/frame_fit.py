@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """One fit: motion, in-frame turn, smooth errors and the scales of all of them, from the inliers.
 
 The model of a frame (docs/estimator.md): a pixel is where the motion ``x`` and the in-frame turn

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The posterior of a frame: one model, its modes, and one Gaussian of them all.
 
 docs/estimator.md is the page. The discrete alternatives of a frame, {rest, typical speeds} x {this

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A calibration whose lens is off: its radial distortion, found with the motion.
 
 A smooth field of errors (:mod:`.model_error`) makes covariances larger and leaves the estimate as

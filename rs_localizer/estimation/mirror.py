@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Planes show two poses: the one that is mirrored about the line of sight may fit as well.
 
 From far away, or on a small marker, a plane that leans to the left and one that leans to the right

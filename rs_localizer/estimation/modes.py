@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Modes of a frame without an in-frame turn: Gaussians about its optima, and their mixture.
 
 Typical speeds and the two leans of a plane are starts of one fit (docs/estimator.md); each becomes

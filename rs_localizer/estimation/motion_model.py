@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From one image to a later one: accelerations that fade while new ones come.
 
 R. Singer, "Estimating optimal tracking filter performance for manned maneuvering targets", 1970.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The points of one frame: checked, chosen, and packed once for all kernels."""
 
 from __future__ import annotations

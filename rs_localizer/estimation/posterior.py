@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The best motion of a frame: inliers by the noise, noise by the inliers."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is known of the motion before the image: Gaussian priors and the direction of gravity.
 
 :class:`Prior` is what a user gives, :class:`PriorTerms` what kernels take, and :func:`add_prior`

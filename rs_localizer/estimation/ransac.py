@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The robust loop: draw samples in blocks, solve, score, optimise the best, stop when sure.
 
 It knows a solver only as a function that turns samples into models.

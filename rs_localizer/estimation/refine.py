@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Refinement of a motion on many points: Levenberg-Marquardt in model B, with a prior.
 
 Parameters of a step, as in ``Estimate.covariance``: the camera turns by ``exp([phi]x)`` in its own

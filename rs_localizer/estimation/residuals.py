@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Reprojection errors of many points under one motion, and their normal equations.
 
 Points lie in lanes (:func:`rs_localizer.estimation.observations.pack`); a motion is a state of

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From a posterior to what users get, the delay of a known turn among it.
 
 A turn that comes too early by ``d`` turns each row by too much, or too little; where the camera

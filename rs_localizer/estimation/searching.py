@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The search for the motion of an image: a global-shutter start, then the solver's hypotheses."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What vibration that hides in the noise does to a motion: its evidence, and how far it moves it.
 
 A fit with scales takes the most probable ones, and where a frame hardly shows that it shakes these

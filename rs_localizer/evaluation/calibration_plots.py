@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of a calibration: likelihood, parts of the recording, residuals by row and by speed."""
 
 from __future__ import annotations

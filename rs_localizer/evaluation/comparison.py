@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Two methods on the same recording: answers, how far they are from the truth, and a table."""
 
 from __future__ import annotations

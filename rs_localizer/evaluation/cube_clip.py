@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The cube in a few seconds of a shaking hand, drawn by P3P and by the localizer: an animation."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of a map that was built: landmarks and cameras, residuals before and after."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How far estimates are from the truth: errors, and the frame and the clock to compare them in.
 
 Alignment: two trajectories in frames of their own, laid over each other by positions and

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures: trajectories, errors over time, inliers, residuals on an image.
 
 Every method keeps its color, its marker and its line in all of them, and they differ in lightness

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A rendered room that is mapped from one walk, and flights that are localized in the map."""
 
 from __future__ import annotations

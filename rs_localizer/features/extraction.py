@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images -> keypoints with descriptors: good ones, and some of every part of the image.
 
 A pose is as certain as the points are spread; the best keypoints alone lie where most texture is.

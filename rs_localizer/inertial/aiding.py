@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A gyroscope beside a tracker: it foresees each frame, and learns from it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Inertial readings by their stamps: whatever order they come in, those of an exposure.
 
 Bounded: it remembers some seconds, and never more than a fixed number of readings. Methods may be

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the frames say of the gyroscope: bias and time offset, tracked beside the camera's motion.
 
 The gyroscope's parameters are a part of the state of the tracker's Kalman filter that no image

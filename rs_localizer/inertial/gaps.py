@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where readings go on without a gap, around an interval."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The direction of gravity from an accelerometer.
 
 It shows the specific force: gravity, upwards, and the acceleration of the camera. One reading tells

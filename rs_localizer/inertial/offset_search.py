@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The time offset of a gyroscope from nothing: all offsets are kept until one is left.
 
 A vibration tells the offset within a frame to a tenth of a millisecond, but for whole periods of

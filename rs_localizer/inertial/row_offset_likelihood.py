@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a frame says of turns of its rows, whichever time offset is supposed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a gyroscope and an accelerometer measured, by the camera's clock and in its axes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Turns of the camera by the gyroscope: within a frame, and from one to the next.
 
 How they depend on the time offset is seen by shifting the samples to and fro by its standard

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whether a gyroscope can be believed, by what the camera sees.
 
 Whether another rotation camera <- imu would make gyroscope and camera agree.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Results that appear whole or not at all, however their making ends."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Recordings: rosbag2 (MCAP, sqlite3) and ROS 1 bags in, rosbag2 out, by the rosbags library.
 
 Messages come out as rosbags' plain objects with the attribute names of ROS 2, whatever the

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Calibration files of other programs -> Camera.
 
 Read are YAML of ROS' camera_calibration and of BoofCV, YAML and XML of OpenCV's FileStorage,

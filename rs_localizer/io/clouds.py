@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """PointCloud2 <-> structured arrays, and correspondences.
 
 Fields are looked up by name and may lie anywhere in a row; unknown ones are ignored. The data are

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tags that other detectors have found: apriltag_msgs and isaac_ros_apriltag_interfaces.
 
 Both are read by the names of their fields. Conventions, from the sources of AprilRobotics/apriltag

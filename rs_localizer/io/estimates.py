@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Poses and twists from whatever holds them: text files, recordings, outputs of replay."""
 
 from __future__ import annotations

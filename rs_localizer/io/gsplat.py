@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What gsplat needs to train with a rolling shutter: poses at the first and the last row.
 
 ``viewmats.npy`` and ``viewmats_rs.npy`` (n,4,4) are ``camera_from_world`` at the first and at the

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Files of hloc (Hierarchical-Localization): queries, pairs, features and matches; its results.
 
 hloc keeps keypoints with the centre of the first pixel at 0, 0, as this project does, and adds

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """When the images of a file were taken: what is known of it, and what is assumed."""
 
 from __future__ import annotations

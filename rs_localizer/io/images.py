@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/Image and CompressedImage -> gray images, raw rows where the sensor has them.
 
 50 megapixels work, they only take long. A compressed image may be small and its pixels many: what

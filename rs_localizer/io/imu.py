@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/Imu -> what a gyroscope and an accelerometer have measured."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What all readers of messages share: the error, the stamp, and the headers.
 
 Messages are taken by their attributes, so that those of rclpy and those of rosbags, which differ

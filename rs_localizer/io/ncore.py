@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What NVIDIA's NCore stores of a rolling-shutter camera: poses when a frame starts and ends.
 
 ``ncore.json`` has the fields of its camera models (``OpenCVPinholeCameraModelParameters``,

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``transforms.json`` of nerfstudio, with what reconstructions need that know the rolling shutter.
 
 Fields as *Gaussian Splatting on the Move* (Seiskari et al., ECCV 2024; its code converts to the

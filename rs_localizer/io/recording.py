@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the package records: topics, and an image or its correspondences as messages of a bag."""
 
 from __future__ import annotations

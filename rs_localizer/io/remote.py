@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Files in other places, by the URLs that fsspec opens (``s3://``, ``gs://``, ``memory://``).
 
 A reader of bags jumps about in its file: what is elsewhere is fetched whole before it is read.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Gyroscope, accelerometer, exposure and readout time inside videos, by telemetry-parser.
 
 GoPro, DJI, Insta360, Sony, Canon and others write them; the library (extra ``video``) knows their

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The names of topics, relative to a node's namespace.
 
 What the inputs are: :mod:`rs_localizer.pipeline.inputs`; the outputs: :mod:`.outputs`.

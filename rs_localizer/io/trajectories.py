@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Trajectory files: TUM poses ``t x y z qx qy qz qw`` and twists ``t wx wy wz vx vy vz``.
 
 Times are seconds in the files and integer nanoseconds here: a float of today's date in seconds

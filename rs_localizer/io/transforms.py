@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The frames of a recording and their transforms: tf2 without ROS.
 
 Follows ``tf2::BufferCore`` of Jazzy, step by step and operation by operation, so that a replay

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """YAML that people write: small, and a tree."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Map and motion together: the cost, its normal equations, their solution, and what is known then.
 
 Landmarks are eliminated, the rest is dense: a landmark that is seen at distant times ties all

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What gives a map its scale and its place: markers of known places, points a known distance apart.
 
 Both are seen in images beside the landmarks, and triangulated with the refined motion. Markers also

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A map from views: COLMAP's structure, the rolling shutter, metres.
 
 1. COLMAP extracts, matches and maps the keyframes, with a global shutter; without a calibration it

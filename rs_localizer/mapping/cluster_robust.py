@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How much less is known because errors of keypoints that follow each other are correlated.
 
 The corners of a marker, or the features of a surface, look nearly the same from image to image, and

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The first structure of a scene, by COLMAP: where keyframes were, what they show, and the lens.
 
 Extraction, matching, incremental mapping and self-calibration are COLMAP's with its defaults

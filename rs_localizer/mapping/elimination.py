@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Landmarks taken out of the normal equations of a map, compiled (Schur complement).
 
 With the landmarks' 3x3 blocks V, the derivatives W of controls and shared numbers by landmarks and

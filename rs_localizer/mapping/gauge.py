@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where a map is: similarities, and what is known of it when nothing outside of it says so.
 
 While map and motion are adjusted the camera's positions and orientations hold them, on average,

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The first motion of a map's images, and how fast it may change."""
 
 from __future__ import annotations

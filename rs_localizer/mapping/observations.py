@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a map is refined from: keypoints of known landmarks and a first guess of all, as views or a
 recording of correspondences have them.
 """

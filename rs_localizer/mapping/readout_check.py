@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The readout time that the images show, beside one that was given: a wrong one bends a map that
 still fits them.
 """

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A map refined with the rolling shutter that saw it: bundle adjustment in continuous time.
 
 Landmarks are free, the motion is a spline, each keypoint is seen at the time of its own row. An

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A map refined with the shutter that its images show: rolling along one axis or the other, or
 global, where nobody knows it.
 """

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where markers are, from one recording that shows them: continuous-time adjustment with the poses
 of the markers free, each a rigid square of known size. The first marker is the origin; whatever
 shows several of them closes loops.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Views on a first map: the pose of each, and the landmarks that it shows.
 
 Keyframes may lie too far apart to tell how the camera moved while one was read out. The images

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Points from keypoints of cameras whose motion is known, each point by itself."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Markers whose places nobody knows: in single images, and a first guess chained over images.
 
 A square seen alone fits two poses (Collins and Bartoli, *Infinitesimal plane-based pose

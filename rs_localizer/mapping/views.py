@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images as the mapping needs them: what is kept of each one when its pixels have been let go."""
 
 from __future__ import annotations

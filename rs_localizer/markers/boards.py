@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Chessboards, ChArUco boards and grids of circles in images, by OpenCV's own detectors."""
 
 from __future__ import annotations

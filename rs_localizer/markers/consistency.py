@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whether a map of markers can be true by itself: overlaps, mirrored markers, other units.
 
 :mod:`rs_localizer.markers.map_check` holds it against images.

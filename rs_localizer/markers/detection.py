@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images -> corners of the map's markers and boards: the correspondences of one frame.
 
 The node and the offline command run this one class, so the same images give the same corners.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """OpenCV's markers, the same from OpenCV 4.6 to 5: their patterns, and where an image shows them.
 
 OpenCV holds the AprilTag patterns upside down (4.x and 5.0; a later one will not, see

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Which marker of a map is not where the map has it: each is held against the others.
 
 In every image the pose of the camera is estimated from all markers but one, and that one is looked

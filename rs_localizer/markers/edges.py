@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Corners of markers from the edges that meet in them, to a few hundredths of a pixel.
 
 Across each side of a black square the profile of the image is sampled, as far as motion smears the

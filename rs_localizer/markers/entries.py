@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Mappings in files that people write, read key by key, with errors that say where."""
 
 from __future__ import annotations

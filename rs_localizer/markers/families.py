@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The dictionaries of markers that OpenCV knows, by the names that users write."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whether a map of markers can be true, against what an image shows of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Files of marker maps: YAML, for instance
 
     map_frame: map                 # frame of all that follows; lengths in metres

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The map of markers: which ones there are, and where.
 
 Its file is read and written by :mod:`rs_localizer.markers.map_files`.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures to look at: what was seen, and a cube on each marker where the pose puts it.
 
 Every point of a cube is drawn where the row that sees it, at its own time, has the camera: with a

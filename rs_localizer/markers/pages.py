@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pages of black rectangles, written as PDF or PNG, true to scale."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What can be printed and seen: single markers, and boards of squares or circles, in the map frame.
 
 The frame of a print has its origin in the middle (of the black square of a marker, of the whole

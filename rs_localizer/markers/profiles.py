@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where along its normal an edge from black to white lies, sharp or smeared by motion.
 
 A pixel's light is its integral, and motion smears an edge evenly to both sides of where it is in

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What an image shows of markers and boards, whichever they are: for those whose map is wrong."""
 
 from __future__ import annotations

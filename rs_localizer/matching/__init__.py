@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints of an image and landmarks of a map -> correspondences.
 
 By the ids of landmarks, or by descriptors: of the two landmarks with the nearest descriptors the

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Landmarks' descriptors, ready to be searched: binary ones by Hamming, others by L2 distance.
 
 Every search is exact and repeatable. On two cores, 500 descriptors of 32 bytes among 100,000 take

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Compiled searches for the two landmarks whose descriptors are nearest to each keypoint's.
 
 Binary descriptors come as rows of 64-bit words, four or a multiple of four of them. Results are

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Offline detection: images -> a recording of correspondences or keypoints, as the nodes do."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Queries of hloc -> poses and velocities, of the matches that hloc has found."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where images come from, offline: a video, a folder of files, a bag."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The whole of a recording's IMU at once, for estimators of many images."""
 
 from __future__ import annotations

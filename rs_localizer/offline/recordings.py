@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """All correspondences of a recording at once, for estimators of many images."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Whole images as a global shutter would have taken them, from the poses of two rows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Offline replay: the frames of a recording, one after the other, through the node's own code."""
 
 from __future__ import annotations

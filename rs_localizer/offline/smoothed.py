@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``replay --smooth``: the frames of a recording, and one motion through all of them."""
 
 from __future__ import annotations

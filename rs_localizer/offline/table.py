@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of recordings as one table: a row a frame, refused ones too (Arrow, Parquet)."""
 
 from __future__ import annotations

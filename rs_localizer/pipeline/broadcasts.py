@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What goes out on TF of a localized frame: ``publish_tf`` of the settings.
 
 ``map_to_camera`` says where the body is in the map (the camera, or ``base_frame``: a frame has one

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Kernels are compiled in a process of their own: a node does not keep the compiler's memory."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A frame from message to pose: what the live node and the offline replay share.
 
 Both feed their messages to a :class:`FrameLocalizer` and publish what

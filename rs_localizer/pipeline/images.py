@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Messages of images -> correspondences or keypoints: all of the two detectors but ROS.
 
 The nodes and the offline ``rs_localizer detect`` run these classes.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the frames get of an IMU: the readings of their exposure, in the camera's axes.
 
 Node and replay share it. Readings may be added from any thread; all else belongs to the one that

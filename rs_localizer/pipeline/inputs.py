@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """THE list of the localizer's inputs: topic, type, role, and who reads and uses its messages.
 
 The node subscribes to it, replay looks for it in recordings, commands and launch file have an

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pose and twist of the body at one moment of an estimated motion, with their covariances.
 
 The estimate is centred on the middle row and counts time in readouts; what is published holds at

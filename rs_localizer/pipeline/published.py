@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From an estimate to what is published of it: the moment, the velocities, and the body.
 
 With ``R = map_from_camera`` and ``p`` the camera's position, the camera's velocities ``v, w`` in

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A localized frame as PX4's external vision takes it: ``px4_msgs/msg/VehicleOdometry``.
 
 ROS has bodies whose x is forward, y left and z up (FLU), and maps whose z is up (REP-103, REP-105);

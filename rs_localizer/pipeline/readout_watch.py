@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The readout time that the camera's own motion shows, beside the one that is set."""
 
 from __future__ import annotations

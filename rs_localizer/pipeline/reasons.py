@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What each reason for refusing a frame means, and what to look at: THE list, for users.
 
 And the reasons for which an image is localized, but without the IMU.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A message without a result, and why; who is told what is odd."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tags that other detectors have found become correspondences by a map of markers."""
 
 from __future__ import annotations

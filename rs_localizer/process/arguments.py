@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Types of command-line arguments: numbers that are refused where they make no sense."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What to say of a package that is not installed: one sentence with the command that brings it."""
 
 from __future__ import annotations

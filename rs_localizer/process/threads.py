@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """One thread for linear algebra.
 
 The OpenBLAS of SciPy 1.11 wakes a thread per core for systems of 12 unknowns: a camera of 60 Hz and

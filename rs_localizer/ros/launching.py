@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the launch files share: arguments that are settings, and checks before anything starts."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The executables of the nodes: take signals in hand, then import what takes long."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated frames of a rolling-shutter camera, with their truth.
 
 Every point is projected at the time of its own row along the true motion; noise and outliers are

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Sequences of rendered images: rendered and encoded by all cores, in order, a few at a time."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What an IMU on a camera's true motion measures, and its messages in a recording.
 
 Every reading is of one instant: the body rate of the motion, and the specific force ``R' (a - g)``

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of the augmented-reality experiment: marker walls, rendered and detected; the truth."""
 
 from __future__ import annotations

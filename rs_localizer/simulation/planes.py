@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Textured planes: what a rendered scene is made of, and how the renderer keeps them."""
 
 from __future__ import annotations

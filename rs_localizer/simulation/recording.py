@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated frames and their truth as messages of a recording."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images of textured planes as a moving rolling-shutter camera takes them.
 
 Every line of pixels (a row, or a column if the shutter moves sideways) is seen from the true pose

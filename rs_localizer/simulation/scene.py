@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Scenes: fixed maps of 3D points around the path of a simulated camera."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """True motions of a simulated camera: constant velocity, or a spline through recorded poses.
 
 A true motion knows its pose and its velocities at every instant; nothing of it is made of the

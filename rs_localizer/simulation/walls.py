@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Scenes of textured planes around the path of a simulated camera, built to be looked at."""
 
 from __future__ import annotations

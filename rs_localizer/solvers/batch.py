@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Data of a batch of samples on its way into the lanes and out again.
 
 A kernel keeps its samples in a flat work array of ``LANES`` doubles per value:

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """joint: both ``r6p_vct_w`` and ``r6p_vcwt`` on every sample; the robust score picks.
 
 The suggestion of Kukelova, Albl, Sugimoto, Pajdla, ACCV 2018, sec. 5, for unknown motion: the

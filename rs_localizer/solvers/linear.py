@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The equations that all linear rolling-shutter solvers share.
 
 Double-linearised model of Kukelova, Albl, Sugimoto, Pajdla, "Linear solution to the minimal

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Minimal solvers for thousands of samples at once: the paper's problem as a call."""
 
 from __future__ import annotations

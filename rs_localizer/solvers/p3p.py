@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """P3P: the global-shutter pose of three points, the baseline of the rolling-shutter solvers.
 
     lambda_i y_i = R X_i + C,   |y_i| = 1

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """R6P in two alternating linear steps: vc_wt, vct_w and vct_wt.
 
     lambda x = (I + r [w]x) (I + [v]x) X + C + r t

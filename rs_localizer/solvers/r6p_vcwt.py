@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """R6P v,C,w,t: the six-point solver that is linear in all twelve unknowns at once.
 
     lambda x = (I + [v]x) X + r [w]x (I + [v^]x) X + C + r t

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """R9P: the nine-point solver with a free matrix in place of the rotation rate; not iterative.
 
     lambda x = (I + [v]x) X + r R_RS X + C + r t

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Where a 6x4 matrix whose entries are linear in three unknowns x, y, z drops rank.
 
 All of its fifteen 4x4 minors vanish there: quartics with 35 monomials. Their QR decomposition,

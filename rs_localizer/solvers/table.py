@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The solvers by name: THE list; settings, commands, tests and experiments read it.
 
 A new solver is a module here with ``SAMPLE_SIZE``, ``SOLUTIONS`` and a batch kernel (see

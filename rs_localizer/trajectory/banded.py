@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bordered banded systems: solutions and marginal covariances (SciPy's LAPACK, Schur complement).
 
     [ H   C ] [x]     [g]

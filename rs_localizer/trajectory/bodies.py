@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Landmarks that move together: each free one by itself, or the corners of one rigid marker."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The readout time of a recording: value, honest deviation, direction, and what is odd about it."""
 
 from __future__ import annotations

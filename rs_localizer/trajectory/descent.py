@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The minimum of a cost, by Gauss and Newton with Levenberg's damping; and of the noise with it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A first lens, and its distortion model, from images in which the camera hardly moves (Zhang
 2000, by OpenCV).
 """

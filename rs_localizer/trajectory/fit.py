@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The estimator of many frames: a spline through all keypoints, and what the frames share.
 
 The noise is not given: it is the scale of the errors, measured between the rounds, and so Tukey's

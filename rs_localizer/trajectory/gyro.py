@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A gyroscope beside the camera: its samples, how it is mounted, and a first guess of that."""
 
 from __future__ import annotations

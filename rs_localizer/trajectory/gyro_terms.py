@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A gyroscope's samples as a part of the trajectory's cost.
 
 The gyroscope's part of the normal equations, compiled.

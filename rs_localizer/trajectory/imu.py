@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How an IMU goes with the camera: offset of its stamps, rotation and gyroscope bias."""
 
 from __future__ import annotations

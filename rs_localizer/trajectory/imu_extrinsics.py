@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How an IMU hangs on a camera whose motion is known: offset of its stamps, rotation, bias.
 
 The mount is that of the joint estimate (:mod:`rs_localizer.trajectory.imu`), with the motion held.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Intrinsics and distortion as numbers that an estimator may change: derivatives, prior, errors."""
 
 from __future__ import annotations

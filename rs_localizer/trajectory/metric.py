@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Metres and gravity of a motion in units of its own, from an accelerometer that went along.
 
 Mean accelerations (:mod:`rs_localizer.trajectory.metric`), divided by the scale s:

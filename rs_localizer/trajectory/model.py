@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the trajectory's estimator is given, what is free in it, and what it changes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The normal equations of keypoints along a spline, compiled."""
 
 from __future__ import annotations

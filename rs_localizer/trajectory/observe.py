@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images with their correspondences, one pose each, as the trajectory's estimator takes them."""
 
 from __future__ import annotations

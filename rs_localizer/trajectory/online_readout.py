@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The readout time from neighbouring frames, while the camera runs.
 
 One image shows how far the camera turns and travels during its readout; the poses of the frames

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The cost of a trajectory and its normal equations, on the whitened errors of
 :mod:`rs_localizer.trajectory.sight_kernels`.
 """

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The estimating equation of the readout time over many triples of frames, compiled.
 
 Names and symbols are those of :mod:`rs_localizer.trajectory.online_readout`.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Odds of a global shutter, and of a reversed one, against what is set, from few frames.
 
 A measured readout time needs a scatter, and so a second and more of motion. Sooner told is which of

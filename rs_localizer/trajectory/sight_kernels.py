@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Reprojection errors along a spline and their derivatives, compiled.
 
 A keypoint is compared with the projection of its landmark at the time of its own row. Noise moves

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What one image says of its motion, without any prior: a Gaussian about an estimate of it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The motion of a whole recording: poses and velocities at any time, with covariance.
 
 What the keypoints say of a motion's accelerations (MacKay, "Bayesian interpolation", Neural

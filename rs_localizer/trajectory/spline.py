@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A camera's continuous motion: stretches of a uniform cumulative cubic B-spline."""
 
 from __future__ import annotations

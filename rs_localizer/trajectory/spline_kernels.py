@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Cumulative cubic B-splines on SO(3) x R^3: values, rates and their derivatives, compiled.
 
 Between the knots ``i`` and ``i + 1`` four controls act; with ``u`` in [0, 1) and ``d_j =

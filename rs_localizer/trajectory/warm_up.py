@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A small recording through calibration and smoothing, so that their kernels are there."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The filter of robot_localization, and that it may believe what we publish."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A short campaign over all readers, and that a campaign sees what it is there to see."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The benches judge rightly: honest estimates pass, and each kind of lie is seen."""
 
 import csv

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images of a quick hand into both nodes: the same poses and twists as offline, to the last bit."""
 
 import re

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The load benchmark counts what it sends; its figures are no matter of tests."""
 
 import numpy as np

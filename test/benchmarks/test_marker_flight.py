@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From photons to poses, offline: images rendered, markers detected, frames replayed; the truth."""
 
 from pathlib import Path

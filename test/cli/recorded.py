@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What tests of commands put into recordings: a flight, transforms, an IMU; and ROS 1 bags."""
 
 from collections.abc import Iterable

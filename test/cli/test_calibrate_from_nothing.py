@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A film of a board and nothing else: lens, readout time and direction, against a small renderer
 that is the test's own (rays through a distorted lens, four by four in a pixel, row by row).
 """

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Videos, folders and bags of rendered prints become recordings of their corners."""
 
 import re

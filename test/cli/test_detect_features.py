@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images of anything become recordings of keypoints, the same as the node's."""
 
 import re

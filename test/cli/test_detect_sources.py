@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What detect makes of its sources: times, boards, what it keeps of a bag, and what it warns of."""
 
 import re

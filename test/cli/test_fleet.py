@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Many recordings by one command: the same bytes by one and two workers, and nothing in the way."""
 
 import csv

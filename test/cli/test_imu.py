@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """simulate --imu, and replay with it: what is recorded, which topic is found, what is said."""
 
 import re

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What hloc has matched becomes poses; its files are made here, by a small projector."""
 
 import json

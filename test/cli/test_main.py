@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The command line itself: help, version, exit codes, and what is imported for it."""
 
 import argparse

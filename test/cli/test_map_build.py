@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map build``: what it refuses, and that nothing is half-written."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The IMU of ``map build``: which one is taken, what is read of it, what is said."""
 
 import argparse

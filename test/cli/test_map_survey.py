@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map survey`` on images of the test's own: flat prints, warped one by one."""
 
 from pathlib import Path

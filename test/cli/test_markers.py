@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Prints with their maps, and what is said of maps that cannot be right."""
 
 from pathlib import Path

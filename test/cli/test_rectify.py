@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer rectify``: which images, which are left out, what is refused."""
 
 from __future__ import annotations

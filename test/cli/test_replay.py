@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer replay``: three kinds of recordings in, poses and twists out, faults in a line."""
 
 from pathlib import Path

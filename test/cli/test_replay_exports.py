@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Poses at any row, and transforms.json: both say where the camera saw the points."""
 
 import json

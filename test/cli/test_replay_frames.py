@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer replay`` with base_frame and publish_tf: transforms from the recording."""
 
 from pathlib import Path

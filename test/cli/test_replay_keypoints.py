@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Replay of keypoints: with a map in the recording and with a map file, and what is missing."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What replay tells its users: how good the poses are, what to do first, nothing in the way."""
 
 import dataclasses

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``replay --rerun``: what the file holds, read back, and that nothing else changes."""
 
 import filecmp

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The bag of `simulate`: what it holds, and that its truth is the truth of its frames."""
 
 import shlex

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The bag of `simulate --images`: what it holds, and that markers are where its truth says."""
 
 from collections import Counter

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """rs_localizer warm: kernels are there, or the exit code says that they are not."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bearings of many pixels at once, against OpenCV's."""
 
 import numpy as np

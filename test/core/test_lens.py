@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Distortion that a calibration lacks, against Brown's and Kannala's formulas written out."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every lens law: derivatives are finite differences, and rays come back from their pixels."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rectified pixels are those of a global shutter, by a projector of the test's own."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Cosines and sines of the in-frame turn, against their formulas."""
 
 import numpy as np

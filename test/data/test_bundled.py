@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What comes with the package can be read and is what its attribution says."""
 
 import cv2

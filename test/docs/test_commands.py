@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every command that README and docs show can be understood by the program that it calls."""
 
 import argparse

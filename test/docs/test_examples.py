@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The Python examples of README and docs run, page by page, with what a reader would have."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tables of README and docs that repeat the code say what the code says."""
 
 import ast

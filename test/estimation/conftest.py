@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rolling-shutter frames for the tests of the core, made by forward projection."""
 
 from types import SimpleNamespace

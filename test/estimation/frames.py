@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of a box of points, made by the tests' own projection, and what is assumed of them."""
 
 import numpy as np

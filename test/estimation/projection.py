@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A rolling-shutter camera of the tests' own: SciPy's rotations and NumPy, nothing of the package.
 
 A motion is a dictionary of what stands in a state, and the shaking's coefficients (k,3).

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is refused, reason by reason: posteriors that are right but for one thing."""
 
 from dataclasses import replace

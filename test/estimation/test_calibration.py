@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What errors of the calibration do to poses, and that their covariances say so."""
 
 from collections.abc import Callable

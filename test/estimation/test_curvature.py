@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A camera that may have turned about what it sees is somewhere on an arc, not on its tangent."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Derivatives by all 18 parameters and by the shaking, against a projection of the tests' own."""
 
 import numpy as np

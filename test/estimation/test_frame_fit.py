@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """One fit of motion, in-frame turn and smooth error, against plain NumPy."""
 
 import itertools

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """All that the points leave possible: rest and motion, in-frame turns, and wrong maps."""
 
 from dataclasses import replace

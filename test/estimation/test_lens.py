@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A lens that is off is found with the motion, and nothing else is taken for one.
 
 Frames come from the independent simulator, which shares no line with the estimator.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The loop with mock solvers: what it draws, when it stops, what it keeps."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Derivatives of pixels where a motion sees the points: without the noise of the points."""
 
 import numpy as np

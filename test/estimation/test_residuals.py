@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors and derivatives against the forward projection, which solves for each point's row."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How long the search goes on: ``max_iterations`` does what it says."""
 
 import numpy as np

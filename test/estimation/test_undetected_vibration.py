@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What vibration that hides in the noise does to a motion, against sums over dense Gaussians."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Answers beside the truth: what is compared, what is counted, and the table of it."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The cube is drawn where its points are, each at its own row's pose; animations can be played."""
 
 import io

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The clip of the demo: which markers count as visible, and how far the cube is off."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors of known size are found, and only frames of the same time are compared."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What pictures show: ranges that one outlier does not stretch."""
 
 import numpy as np

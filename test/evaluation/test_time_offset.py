@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Clocks that differ are found from the motion; frames that differ are laid over each other."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints lie where the picture has them, and are described as COLMAP does."""
 
 from typing import Any

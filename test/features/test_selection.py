@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every part of an image keeps some of its keypoints, and the best ones."""
 
 import numpy as np

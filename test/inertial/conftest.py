@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A camera that turns as a known function of time says, projected by the tests' own means."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A tracker and its gyroscope: offsets are found, and one that lies is dropped and said to."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Readings in any order, repeated, lost, from a clock that jumps: an exposure gets its own."""
 
 import random

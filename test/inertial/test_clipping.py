@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Products with a clipped matrix: as by LAPACK's eigenvectors."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The filter of bias and offset: as the whole Kalman filter, of motion and parameters at once."""
 
 import numpy as np

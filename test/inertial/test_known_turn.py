@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The turn within a frame: against SciPy's splines and its integration of the kinematics."""
 
 import numpy as np

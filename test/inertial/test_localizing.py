@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames with a known turn: the truth comes back whatever shakes, and nothing changes without."""
 
 from dataclasses import fields

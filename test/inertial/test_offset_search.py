@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The time offset from nothing: whatever shakes, the right one of its periods is found."""
 
 from dataclasses import replace

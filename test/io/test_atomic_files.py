@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Results appear whole or not at all; a disk that takes no more is named."""
 
 import subprocess

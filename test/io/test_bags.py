@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of all three kinds are written and read back; bad ones are refused by name."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Small files that stand for much work or memory, or lie about it: one sentence, at once."""
 
 import gzip

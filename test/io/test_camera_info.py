@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """CameraInfo becomes a Camera; what is not a calibration is refused with what was found."""
 
 from types import SimpleNamespace

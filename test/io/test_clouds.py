@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Clouds of every layout are read; those that cannot be are refused with what was found."""
 
 import array

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is written for gsplat says where a rolling shutter sees points, in all four directions."""
 
 from pathlib import Path

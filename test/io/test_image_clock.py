@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Stamps of images: their own, or those of a rate; and what speaks against it."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images of all encodings, and what is wrong with those that cannot be read."""
 
 import array

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/Imu of rosbags and of rclpy are read alike; what no IMU measures is refused."""
 
 import importlib.util

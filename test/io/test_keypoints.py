@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Clouds of keypoints and of landmarks: every layout is read, the others are refused."""
 
 import array

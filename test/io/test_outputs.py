@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The six messages of a frame: values, frames and stamps, and what is left out without a twist."""
 
 import dataclasses

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """PX4's messages say in its axes what a frame says in those of ROS."""
 
 import math

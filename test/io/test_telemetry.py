@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Gyroscopes and readout times inside videos: axes, units, clock, and what is said of them."""
 
 from __future__ import annotations

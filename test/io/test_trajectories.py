@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Trajectory files keep every bit, times above all; faults are named with their line."""
 
 import numpy as np

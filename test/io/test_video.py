@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Streams of JPEGs are split where the images end, not where bytes look like it."""
 
 import struct

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """YAML files: those of people are read, those that are traps are refused in time."""
 
 import time

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of a room and of markers by the tests' own rolling-shutter camera."""
 
 from dataclasses import dataclass

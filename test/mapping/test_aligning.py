@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Maps in another frame: what was wished holds, and nothing else changes."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors that are alike from image to image, and how much less they say."""
 
 from dataclasses import replace

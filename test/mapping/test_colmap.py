@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """COLMAP in a process of its own: what it is given, and what becomes of one that dies."""
 
 import subprocess

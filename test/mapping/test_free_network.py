@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Deviations of a shape, wherever the whole of it lies."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Scale and gravity of a map by an IMU: found, refused with a reason, compared with markers."""
 
 import re

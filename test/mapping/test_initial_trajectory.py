@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How fast a motion changes, as a time lapse has it."""
 
 import numpy as np

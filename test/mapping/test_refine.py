@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Refining maps: against dense algebra, and against the truth of an own projector."""
 
 from dataclasses import replace

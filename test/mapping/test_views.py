@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is kept of images, and which of them COLMAP gets."""
 
 from pathlib import Path

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images of prints in known poses, drawn without the package's own code."""
 
 from collections.abc import Callable

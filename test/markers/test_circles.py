@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Grids of circles and inverted boards: where their points are, and their order."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Maps that cannot be true are recognized, alone or by what an image shows; true ones are not."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Corners of rendered markers and boards: where they are, their order, and which are left out."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A marker that is not where the map has it stands out, and nothing else does."""
 
 from typing import Any

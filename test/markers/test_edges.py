@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Corners from edges: exact wherever in the pixels an edge lies, sharp or smeared."""
 
 import cv2

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Marker maps of other programs: what their own files say, and there and back."""
 
 import json

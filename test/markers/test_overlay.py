@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Cubes stand on their markers, each point of them at the time of the row that sees it."""
 
 from typing import Any

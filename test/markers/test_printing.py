@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pages are true to scale and hold what their map says: the detector reads them."""
 
 import re

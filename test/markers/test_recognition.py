@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What an image shows, for those whose map has nothing of it."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Matches against plain loops; what passes, what is kept, what is refused."""
 
 from typing import Any

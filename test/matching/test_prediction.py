@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Predicted landmarks against the exact rolling-shutter projection, for every camera."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A replayed flight as the systems downstream get it: frames, signs and covariances of each.
 
 The flight is the independent simulator's; laws of motion and the truth judge, in the axes of those

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Offline, a frame waits until the recording has its readings, and nothing changes its place."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Images as a global shutter would have taken them, against rendered ones."""
 
 from __future__ import annotations

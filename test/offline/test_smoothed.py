@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Smoothing in windows: as in one piece, with no more than a window's frames in memory."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The table of frames: one row a frame, the same bytes whoever makes it, from and to anywhere."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pose and twist at a moment in plain NumPy: what the kernels are compared with."""
 
 import numpy as np

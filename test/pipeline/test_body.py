@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every published quantity of a body that carries a camera, against a hand-written chain of frames.
 
 The chain is of 4x4 matrices, from the map to the body; velocities are differences of it, and

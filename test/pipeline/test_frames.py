@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From message to pose: refusals and their reasons, times, changes of camera and settings."""
 
 from types import SimpleNamespace

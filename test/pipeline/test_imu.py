@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """An IMU that stops, lies, is late or is lost now and then: no frame is lost, none is wrong."""
 
 import copy

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From the axes of the IMU to those of the camera, on a fixed mounting and on one that moves."""
 
 from typing import Any

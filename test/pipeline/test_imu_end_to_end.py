@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Stamps that are off, an IMU that is turned and late, vibration, every scan direction at once.
 
 The world is the test's own: SciPy's rotations, a motion of sines, and a pinhole camera.

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is odd about a frame is said, and what is usual is not."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Jumps are poses that do not follow from the last one; all else is a filter's daily bread."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """From keypoints to a pose: maps that are late, missing, replaced or unfit, and what is said."""
 
 from typing import Any

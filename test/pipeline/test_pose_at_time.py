@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Pose, twist and covariances at a moment, against finite differences of the motion model."""
 
 from collections.abc import Callable

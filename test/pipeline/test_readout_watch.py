@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Alarms of a wrong readout time, and finding it, while frames are localized; hand motion."""
 
 import re

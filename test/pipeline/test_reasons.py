@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Every reason for refusing a frame is explained to users, and none that does not exist."""
 
 import re

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Covariances about roll, pitch and yaw are those of these angles, by drawing poses."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tags of AprilRobotics' own detector: its pixels and corners, the poses that come of them."""
 
 from __future__ import annotations

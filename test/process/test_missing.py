@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Packages that are not installed: one sentence, whoever is started."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Signals at any moment: an orderly end, and nothing that is not whole."""
 
 import signal

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Programs of this package keep linear algebra in one thread; BLAS itself is asked."""
 
 import os

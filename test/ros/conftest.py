@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A real node in its own process, and a peer that talks to it over DDS."""
 
 import contextlib

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Launch files and views name what the node has; they are run by hand where ROS is installed."""
 
 import json

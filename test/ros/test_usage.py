@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``localizer --help`` and ``--version`` answer, and start no node."""
 
 import subprocess

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Work by several threads comes back in order, a few at a time; images survive their encoding."""
 
 import threading

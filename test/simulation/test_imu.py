@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The simulated IMU against the motion itself: what it measures, integrated, is the motion."""
 
 import math

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Rendered images against plain ray casting, OpenCV's warping and analytic projections."""
 
 from dataclasses import replace

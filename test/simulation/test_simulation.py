@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated frames: every point where its own row sees it, noise and outliers as ordered."""
 
 import cv2

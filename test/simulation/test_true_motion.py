@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """True motions: their velocities are the derivatives of their poses, and gaps stay gaps."""
 
 import numpy as np

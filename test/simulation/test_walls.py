@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Scenes: markers are where their map says, and most of a real motion sees them."""
 
 import cv2

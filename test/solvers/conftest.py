@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The solvers once more in plain NumPy: one sample, full systems, no elimination by hand.
 
 The equations are written as the camera model says and their coefficients found by setting one

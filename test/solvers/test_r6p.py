@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """R6P against an oracle in NumPy that shares neither algebra nor numerics with it.
 
 The oracle evaluates the fifteen minors by ``np.linalg.det`` at points and fits the quartics to

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A hand that carries camera and IMU, by formulas of its own: what both would measure, exactly.
 
 Nothing of it is the package's code, but for the spline that the camera's motion is handed over in.

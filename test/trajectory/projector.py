@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A rolling-shutter camera of the tests' own: nothing of it is the package's code.
 
 Motion: sums of sines in each of three rotation angles and three coordinates. Lens: pinhole with

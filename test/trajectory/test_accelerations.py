@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The prior of the accelerations against dense covariances, and what an estimate says of them."""
 
 import numpy as np

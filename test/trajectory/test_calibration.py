@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Calibration of whole recordings of the tests' own projector, and of the real ones."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The estimator: its normal equations against differences, its results against an own projector."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A gyroscope beside the camera: derivatives, what is found of it, and what is refused."""
 
 from dataclasses import replace

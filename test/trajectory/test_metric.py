@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Metres and gravity from an accelerometer: the equations, what is found, and how honest it is."""
 
 from dataclasses import replace

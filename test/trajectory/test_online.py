@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The readout time from neighbouring frames: value, deviation, alarms; on an own projector."""
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The compiled parts of the readout watch, against the same in plain NumPy."""
 
 import numpy as np

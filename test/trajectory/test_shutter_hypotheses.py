@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A global shutter is told from a rolling one by what changes from frame to frame."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Smoothing: better than tracking, honest, and silent where the images say nothing."""
 
 from dataclasses import replace

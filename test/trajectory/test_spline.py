@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The cumulative B-spline: laws of its values and derivatives, against finite differences."""
 
 import numpy as np

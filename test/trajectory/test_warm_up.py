@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """After warming up, calibrating and smoothing compile nothing any more."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map align``: scale, direction of gravity and origin of a map."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map build``: images of a place -> a map of landmarks, in metres."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What becomes of a map whose images contradict the readout time that was given."""
 
 from __future__ import annotations

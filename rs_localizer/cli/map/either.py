@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Maps of landmarks or of markers: what all actions on files of maps take and write."""
 
 from __future__ import annotations

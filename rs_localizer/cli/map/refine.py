@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map refine``: a map adjusted with the rolling shutter that saw it."""
 
 from __future__ import annotations

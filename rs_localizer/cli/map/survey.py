@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer map survey``: where markers are, from a recording that shows them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Small linear algebra of numbers or lanes: vectors of three, least squares, rotations."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Real eigenvalues of many small matrices at once, one matrix per lane.
 
 Householder's reduction to Hessenberg form and Francis' implicit double shifts, as in EISPACK's

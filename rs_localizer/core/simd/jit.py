@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """How kernels of this package are compiled and where the machine code is kept."""
 
 from __future__ import annotations

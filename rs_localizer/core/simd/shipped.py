@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Machine code that came with the package, where nobody wants to wait for a compiler.
 
 ``packaging/compile_kernels.py`` puts it there before a wheel is built: caches of kernels

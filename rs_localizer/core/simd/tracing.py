@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Straight-line SIMD code for Numba, written as plain Python arithmetic.
 
 A minimal solver is a few hundred multiplications on a system of fixed size, needed for thousands

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """SIMD values in ordinary Numba code: loops where tracing would unroll too much.
 
 The module ``tracing`` unrolls a small solver into straight-line code. Elimination and eigenvalues

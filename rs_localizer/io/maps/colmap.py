@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Sparse models of COLMAP: points with who sees them, images, and descriptors from its database.
 
 A landmark's descriptor is the medoid of those of the images that see it: the one nearest to the

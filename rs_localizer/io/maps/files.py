@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Files that hold maps: which there are, and how they are read and written."""
 
 from __future__ import annotations

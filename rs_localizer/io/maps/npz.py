@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Maps as NumPy archives: ``points`` (n,3), and ``ids`` (n,), ``descriptors`` (n,d) and
 ``covariances`` (n,3,3; m^2, NaN: not known) where known.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Maps as PLY files: vertices with ``x y z``, and ``id`` and the list ``descriptor`` where known.
 
 Descriptors are lists of ``uchar`` or ``float``, equally long at all vertices. Other properties, as

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Bundles of apriltag_ros (ROS 1): YAML.
 
     tag_family: tag36h11

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Files of marker maps of any format: which it is, by what it holds."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """AprilTag fields of WPILib (FIRST Robotics): JSON.
 
     {"tags": [{"ID": 1, "pose": {"translation": {"x": 1.0, "y": 2.0, "z": 1.5},

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Tasks by Dask: on a cluster of this machine, or by a scheduler that runs already."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a result depends on, so that it is known again, and what its folder is called."""
 
 from __future__ import annotations

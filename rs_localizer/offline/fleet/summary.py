@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """One summary of many recordings: a table for programs, one for people, and a picture."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """One recording of many: what a worker does with it, and what it answers."""
 
 from __future__ import annotations

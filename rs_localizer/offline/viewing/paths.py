@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Names of what is shown, below which the viewer finds it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What a viewer draws of a localized frame, as arrays."""
 
 from __future__ import annotations

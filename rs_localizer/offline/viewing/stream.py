@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of a replay -> a recording of the Rerun viewer, or the viewer itself."""
 
 from __future__ import annotations

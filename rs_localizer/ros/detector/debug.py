@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The debug pictures of the marker detector: drawn when the localizer's answer has come."""
 
 from __future__ import annotations

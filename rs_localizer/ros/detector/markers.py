@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The node ``marker_detector``: images in; correspondences with a marker map out."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A node that looks at images: images in, a cloud for each of them out.
 
 It listens to images only while somebody listens to it.

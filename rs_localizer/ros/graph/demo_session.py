@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plays recordings through live localizer nodes, one per method, and hears their answers."""
 
 from __future__ import annotations

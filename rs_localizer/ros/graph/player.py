@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Plays the messages of a recording into the ROS graph, with /clock."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Listens to a localizer node and writes how it is, again and again."""
 
 from __future__ import annotations

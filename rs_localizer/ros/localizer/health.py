@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the numbers mean for a user: a level, one sentence, and the numbers by readable names."""
 
 from __future__ import annotations

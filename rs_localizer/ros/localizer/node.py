@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The node ``rs_localizer``: correspondences and camera_info in; pose, twist and inliers out."""
 
 from __future__ import annotations

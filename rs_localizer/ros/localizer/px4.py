@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The output for PX4, ``~/vehicle_odometry``: asked for by ``px4_odometry``, needs px4_msgs."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """TF in the node: where the camera is on the robot, and where odometry believes the robot.
 
 tf2_ros is imported when a setting needs it: it is not on PyPI, and all else works without it.

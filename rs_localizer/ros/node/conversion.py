@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """rclpy messages, made by type name or copied from those of a recording, and their publishers."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What every node says of itself: a level, a state, one sentence, and numbers by readable names."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A managed node with a worker: what the nodes of this package have in common.
 
 Three threads: the executor's answers services, changes parameters and the life cycle, and publishes

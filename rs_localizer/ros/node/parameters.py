@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """ROS parameters, declared by walking the settings of :mod:`rs_localizer.config`."""
 
 from __future__ import annotations

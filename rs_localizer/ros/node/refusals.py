@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What was refused: counted by reason, and logged without flooding the log."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Works beside the executor, so that a slow frame delays nothing but frames.
 
 The kernels release the GIL: meanwhile the executor takes messages, answers services, changes

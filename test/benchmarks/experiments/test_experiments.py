@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What held still holds: all experiments with a few trials, against the verdicts expected of them.
 
 With so few a claim may be undecided, but never the contrary of what it was. Left out are the

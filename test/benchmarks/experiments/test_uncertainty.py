@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Intervals hold what they promise, and verdicts are read off them."""
 
 import numpy as np

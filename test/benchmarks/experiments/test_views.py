@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Errors in sigmas against independent truth, and the scenes that they are measured on."""
 
 import numpy as np

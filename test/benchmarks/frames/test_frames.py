@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The benches of frames judge rightly: honest regions pass, lies and worse versions are seen."""
 
 import math

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Frames of the second simulator: scenes as described, conventions as the estimator has them."""
 
 from functools import partial

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The second simulator against SciPy's rotations, OpenCV's lens, and finite differences."""
 
 from functools import partial

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Real eigenvalues in lanes against LAPACK's, on easy, cyclic, defective and broken matrices."""
 
 import numba

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The cache of compiled kernels: used when it is right, and never in the way when it is not."""
 
 import contextlib

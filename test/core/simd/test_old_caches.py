@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Old caches go; what may be in use, or is somebody else's, stays."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Same input, same bits: what LLVM may round in two ways, kernels of the estimate do not write.
 
 Before a loop that stores, the vectorizer asks at run time whether the arrays overlap, and asks with

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Machine code of the package: used where the CPU can run it, and only there."""
 
 import importlib

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The traced code against the same arithmetic in NumPy."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Map files: what is written is read back, what COLMAP wrote is understood, hostile ones refused.
 
 The model in the folder colmap was written by pycolmap 4.2.1 (4 images, 14 points with noise, SIFT

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The frames of a recording: the same numbers as tf2, and what cannot be answered is said."""
 
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Makes the module beside it importable, from the tests and from workers."""
 
 import sys

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Work that ends processes, or tells of them: a module of its own, which workers can import."""
 
 import os

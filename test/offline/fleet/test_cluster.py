@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Processes that are killed in the middle of their work, and what becomes of it."""
 
 import os

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Folders of results: a recording's own name, and never the same twice."""
 
 import random

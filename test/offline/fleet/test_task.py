@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """One recording of many: whole or not there, and done again only when it has changed."""
 
 import json

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the viewer draws: shapes by their definitions, not by the code's own formulas."""
 
 import numpy as np

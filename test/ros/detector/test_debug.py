@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Debug pictures wait for poses as long as somebody sends poses."""
 
 from typing import Any

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The marker detector as its users meet it: its own process, real DDS, images of all kinds."""
 
 import signal

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The demo as a user starts it, with a few frames; and what Ctrl-C leaves of it."""
 
 import os

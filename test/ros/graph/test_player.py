@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer replay --ros``: the recording's messages in the graph, paced, with /clock."""
 
 import re

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """``rs_localizer watch``: what a node publishes, as text; clean ends."""
 
 import re

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A robot around the localizer in its own process: what it sends, and what it hears of the node."""
 
 import contextlib

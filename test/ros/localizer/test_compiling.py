@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The first start on a machine: while kernels are compiled, the node answers and says so."""
 
 from typing import Any

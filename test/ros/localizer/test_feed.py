@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The latest camera_info is used, whatever the worker has got round to."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """base_frame and publish_tf of the node in its own process, with tf2_ros or a stand-in for it."""
 
 import signal

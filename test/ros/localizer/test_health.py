@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The diagnosis of a node: what a user reads first when there are no poses."""
 
 import re

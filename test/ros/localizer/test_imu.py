@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """An IMU beside the camera, heard by a node in its own process: as offline, or as without it."""
 
 import re

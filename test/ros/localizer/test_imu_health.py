@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What is said of the IMU: numbers where they are known, and a warning where it is not used."""
 
 import math

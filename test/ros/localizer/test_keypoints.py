@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints and maps over live DDS: latched, late, replaced, bad; said in the diagnostics."""
 
 import os

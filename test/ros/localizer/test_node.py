@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The node as its users meet it: its own process, real DDS, signals, parameters, life cycle."""
 
 import signal

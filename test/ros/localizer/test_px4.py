@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The output for PX4: asked for, refused where it cannot be, and in px4_msgs' types."""
 
 import sys

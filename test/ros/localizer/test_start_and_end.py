@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The node from its start to its end: signals, arguments that are wrong, what it says of itself."""
 
 import os

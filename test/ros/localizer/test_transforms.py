@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """TF in the node. Where tf2_ros is installed the same tests run with it."""
 
 import importlib

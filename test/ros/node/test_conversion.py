@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Messages of recordings become messages of rclpy and stay the same to the last byte."""
 
 import array

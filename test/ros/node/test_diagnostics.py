@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A state that lasts is worth a line in the log, ever more seldom."""
 
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What the gaps between stamps tell of messages that have not come."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Parameters are the settings: declared with description and range, refused with the reason."""
 
 import re

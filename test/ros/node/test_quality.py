@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A topic is heard as well as its publishers send it, whoever comes first."""
 
 import time

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The worker: nothing waits for a slow frame, the newest wins, and every frame is accounted for."""
 
 import threading

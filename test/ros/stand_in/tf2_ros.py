@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """Stands in for tf2_ros where there is none: it is not on PyPI.
 
 The interface is that of geometry2 (branch jazzy) as far as the node uses it. tf2_msgs is not on

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """What happens to a node while it works: floods, transitions, settings, silence, strangers."""
 
 import re

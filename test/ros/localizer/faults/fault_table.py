@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """All faults: what is done to the node, and what it has to say."""
 
 from collections.abc import Callable

@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """A live node, a peer that talks to it over DDS, and the frames that it sends."""
 
 import array

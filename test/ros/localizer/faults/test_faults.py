@@ -1,3 +1,5 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
 """The fault matrix: what is wrong, what the node says of it, and that it localizes afterwards.
 
 A fault is a row of :data:`FAULTS`. The table is written to a file with
