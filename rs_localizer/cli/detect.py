@@ -31,7 +31,8 @@ from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import STORAGES
 from rs_localizer.offline.detect import Extraction, Options, Recorded, record, record_features
 from rs_localizer.offline.fleet.task import Figures, Kind
-from rs_localizer.pipeline.images import FrameDetector, FrameExtractor
+from rs_localizer.pipeline.images import FrameDetector
+from rs_localizer.pipeline.keypoints import FrameExtractor
 from rs_localizer.process.arguments import integer, number
 from rs_localizer.settings import build, settings
 

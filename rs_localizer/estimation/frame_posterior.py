@@ -199,9 +199,11 @@ def _of_points(
         ):
             frame = of_map
     shaken = _shaken(frame, Asked(smooth, wide), other) if turns else None
-    weighed = frame.smooth or frame.planar
-    if weighed or (assumed.may_rest and not _clearly_moving(best, terms, assumed)):
-        posterior, evidence = _merged(frame)
+    # A map that is known to be bent may look like motion.
+    moving = declared == 0.0 and not frame.planar and _clearly_moving(best, terms, assumed)
+    slowest = 0 if assumed.may_rest and not moving else len(SPEEDS) - 1
+    if frame.smooth or frame.planar or slowest == 0:
+        posterior, evidence = _merged(frame, slowest)
     else:
         covariance = along_arcs(best.inflation * best.covariance, best.state[9:12])
         posterior, evidence = replace(best, covariance=covariance), -math.inf
@@ -359,14 +361,16 @@ def _clearly_moving(best: Posterior, terms: PriorTerms, assumed: Assumed) -> boo
     )
 
 
-def _merged(frame: _Frame) -> tuple[Posterior, float]:
-    """The mixture of all modes as one Gaussian, and its evidence."""
+def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
+    """The mixture of all modes as one Gaussian, and its evidence.
+
+    ``slowest``: index of the first typical speed that is weighed.
+    """
     best, assumed = frame.best, frame.assumed
     odds = assumed.scales.speeds + assumed.of_rest * _RESTS
     by_turn = np.zeros(len(SPEEDS))
     if assumed.turn is not None:
         by_turn = np.array([assumed.turn.evidence(speed) for speed in SPEEDS])
-    slowest = 0 if assumed.may_rest else len(SPEEDS) - 1
     found = mixture_of(
         _inliers(frame), best.state, frame.terms, odds, by_turn, slowest,
         assumed.turn is not None, frame.planar, _smooth(frame),

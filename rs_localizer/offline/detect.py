@@ -30,14 +30,8 @@ from rs_localizer.markers.displaced import LeaveOneOut, Predict, rms, still_erro
 from rs_localizer.markers.maps import MarkerMap
 from rs_localizer.markers.recognition import recognized
 from rs_localizer.offline.image_sources import Carried, Shot
-from rs_localizer.pipeline.images import (
-    Detected,
-    Extracted,
-    FrameDetector,
-    FrameExtractor,
-    correspondences,
-    keypoints,
-)
+from rs_localizer.pipeline.images import Detected, FrameDetector, correspondences
+from rs_localizer.pipeline.keypoints import Extracted, FrameExtractor, keypoints
 from rs_localizer.pipeline.refusal import Refusal
 
 # Fewer corners than this say nothing about how well a pose fits.
