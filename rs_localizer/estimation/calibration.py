@@ -100,7 +100,7 @@ def _unit_of(count: int) -> Array:
 
 def _smooth_columns(posterior: Posterior, lines: Lines, chosen: BoolArray) -> Array:
     """By how many pixels a deviation of each coefficient of the smooth error moves (n,2,q)."""
-    scale, rays = posterior.model_error, lines.image[chosen]
+    scale, rays = posterior.shared, lines.image[chosen]
     if not scale > 0.0:
         return np.zeros((len(rays), 2, 0))
     if posterior.bend.shape[1]:

@@ -334,6 +334,7 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
         squared_errors=fit.squared_errors,
         shake=fit.turns,
         model_error=fit.smooth,
+        shared=fit.smooth,
         bend=bend,
         agreement=fit.agreement,
         scales=scales,
@@ -383,6 +384,7 @@ def _merged(frame: _Frame, slowest: int) -> tuple[Posterior, float]:
         covariance=found.covariance,
         squared_errors=frame.observations.squared_errors(found.state),
         model_error=found.smooth,
+        shared=found.shared,
         bend=frame.bend,
         speeds=found.speeds,
         scales=Scales.nothing()._replace(speeds=found.log_likelihoods),
@@ -428,11 +430,13 @@ def _either(
     covariance = (1.0 - weight) * (shaken.covariance + np.outer(mean, mean)) + weight * away
     covariance[:PARAMETERS, :PARAMETERS] += weight * steady.covariance
     likely = steady if probable > 0.5 else shaken
+    shared = math.sqrt(weight * steady.shared**2 + (1.0 - weight) * shaken.shared**2)
     return replace(
         likely,
         state=apply_step(shaken.state, mean[:PARAMETERS]),
         covariance=covariance,
         shake=(1.0 - probable) * shaken.shake,
+        shared=shared,
         scales=shaken.scales._replace(speeds=steady.scales.speeds),
     )
 

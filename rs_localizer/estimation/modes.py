@@ -191,7 +191,7 @@ class _Modes(NamedTuple):
     evidences: Array  # (k,)
     costs: Array  # (k,)
     speeds: IntArray  # (k,) indices of SPEEDS
-    smooth: float  # px, of the last one
+    smooths: Array  # (k,) px
 
 
 class Mixture(NamedTuple):
@@ -203,6 +203,7 @@ class Mixture(NamedTuple):
     speeds: Array  # (5,) weights of the typical speeds in the covariance
     log_likelihoods: Array  # (5,) of the typical speeds
     smooth: float  # px, of the fastest: at rest, what moves looks like an error of the map
+    shared: float  # px, of all: root mean square by their weights in the covariance
     evidences: Array  # (k,) of the modes
     costs: Array  # (k,) noise variances
     steps: Array  # (k,18) to them from the most probable one
@@ -264,7 +265,7 @@ def mixture_of(
         total = _log_sum(total, evidences[k])
     if total == -np.inf:
         return Mixture(
-            start, modes.covariances[0], total, weights, weights, 0.0, evidences, modes.costs,
+            start, modes.covariances[0], total, weights, weights, 0.0, 0.0, evidences, modes.costs,
             np.zeros((count, PARAMETERS)),
         )  # fmt: skip
     first = int(np.argmax(probable))
@@ -274,10 +275,13 @@ def mixture_of(
     state, covariance, steps = averaged(modes.states, modes.covariances, first, probable, possible)
     for k in range(count):
         weights[modes.speeds[k]] += possible[k]
+    shared = 0.0
+    for k in range(count):
+        shared += possible[k] * modes.smooths[k] ** 2
     log_likelihoods = np.maximum(log_likelihoods - np.max(log_likelihoods), _LEAST_LIKELY)
     return Mixture(
-        state, covariance, total, weights, log_likelihoods, modes.smooth, evidences, modes.costs,
-        steps,
+        state, covariance, total, weights, log_likelihoods, modes.smooths[count - 1],
+        math.sqrt(shared), evidences, modes.costs, steps,
     )  # fmt: skip
 
 
@@ -302,16 +306,16 @@ def _modes(
     data, most = weighted(inliers.data, inliers.chosen), 2 * len(SPEEDS)
     modes = _Modes(
         np.empty((most, STATE_SIZE)), np.empty((most, PARAMETERS, PARAMETERS)), np.empty(most),
-        np.empty(most), np.empty(most, np.int64), 0.0,
+        np.empty(most), np.empty(most, np.int64), np.empty(most),
     )  # fmt: skip
-    near, count, best, scale = start.copy(), 0, -np.inf, 0.0
+    near, count, best = start.copy(), 0, -np.inf
     if slowest == 0:
         near[12:] = 0.0
     leans, twin, has_twin = planar, start, False
     for speed in range(slowest, len(SPEEDS)):
         prior = terms_at(terms, SPEEDS[speed], turn_known)
         mode = _mode(data, inliers, near, prior, odds[speed], smooth)
-        count, scale = _keep(modes, count, speed, mode), mode.smooth
+        count = _keep(modes, count, speed, mode)
         near, here = mode.state, mode.evidence
         other = has_twin
         if leans and not has_twin:
@@ -320,14 +324,14 @@ def _modes(
             second = _mode(data, inliers, twin, prior, odds[speed], smooth)
             leans = has_twin = _apart(mode, second)
             if has_twin:
-                count, scale = _keep(modes, count, speed, second), second.smooth
+                count = _keep(modes, count, speed, second)
                 twin, here = second.state, max(here, second.evidence)
         best = max(best, here)
         if here < best - FAR_LESS_PROBABLE / TEMPER:
             break
     return _Modes(
         modes.states[:count], modes.covariances[:count], modes.evidences[:count],
-        modes.costs[:count], modes.speeds[:count], scale,
+        modes.costs[:count], modes.speeds[:count], modes.smooths[:count],
     )  # fmt: skip
 
 
@@ -337,7 +341,7 @@ def _keep(modes: _Modes, count: int, speed: int, mode: Mode) -> int:
     write(modes.states[count], mode.state)
     modes.covariances[count] = mode.covariance
     modes.evidences[count], modes.costs[count] = mode.evidence, mode.cost
-    modes.speeds[count] = speed
+    modes.speeds[count], modes.smooths[count] = speed, mode.smooth
     return count + 1
 
 

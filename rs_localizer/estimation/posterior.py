@@ -70,6 +70,7 @@ class Posterior:
     mirror: Mirror | None = None
     shake: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k,3) rad, coefficients
     model_error: float = 0.0  # px, root mean square of what the motion leaves beside the noise
+    shared: float = 0.0  # px, likewise, of all modes together
     agreement: float = 0.0  # of neighbouring rows, standard deviations
     declared: float = 0.0  # px, the part of it that the map is known to be off
     # Probabilities of the typical speeds; empty: the configured one
