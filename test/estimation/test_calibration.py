@@ -61,19 +61,22 @@ def bowed(points: np.ndarray, _: int) -> np.ndarray:
 def inside(
     localizer: rsl.Localizer, depth: float, frames: int = 40,
     mapped: Callable[[np.ndarray, int], np.ndarray] = lambda points, _: points,
-    noise: float = 0.3,
+    noise: float = 0.3, least: float = 1.0,
 ) -> float:  # fmt: skip
-    """Share of poses within their 95 % regions."""
+    """Share of poses within their 95 % regions; of the frames at least so many have one."""
     held = []
     for seed in range(frames):
         points, pixels, true = frame(seed, depth, noise)
         found = localizer.localize(mapped(points, seed), pixels)
-        assert found, str(found)
+        if not found:
+            assert least < 1.0, str(found)
+            continue
         centre = -true.rotation.T @ true.translation
         turn = so3.log(np.ascontiguousarray(found.rotation @ true.rotation.T))
         error = np.concatenate([turn, found.rotation @ (centre - found.position)])
         squared = error @ np.linalg.solve(found.covariance[POSE, POSE], error)
         held.append(squared < chi2.ppf(0.95, 6))
+    assert len(held) >= least * frames
     return float(np.mean(held))
 
 
@@ -147,6 +150,12 @@ def test_regions_hold_before_a_bent_map_that_is_declared(depth, least):
     """
     declared = rsl.Localizer(CAMERA, map_deviation=0.01, calibration=EXACT)
     assert inside(declared, depth, 30, bent) >= least
+
+
+def test_regions_before_a_wall_count_the_smooth_errors_of_all_modes():
+    """A calibration with distortion that the lens has not: 0.21 of 14 when the fastest counted."""
+    distorted = rsl.Localizer(replace(CAMERA, D=np.array([0.03, 0.0, 0.0, 0.0, 0.0])))
+    assert inside(distorted, 0.0, 20, noise=1.0, least=0.5) >= 0.7
 
 
 def test_regions_hold_in_a_room_whose_bend_shows_and_is_not_declared():

@@ -20,7 +20,7 @@ from rs_localizer.markers.poses import Pose
 from rs_localizer.markers.prints import Marker
 from rs_localizer.process.arguments import number
 
-_LEAST_FLOOR = 3
+_LEAST_FLOOR = 3  # points make a plane
 # A floor whose points lie within this part of their extent of a line has no direction.
 _LINE = 1e-3
 _UP = np.array([0.0, 0.0, 1.0])
