@@ -155,6 +155,27 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     )
 
 
+# The numbers of these models in COLMAP's binary files.
+_COLMAP_NUMBERS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
+    "FULL_OPENCV",
+)
+
+
+def colmap_line(number: int, model: int, width: int, height: int, parameters: Array) -> str:
+    """A camera of COLMAP's binary files as a line of its text files.
+
+    Raises:
+        ValueError: for a model that is not supported.
+    """
+    if not 0 <= model < len(_COLMAP_NUMBERS):
+        raise ValueError(
+            f"model must be one of {', '.join(_COLMAP_MODELS)}; found COLMAP's number {model}"
+        )
+    values = " ".join(repr(float(value)) for value in parameters)
+    return f"{number} {_COLMAP_NUMBERS[model]} {width} {height} {values}"
+
+
 def colmap_parameters(camera: Camera) -> dict[str, Any]:
     """``model`` and ``params`` that COLMAP knows a camera's delivered images by.
 
