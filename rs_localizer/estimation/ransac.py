@@ -16,6 +16,7 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
 from rs_localizer.core.blocks import write
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.state import STATE_SIZE
@@ -39,14 +40,16 @@ _RANKED_HORIZON = 200_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pool:
-    """Points to draw from.
+    """Points of one camera to draw from.
 
     ``ranked``: they are sorted from the best to the worst and the first samples come from the
     first of them (PROSAC: Chum, Matas, "Matching with PROSAC", CVPR 2005).
     """
 
     points: IntArray
+    row_range: float  # of the row times of its camera's points
     ranked: bool = False
+    share: float = 1.0  # of the samples, beside those of the other pools
 
     def prefix_sizes(self, first: int, count: int, size: int) -> IntArray:
         """From how many points of the pool samples ``first ... first + count - 1`` are drawn."""
@@ -99,6 +102,28 @@ def draw(pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, sa
                 break
 
 
+@kernel
+def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
+    """Turn models (k,18,h) of cameras (h,) into those of their rig.
+
+    ``exp(tau [w]x) R X + C + tau t`` in the axes of a camera is, with all four turned into those of
+    the rig and ``C`` moved by the camera's centre, the same model of the rig.
+    """
+    turned = np.empty(3)
+    for h in range(len(camera)):
+        axes, centre = mounts.axes[camera[h]], mounts.centres[camera[h]]
+        for s in range(len(models)):
+            for column in range(6):
+                # Columns of R, and C, w, t.
+                first, step = (column, 3) if column < 3 else (3 * column, 1)
+                for i in range(3):
+                    turned[i] = centre[i] if column == 3 else 0.0
+                    for k in range(3):
+                        turned[i] += axes[k, i] * models[s, first + step * k, h]
+                for i in range(3):
+                    models[s, first + step * i, h] = turned[i]
+
+
 # Of local optimisation, at the last scale.
 _ITERATIONS = 3
 # Steps of a descent: at its first scale, where it has far to go, and at each of the others.
@@ -123,7 +148,7 @@ def state_of_model(model: Array) -> Array:
 
 @kernel
 def best_models(
-    models: Array, data: Array, gradient: Array, scale: float, keep: int, bar: float
+    models: Array, data: Array, scale: float, keep: int, bar: float
 ) -> tuple[Array, Array]:
     """States (keep,24) and costs (keep,) of the models (k,18,h) with the least truncated error.
 
@@ -140,7 +165,7 @@ def best_models(
                 continue
             state = state_of_model(models[s, :, h])
             limit = min(costs[keep - 1], bar)
-            cost = truncated_cost(data, state, gradient, scale, limit)
+            cost = truncated_cost(data, state, scale, limit)
             if cost < limit:
                 place = keep - 1
                 while place > 0 and cost < costs[place - 1]:
@@ -157,7 +182,6 @@ def optimize(
     states: Array,
     costs: Array,
     data: Array,
-    gradient: Array,
     first_scale: float,
     last_scale: float,
     prior: PriorTerms,
@@ -173,11 +197,11 @@ def optimize(
     for i in range(len(states)):
         if not np.isfinite(costs[i]):
             continue
-        state = anneal(data, states[i], gradient, first_scale, last_scale, prior, noise)
+        state = anneal(data, states[i], first_scale, last_scale, prior, noise)
         state, _, _, _ = refine(
-            data, state, gradient, last_scale, 1.0, prior, noise, 1, _ITERATIONS, _TOLERANCE
+            data, state, last_scale, 1.0, prior, noise, 1, _ITERATIONS, _TOLERANCE
         )
-        cost = truncated_cost(data, state, gradient, last_scale, best_cost)
+        cost = truncated_cost(data, state, last_scale, best_cost)
         if cost < best_cost:
             best, best_cost = state, cost
     return best, best_cost
@@ -187,7 +211,6 @@ def optimize(
 def descend(
     data: Array,
     start: Array,
-    gradient: Array,
     first_scale: float,
     last_scale: float,
     prior: PriorTerms,
@@ -199,20 +222,16 @@ def descend(
     """
     state, scale, iterations = start, first_scale, _FIRST_STEPS
     while scale > last_scale:
-        state, _, _, _ = refine(
-            data, state, gradient, scale, 1.0, prior, noise, 1, iterations, _TOLERANCE
-        )
+        state, _, _, _ = refine(data, state, scale, 1.0, prior, noise, 1, iterations, _TOLERANCE)
         scale, iterations = _RATIO * scale, _STEPS
-    state, _, _, _ = refine(
-        data, state, gradient, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE
-    )
-    return state, truncated_cost(data, state, gradient, last_scale, np.inf)
+    state, _, _, _ = refine(data, state, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE)
+    return state, truncated_cost(data, state, last_scale, np.inf)
 
 
 def warm_up() -> None:
     """Compile what a plane comes to that faces the camera."""
     nothing = np.zeros((0, POINT_SIZE * LANES))
-    descend(nothing, np.zeros(STATE_SIZE), np.zeros(2), 1.0, 1.0, held_terms(), 1.0)
+    descend(nothing, np.zeros(STATE_SIZE), 1.0, 1.0, held_terms(), 1.0)
 
 
 MODEL_SIZE = 18
@@ -293,17 +312,19 @@ def search(
         models = np.empty((hypotheses.solutions, MODEL_SIZE, len(samples)))
         blocks += 1
         rotation = draws.rotations[blocks % len(draws.rotations)]
+        camera, mounts = observations.camera[samples[:, 0]], observations.mounts
         hypotheses.solve(
             observations.points, observations.rays, observations.tau, samples,
-            rotation[None], hypotheses.iterations, models,
+            mounts.axes[camera] @ rotation, hypotheses.iterations, models,
         )  # fmt: skip
+        into_rig(models, camera, mounts)
         states, costs = best_models(
-            models, observations.packed, observations.row_time_gradient,
+            models, observations.packed,
             hypotheses.score_scale, _KEEP, no_fit - best_gain,
         )  # fmt: skip
         best_gain = max(best_gain, no_fit - float(costs[0]))
         state, cost = optimize(
-            states, costs, observations.packed, observations.row_time_gradient,
+            states, costs, observations.packed,
             2.0 * hypotheses.score_scale, hypotheses.final_scale, prior, hypotheses.noise,
         )  # fmt: skip
         if cost < best.cost:
@@ -321,16 +342,18 @@ def _draw(
     random: Random,
     samples: IntArray,
 ) -> None:
-    """Fill the samples from all pools in equal parts, and count what each has given."""
+    """Fill the samples from all pools by their shares, and count what each has given."""
     count, size = samples.shape
+    total, share = sum(pool.share for pool in pools), 0.0
     first = 0
     for index, pool in enumerate(pools):
-        part = samples[first : (index + 1) * count // len(pools)]
+        share += pool.share
+        part = samples[first : count if index == len(pools) - 1 else int(share * count / total)]
         if pool.ranked:
             prefixes = pool.prefix_sizes(drawn[index], len(part), size)
         else:
             prefixes = np.full(len(part), len(pool.points), dtype=np.int64)
-        draw(pool.points, prefixes, observations.tau, observations.row_range, random, part)
+        draw(pool.points, prefixes, observations.tau, pool.row_range, random, part)
         drawn[index] += len(part)
         first += len(part)
 

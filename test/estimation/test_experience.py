@@ -102,7 +102,9 @@ def test_they_forget_it():
 
 def test_what_frames_deny_is_no_prior_of_the_next():
     camera = Camera(640, 480, np.diag([500.0, 500.0, 1.0]), readout_time=0.02)
-    terms, _ = assumptions(camera, LocalizerConfig(), find_solver("r6p_vcwt"))
+    terms, _ = assumptions(
+        camera.readout_time, camera.focal_length, LocalizerConfig(), find_solver("r6p_vcwt")
+    )
     calm = speeds_after(0.003, 0.005).prior
     slow, prior = told_speed(terms, calm)
     own, told = (one.informations[0].diagonal()[6:12] for one in (terms, slow))
