@@ -17,6 +17,13 @@ if TYPE_CHECKING:
     from rs_localizer.core.units import CameraState, camera_state
     from rs_localizer.estimation.prior import Prior
     from rs_localizer.io.calibration import read_calibration
+    from rs_localizer.io.rigs import (
+        RigParts,
+        read_camchain,
+        read_rig_config,
+        write_camchain,
+        write_rig_config,
+    )
     from rs_localizer.localizer import Localizer
     from rs_localizer.offline.table import localize_recording
     from rs_localizer.solvers.minimal import solve_minimal
@@ -38,6 +45,7 @@ __all__ = [
     "Reason",
     "Rig",
     "RigEstimate",
+    "RigParts",
     "Roi",
     "ScanDirection",
     "Tracker",
@@ -45,8 +53,12 @@ __all__ = [
     "camera_state",
     "localize_recording",
     "read_calibration",
+    "read_camchain",
+    "read_rig_config",
     "rectify",
     "solve_minimal",
+    "write_camchain",
+    "write_rig_config",
 ]
 
 if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all others
@@ -64,6 +76,10 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
         "io.calibration": ("read_calibration",),
+        "io.rigs": (
+            *("RigParts", "read_camchain", "read_rig_config"),
+            *("write_camchain", "write_rig_config"),
+        ),
         "localizer": ("Localizer",),
         "offline.table": ("localize_recording",),
         "solvers.minimal": ("solve_minimal",),

@@ -42,6 +42,7 @@ def test_versions_agree():
     assert rs_localizer.__version__ == version
     newest = next(iter(get_changelog_from_path(str(ROOT / "CHANGELOG.rst")).foreach_version()))
     assert newest[0] == version
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def build_wheel(directory: Path, **environment: str) -> Path:

@@ -174,6 +174,7 @@ def main(
             raise
         return code
     except KeyboardInterrupt:
+        remove_unfinished()  # it may have come while that was being removed
         return _fail(name, "interrupted", INTERRUPTED)
     return 0
 

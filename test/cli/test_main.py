@@ -7,6 +7,7 @@ import importlib
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import pytest
 import rs_localizer
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.main import COMMANDS, main
+from rs_localizer.io.atomic_files import atomic_files
 
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:
@@ -104,6 +106,24 @@ def test_faults_are_one_line_and_an_exit_code(error, code, text, monkeypatch, ca
     monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
     assert main(["replay"]) == code
     assert capsys.readouterr().err.endswith(text)
+
+
+def test_a_signal_while_the_workplace_is_removed(tmp_path, monkeypatch):
+    remove = shutil.rmtree
+
+    def interrupted(path: Path, ignore_errors: bool = False) -> None:
+        monkeypatch.setattr(shutil, "rmtree", remove)
+        raise KeyboardInterrupt
+
+    def make(arguments: argparse.Namespace) -> None:
+        with atomic_files(tmp_path / "map.yaml") as (part,):
+            part.write_text("whole")
+            monkeypatch.setattr(shutil, "rmtree", interrupted)
+
+    command = SimpleNamespace(add_arguments=lambda parser: None, run=make)
+    monkeypatch.setitem(sys.modules, COMMANDS["replay"].module, command)
+    assert main(["replay"]) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["map.yaml"]
 
 
 def test_what_a_command_prints_as_json(monkeypatch, capsys):
