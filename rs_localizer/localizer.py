@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,14 +19,13 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lens import LensError, with_lens
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.rig import ByCamera, Exposure, Rig, RigEstimate
+from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation import frame_fit, mirror, motion_model, observations, ransac
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.assumptions import (
-    Assumed,
     assumptions,
     known_terms,
     told_speed,
@@ -39,6 +39,7 @@ from rs_localizer.estimation.observations import (
     Observed,
     Sighted,
     checked,
+    checked_of_rig,
     find_usable,
     packed,
     relinearized,
@@ -106,29 +107,24 @@ class Localizer:
             camera.focal_length, self.config, self._solver, start_solver(self._solver)
         )
         self._exposure = camera.exposure()
-        self._assumptions = self._assume(self._exposure.span)
+        # Of as many spans as a rig of cameras that are in step has.
+        self._assume = lru_cache(16)(
+            partial(assumptions, rig=camera, config=self.config, solver=self._solver)
+        )
 
     @property
     def camera(self) -> Camera:
-        """The camera of a rig of one.
-
-        Raises:
-            ValueError: there are several.
-        """
+        """The camera of a rig of one; ``ValueError`` where there are several."""
         if len(self.rig.cameras) > 1:
             raise ValueError(f"the rig has several cameras: {', '.join(self.rig.cameras)}")
         return next(iter(self.rig.cameras.values()))
-
-    def _assume(self, span: float) -> tuple[PriorTerms, Assumed]:
-        return assumptions(span, self.rig.focal_length, self.config, self._solver)
 
     def warm_up(self) -> None:
         """Compile every kernel that :meth:`localize`, or tracking, may need, or load it from the
         cache.
         """
         if not self._alone:
-            first = next(iter(self.rig.cameras.values()))
-            Localizer(first, self.config).warm_up()
+            Localizer(next(iter(self.rig.cameras.values())), self.config).warm_up()
             return
         for part in (frame_fit, mirror, motion_model, observations, ransac):
             part.warm_up()
@@ -227,14 +223,14 @@ class Localizer:
             threshold = self.config.inlier_threshold
             if not found or (plain and refuted(found.residuals, plain.residuals, threshold)):
                 found = plain
-        return found if self._alone or not found else _of_rig(found, given)
+        if self._alone or not found:
+            return found
+        return RigEstimate.of(found, given.exposure, given.counts)
 
     def _sights(
         self, points: Any, pixels: Any, scores: Any, stamps: Mapping[str, float] | None
     ) -> tuple[Exposure, Sequence[int], Array, Array, Array | None]:
-        """When and from where a frame was seen, how many points each camera saw, and all points,
-        pixels and scores.
-        """
+        """As :func:`checked_of_rig`, of a camera alone or a rig."""
         if self._alone:
             if isinstance(points, Mapping) or stamps is not None:
                 raise ValueError("images by names, and their stamps, are those of a Rig")
@@ -245,35 +241,12 @@ class Localizer:
                 "a frame of a rig is {name: (points, pixels)} or {name: (points, pixels, scores)}; "
                 f"its cameras are {', '.join(self.rig.cameras)}"
             )
-        if not points:
-            raise ValueError("the frame has no image")
-        exposure, parts = self.rig.exposure(tuple(points), stamps), []
-        for name, part in points.items():
-            if len(part) not in (2, 3):
-                raise ValueError(f"{name}: (points, pixels) or (points, pixels, scores) are needed")
-            try:
-                parts.append(checked(part[0], part[1], part[2] if len(part) == 3 else None))
-            except ValueError as error:
-                raise ValueError(f"{name}: {error}") from None
-        scored = [part[2] for part in parts if part[2] is not None]
-        if scored and len(scored) < len(parts):
-            raise ValueError("either all images of a frame have scores or none has")
-        return (
-            exposure,
-            [len(part[0]) for part in parts],
-            np.concatenate([part[0] for part in parts]),
-            np.concatenate([part[1] for part in parts]),
-            np.concatenate(scored) if scored else None,
-        )
+        return checked_of_rig(self.rig, points, stamps)
 
     def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
         """What there is to find by a lens that other frames tell of, or by the calibration's."""
         exposure, counts, points, pixels, scores, prior, expected_share, turn = given
-        terms, assumed = configured = (
-            self._assumptions
-            if exposure.span == self._exposure.span
-            else self._assume(exposure.span)
-        )
+        terms, assumed = configured = self._assume(exposure.span)
         if prior is not None or turn is not None:
             if assumed.may_rest:
                 terms, prior = told_speed(terms, prior)
@@ -373,7 +346,7 @@ class Localizer:
     def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.
         assumed = observed.assumed
-        may_rest = self._assumptions[1].may_rest and len(terms.informations) == 1
+        may_rest = self._assume(self._exposure.span)[1].may_rest and len(terms.informations) == 1
         if may_rest != assumed.may_rest:
             assumed = replace(assumed, may_rest=may_rest)
         gate, sighted = self._gate(observed, best.state), observed.sighted
@@ -439,16 +412,3 @@ class Localizer:
             lens=observed.lens,
             of_lens=lens,
         )
-
-
-def _of_rig(found: Estimate, given: _Given) -> RigEstimate:
-    """The estimate of a rig, with what it says of the points by the names of the cameras."""
-    names, ends = given.exposure.names, np.cumsum(given.counts).tolist()
-    places = {
-        name: slice(end - count, end)
-        for name, count, end in zip(names, given.counts, ends, strict=True)
-    }
-    values = {each.name: getattr(found, each.name) for each in fields(Estimate)}
-    for name in ("inliers", "residuals"):
-        values[name] = ByCamera.of(values[name], places)
-    return RigEstimate(**values, time=given.exposure.time, names=names)

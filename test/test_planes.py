@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
-from rs_localizer.core.rig import Mounts
+from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
@@ -75,7 +75,7 @@ def test_the_best_motion_is_the_minimum_of_the_exact_problem(tilt, turn, travel)
     # All points are inliers here, and nothing is averaged yet.
     localizer = rsl.Localizer(CAMERA, inlier_threshold=4.0)
     terms, _ = assumptions(
-        CAMERA.readout_time, CAMERA.focal_length, localizer.config,
+        CAMERA.readout_time, Rig.of(CAMERA), localizer.config,
         find_solver(localizer.config.solver),
     )  # fmt: skip
     compared = 0

@@ -20,7 +20,7 @@ from benchmarks.experiments.kernels import best_solutions, refine_frames
 from benchmarks.experiments.trials import POINTS, Motions, Trials, camera
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.rig import Mounts
+from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import SOLVERS, find_solver
@@ -161,7 +161,7 @@ def _best(models: Array, trials: Trials, scale: float) -> Array:
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
     prior, _ = assumptions(
-        camera().readout_time, camera().focal_length, LocalizerConfig(), find_solver("r6p_vcwt")
+        camera().readout_time, Rig.of(camera()), LocalizerConfig(), find_solver("r6p_vcwt")
     )
     found = refine_frames(np.ascontiguousarray(models), *view_arguments(trials), threshold, prior)
     w, velocity = -found[:, 12:15], found[:, 15:18]

@@ -19,7 +19,8 @@ from rs_localizer.core.rig import Mounts
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, STATE_TRANSLATION, rotation_of
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.ransac import MODEL_SIZE, best_models, draw, generator
+from rs_localizer.estimation.ransac import best_models, draw, generator
+from rs_localizer.solvers.batch import MODEL_SIZE
 from rs_localizer.solvers.table import find_solver
 
 

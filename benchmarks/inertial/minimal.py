@@ -164,7 +164,7 @@ def _found(
     """Rotation (3,3) camera_from_map by the robust loop and the refinement."""
     config = LocalizerConfig()
     exposure = Rig.of(camera).exposure()
-    terms, assumed = assumptions(camera.readout_time, camera.focal_length, config, solver)
+    terms, assumed = assumptions(camera.readout_time, Rig.of(camera), config, solver)
     usable = find_usable(exposure, *given, [len(given[0])], turn)
     observed = Observed(
         packed(exposure, given[0], usable),

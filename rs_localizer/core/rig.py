@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -267,6 +267,19 @@ class RigEstimate(Estimate):
 
     time: float = 0.0  # s, middle of all exposures, by the clock of the stamps
     names: tuple[str, ...] = ()  # of the cameras that had a part, in the order of the points
+
+    @classmethod
+    def of(cls, estimate: Estimate, exposure: Exposure, counts: Sequence[int]) -> RigEstimate:
+        """The estimate of a frame of a rig, of whose cameras each has so many points."""
+        ends = np.cumsum(counts).tolist()
+        places = {
+            name: slice(end - count, end)
+            for name, count, end in zip(exposure.names, counts, ends, strict=True)
+        }
+        values = {each.name: getattr(estimate, each.name) for each in fields(Estimate)}
+        for name in ("inliers", "residuals"):
+            values[name] = ByCamera.of(values[name], places)
+        return cls(**values, time=exposure.time, names=exposure.names)
 
     def at_time(self, time: float) -> tuple[Array, Array]:
         """Rotation (3,3) and translation (3,) rig_from_map at a time in s."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.estimation.prior import (
@@ -56,13 +57,12 @@ class Assumed:
 
 
 def assumptions(
-    span: float, focal_length: float, config: LocalizerConfig, solver: Solver
+    span: float, rig: Rig, config: LocalizerConfig, solver: Solver
 ) -> tuple[PriorTerms, Assumed]:
     """What the configuration assumes of motion, cameras and map, per span of the row times.
 
     Args:
         span: s; 0: unknown.
-        focal_length: px.
     """
     span = span or _UNKNOWN_READOUT_TIME
     velocity, acceleration = config.velocity_prior, config.acceleration
@@ -76,7 +76,7 @@ def assumptions(
     )
     return terms, Assumed(
         map_deviation=config.map_deviation,
-        focal_length=focal_length,
+        focal_length=rig.focal_length,
         may_rest=solver.rolling_shutter and min(velocity.angular, velocity.linear) > 0.0,
         rolling=solver.rolling_shutter,
         scales=Scales.nothing(),

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from rs_localizer.core.gyro_compensated import gyro_compensated
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
-from rs_localizer.core.rig import Exposure, Mounts
+from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Failure
@@ -103,6 +103,39 @@ def checked(
         if not np.all(np.isfinite(array)):
             raise ValueError(f"{name} must be finite, found NaN or infinity")
     return points, pixels, scores
+
+
+def checked_of_rig(
+    rig: Rig, parts: Mapping[str, Sequence[ArrayLike]], stamps: Mapping[str, float] | None
+) -> tuple[Exposure, list[int], Array, Array, Array | None]:
+    """When and from where a frame is seen, how many points each camera sees, and the points,
+    pixels and scores of all, as :func:`checked`.
+
+    Args:
+        parts: (points, pixels) or (points, pixels, scores) by the names of the cameras.
+        stamps: s, of the first rows.
+    """
+    if not parts:
+        raise ValueError("the frame has no image")
+    exposure, checks = rig.exposure(tuple(parts), stamps), []
+    for name, part in parts.items():
+        if len(part) not in (2, 3):
+            raise ValueError(f"{name}: (points, pixels) or (points, pixels, scores) are needed")
+        try:
+            checks.append(checked(part[0], part[1], part[2] if len(part) == 3 else None))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+    points, pixels, scores = zip(*checks, strict=True)
+    scored = [values for values in scores if values is not None]
+    if scored and len(scored) < len(parts):
+        raise ValueError("either all images of a frame have scores or none has")
+    return (
+        exposure,
+        [len(each) for each in points],
+        np.concatenate(points),
+        np.concatenate(pixels),
+        np.concatenate(scored) if scored else None,
+    )
 
 
 def distinct(points: Array, pixels: Array, camera: IntArray, chosen: IntArray) -> IntArray:

@@ -16,7 +16,6 @@ import numpy as np
 
 from rs_localizer.core.arrays import Array, BoolArray, IntArray, Random
 from rs_localizer.core.blocks import write
-from rs_localizer.core.rig import Mounts
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.state import STATE_SIZE
@@ -24,6 +23,7 @@ from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.refine import anneal, refine
 from rs_localizer.estimation.residuals import POINT_SIZE, truncated_cost
+from rs_localizer.solvers.batch import MODEL_SIZE, into_rig
 
 
 def generator(seed: int) -> Random:
@@ -100,28 +100,6 @@ def draw(pool: Any, prefixes: Any, tau: Array, row_range: float, random: Any, sa
                 last = max(last, tau[point])
             if last - first >= _LEAST_ROW_SPREAD * row_range:
                 break
-
-
-@kernel
-def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
-    """Turn models (k,18,h) of cameras (h,) into those of their rig.
-
-    ``exp(tau [w]x) R X + C + tau t`` in the axes of a camera is, with all four turned into those of
-    the rig and ``C`` moved by the camera's centre, the same model of the rig.
-    """
-    turned = np.empty(3)
-    for h in range(len(camera)):
-        axes, centre = mounts.axes[camera[h]], mounts.centres[camera[h]]
-        for s in range(len(models)):
-            for column in range(6):
-                # Columns of R, and C, w, t.
-                first, step = (column, 3) if column < 3 else (3 * column, 1)
-                for i in range(3):
-                    turned[i] = centre[i] if column == 3 else 0.0
-                    for k in range(3):
-                        turned[i] += axes[k, i] * models[s, first + step * k, h]
-                for i in range(3):
-                    models[s, first + step * i, h] = turned[i]
 
 
 # Of local optimisation, at the last scale.
@@ -233,8 +211,6 @@ def warm_up() -> None:
     nothing = np.zeros((0, POINT_SIZE * LANES))
     descend(nothing, np.zeros(STATE_SIZE), 1.0, 1.0, held_terms(), 1.0)
 
-
-MODEL_SIZE = 18
 
 # Of every block this many hypotheses are optimised: a six-point model of inliers alone is often
 # not the first in a block, because noise makes it miss most of the other inliers.
