@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rs_localizer.core.camera import Camera, DistortionModel, Roi
     from rs_localizer.core.reasons import Reason
     from rs_localizer.core.rectification import rectify
+    from rs_localizer.core.rig import Rig, RigEstimate
     from rs_localizer.core.scanning import ScanDirection
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.types import Estimate, Failure
@@ -42,6 +43,8 @@ __all__ = [
     "Motion",
     "Prior",
     "Reason",
+    "Rig",
+    "RigEstimate",
     "RigParts",
     "Roi",
     "ScanDirection",
@@ -66,6 +69,7 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.camera": ("Camera", "DistortionModel", "Roi"),
         "core.reasons": ("Reason",),
         "core.rectification": ("rectify",),
+        "core.rig": ("Rig", "RigEstimate"),
         "core.scanning": ("ScanDirection",),
         "core.shutter": ("Motion",),
         "core.types": ("Estimate", "Failure"),

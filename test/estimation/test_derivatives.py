@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 
+from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation import observations, residuals
 
 from .projection import (
@@ -29,7 +30,8 @@ def packed(points, rays, direction, shift=0.0):
     by_ray = jacobian_of(rays)
     moved = rays + np.linalg.solve(by_ray, np.broadcast_to(shift, rays.shape)[..., None])[..., 0]
     tau = row_time(pixels_of(moved), direction)
-    return observations.pack(points, moved, tau, jacobian_of(moved)), tau
+    mounts = Mounts.one(gradient(direction))
+    return observations.Observations.of(points, moved, tau, jacobian_of(moved), mounts).packed, tau
 
 
 def numerical(state, points, direction, coefficients=STILL, h=1e-5):
@@ -52,9 +54,7 @@ def test_normal_equations_are_those_of_the_forward_projection(direction):
     shift = np.array([2e-3, -3e-3])
     data, _ = packed(points, rays, direction, shift)
     information, slope = np.empty((18, 18)), np.empty(18)
-    cost = residuals.normal_equations(
-        data, state, gradient(direction), 100.0, 0.0, 2, information, slope
-    )
+    cost = residuals.normal_equations(data, state, 100.0, 0.0, 2, information, slope)
     assert cost == pytest.approx(len(points) * shift @ shift, rel=1e-3)
     expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
     scale = np.sqrt(np.diag(expected))
@@ -76,9 +76,7 @@ def test_lines_are_those_of_the_forward_projection(direction, coefficients):
     h = 1e-5
     rates = (shake(tau + h, coefficients) - shake(tau - h, coefficients)) / (2 * h)
     turns = np.column_stack([shake(tau, coefficients), rates])
-    errors, by_motion, by_turn, seen, image = residuals.linearized(
-        data, len(points), state, gradient(direction), turns
-    )
+    errors, by_motion, by_turn, seen, image = residuals.linearized(data, len(points), state, turns)
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)
     np.testing.assert_allclose(seen, tau, atol=1e-9)
     np.testing.assert_allclose(image, rays, atol=1e-9)
@@ -109,7 +107,7 @@ def test_errors_beside_the_shaking_are_distances_of_pixels():
     h = 1e-5
     rates = (shake(measured + h, SHAKE) - shake(measured - h, SHAKE)) / (2 * h)
     errors, *_ = residuals.linearized(
-        data, len(points), state, gradient(direction),
+        data, len(points), state,
         np.column_stack([shake(measured, SHAKE), rates]),
     )  # fmt: skip
     np.testing.assert_allclose(errors, -off, atol=5e-3)
@@ -122,15 +120,13 @@ def test_a_still_camera_has_the_lines_of_its_normal_equations():
     off = 0.5 * np.random.default_rng(1).normal(size=rays.shape)
     data, _ = packed(points, rays, direction, off)
     errors, by_motion, *_ = residuals.linearized(
-        data, len(points), state, gradient(direction), np.zeros((len(points), 6))
+        data, len(points), state, np.zeros((len(points), 6))
     )
     information, slope = np.empty((18, 18)), np.empty(18)
-    cost = residuals.normal_equations(
-        data, state, gradient(direction), 1e3, 0.0, 2, information, slope
-    )
+    cost = residuals.normal_equations(data, state, 1e3, 0.0, 2, information, slope)
     assert cost == pytest.approx(np.sum(errors**2), rel=1e-10)
     products = np.einsum("nci,ncj->ij", by_motion, by_motion)
     np.testing.assert_allclose(information, products, rtol=1e-9, atol=1e-9 * products.max())
     np.testing.assert_allclose(slope, np.einsum("nci,nc->i", by_motion, errors), rtol=1e-8)
-    squared = residuals.squared_errors(data, len(points), state, gradient(direction))
+    squared = residuals.squared_errors(data, len(points), state)
     np.testing.assert_allclose(squared, np.sum(errors**2, axis=1), rtol=1e-10)
