@@ -304,11 +304,6 @@ class FrameLocalizer:
         self._camera, self._config = camera, config
         self.readout_watch.reset()
 
-    @property
-    def camera(self) -> Camera:
-        """With the lens and the shutter that hold now."""
-        return self._camera
-
     def _middle_row_ns(self, stamp_ns: int) -> int:
         """When the middle row of the image with this stamp was exposed."""
         return middle_row_ns(self._config, self._camera, stamp_ns)

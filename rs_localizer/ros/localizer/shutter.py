@@ -72,7 +72,9 @@ class ShutterOutput:
 
     def add(self, frame: Localized) -> None:
         """Take a localized frame, in the worker's thread."""
-        config, camera = self._frames.config, self._frames.camera
+        config, calibration = self._frames.config, self._frames.calibration
+        assert calibration is not None  # without it no frame is localized
+        camera = calibration.camera(config.readout_time, config.scan_direction)
         stamp = frame.input_stamp_ns
         solved = _Solved(frame, camera, middle_row_ns(config, camera, stamp))
         with self._changed:
