@@ -14,6 +14,7 @@ iterated update). A gyroscope takes the place of the motion model's rotation whe
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -23,6 +24,7 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.experience import Experience
@@ -88,15 +90,15 @@ class _Track:
 
 
 class Tracker:
-    """Localizes the frames of one camera in their order.
+    """Localizes the frames of one camera, or of one rig, in their order.
 
     Args:
         localizer: to remember the motion, its camera must have a readout time, because the
             velocities of one image are per readout, and its solver must be one for rolling
             shutters, because a global shutter has no velocities.
         inertial: of the gyroscope whose samples come with the frames; None: there is none. Needs a
-            readout time. Unless the motion is remembered, its bias is any that a gyroscope may
-            have, and the offset of its stamps the given one.
+            camera alone, with a readout time. Unless the motion is remembered, its bias is any that
+            a gyroscope may have, and the offset of its stamps the given one.
         memory: what frames tell the next ones.
 
     Raises:
@@ -125,8 +127,9 @@ class Tracker:
         self.of_rest = 0.0
         self._track: _Track | None = None
         self._last_ns, self._too_close = 0, 0
-        readout_time = localizer.camera.readout_time
-        self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
+        self._aid = (
+            None if inertial is None else GyroscopeAid(inertial, localizer.camera.readout_time)
+        )
         self._beside_turn = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
         if self._aid is not None:
             self._aid.warm_up()
@@ -149,13 +152,17 @@ class Tracker:
             return False
         return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
 
-    def _check_time(self, time_ns: int) -> None:
-        """Raise ``ValueError`` for a time that cannot be in nanoseconds."""
+    @staticmethod
+    def _check_type(time_ns: int) -> None:
         if isinstance(time_ns, bool) or not isinstance(time_ns, (int, np.integer)):
             raise ValueError(
                 f"time_ns must be a whole number of nanoseconds, got {time_ns!r} "
                 f"({type(time_ns).__name__}): round(1e9 * seconds)"
             )
+
+    def _check_time(self, time_ns: int) -> None:
+        """Raise ``ValueError`` for a time that cannot be in nanoseconds."""
+        self._check_type(time_ns)
         step, self._last_ns = time_ns - self._last_ns, time_ns
         self._too_close = self._too_close + 1 if 0 < step < _LEAST_STEP_NS else 0
         if self._too_close >= _MOST_TOO_CLOSE:
@@ -164,17 +171,22 @@ class Tracker:
                 "of a millisecond"
             )
 
-    def prediction(self, time_ns: int) -> Prior | None:
-        """What the last frames say of the motion at a time; None when there is no track."""
+    def prediction(self, time_ns: int, span: float | None = None) -> Prior | None:
+        """What the last frames say of the motion at a time; None when there is no track.
+
+        ``span``: s, as parts of which the frame counts its row times; None: as the last one.
+        """
         track = self._track
         if track is None or not self._follows(time_ns):
             return None
         dt = (time_ns - track.time_ns) * 1e-9
-        readout_time = self.localizer.camera.readout_time
+        readout_time = track.estimate.span if span is None else span
         acceleration = self.localizer.config.acceleration
         motion, covariance, swing = unshaken(track.estimate)
         if track.estimate.turn is not None:
             motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
+        if readout_time != track.estimate.span:
+            motion, covariance = _per_span(motion, covariance, readout_time / track.estimate.span)
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
         covariance += acceleration_covariance(
             _scaled(acceleration, track.process_noise_scale), dt, readout_time
@@ -197,10 +209,11 @@ class Tracker:
     def localize(
         self,
         time_ns: int,
-        points: ArrayLike,
-        pixels: ArrayLike,
+        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
+        pixels: ArrayLike | None = None,
         scores: ArrayLike | None = None,
         imu: ImuSamples | None = None,
+        stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
         """Localize the frame whose middle row was exposed at ``time_ns``.
 
@@ -210,7 +223,14 @@ class Tracker:
         Args:
             imu: samples from before the last frame with a pose, if there are any, until after the
                 exposure of this one; None: the camera goes alone.
+            stamps: of a rig, s after ``time_ns`` at which the first row of each image was exposed;
+                None: all then. The time of the estimate counts from there, too.
         """
+        span = None
+        if isinstance(points, Mapping) and points:
+            self._check_type(time_ns)
+            exposure = self.localizer.rig.exposure(tuple(points), stamps)
+            time_ns, span = time_ns + round(1e9 * exposure.time), exposure.span
         if self._memory is Memory.MOTION:
             self._check_time(time_ns)
             if not self._follows(time_ns):
@@ -225,10 +245,11 @@ class Tracker:
             turn = None if predicted is None else predicted.turn
             prior = None if predicted is None else predicted.prior
             if prior is None:
-                prior = self._prior(time_ns, turn)
+                prior = self._prior(time_ns, turn, span)
             if self._track is not None:
                 prior = self._track.experience.with_lens(prior)
-            return self.localizer.find(points, pixels, scores, prior, share, turn), prior
+            found = self.localizer.find(points, pixels, scores, prior, share, turn, stamps)
+            return found, prior
 
         if self._aid is None:
             result, prior = localized(None)
@@ -241,20 +262,23 @@ class Tracker:
             if self._aid is not None and imu is not None and self._aid.wants_sight():
                 lens, camera = result.lens, self.localizer.camera
                 camera = camera if lens is None else lens.mended(camera)
-                self._aid.seek(row_offset_likelihood(camera, points, pixels, result, time_ns))
+                assert pixels is not None  # a gyroscope goes with a camera alone
+                self._aid.seek(
+                    row_offset_likelihood(camera, points, pixels, result, time_ns)  # type: ignore
+                )
         elif self._track is not None and self._memory is Memory.MOTION:
             self._track.failures += 1
             if self._track.failures >= _MOST_FAILURES:
                 self._track = None
         return self.localizer.accepted(result)
 
-    def _prior(self, time_ns: int, turn: KnownTurn | None) -> Prior | None:
+    def _prior(self, time_ns: int, turn: KnownTurn | None, span: float | None) -> Prior | None:
         """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
         if self._memory is Memory.NOTHING:
             return Prior(of_rest=self.of_rest) if turn is None else None
         if self._memory is Memory.MAP_AND_LENS:
             return None if self._track is None else Prior(scales=self._track.experience.scales)
-        prior = self.prediction(time_ns)
+        prior = self.prediction(time_ns, span)
         if prior is not None and not self.trusts_readout_time:
             rest = self.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
@@ -298,12 +322,26 @@ class Tracker:
 
 def _check_motion(localizer: Localizer) -> None:
     """Raise ``ValueError`` where frames do not say how the camera moves."""
-    if not localizer.camera.readout_time > 0.0:
+    cameras = localizer.rig.cameras.values()
+    if not all(camera.readout_time > 0.0 for camera in cameras):
         raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
     if not find_solver(localizer.config.solver).rolling_shutter:
         raise ValueError(
             f"tracking needs velocities, which solver {localizer.config.solver} does not find"
         )
+
+
+def _per_span(motion: Motion, covariance: Array, ratio: float) -> tuple[Motion, Array]:
+    """A motion and its covariance (18,18) per another time: ``ratio`` times as long."""
+    scale = np.repeat([1.0, 1.0, ratio, ratio, ratio**2, ratio**2], 3)
+    return Motion(
+        motion.rotation,
+        motion.translation,
+        ratio * motion.angular_velocity,
+        ratio * motion.linear_velocity,
+        angular_acceleration=ratio**2 * motion.angular_acceleration,
+        linear_acceleration=ratio**2 * motion.linear_acceleration,
+    ), covariance * np.outer(scale, scale)
 
 
 def _beside(prior: Prior | None, turn: KnownTurn) -> Prior | None:
