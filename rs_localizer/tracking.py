@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.shutter import Motion
-from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
+from rs_localizer.core.shutter import motion_of, numbers_of
+from rs_localizer.core.state import PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
@@ -37,7 +37,7 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.inertial.aiding import Before, GyroPrediction, GyroscopeAid
+from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid, beside_turn
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -68,8 +68,6 @@ _NEWEST = 0.3
 _LEARNING = 0.5
 # The least: with a tenth predictions hold 88 % of a webcam's frames, with this 93 and more.
 _LEAST_SCALE, _MOST_SCALE = 0.3, 1e4
-# What a gyroscope measures.
-_TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 # Of a motion that is but a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
@@ -96,9 +94,9 @@ class Tracker:
         localizer: to remember the motion, its camera must have a readout time, because the
             velocities of one image are per readout, and its solver must be one for rolling
             shutters, because a global shutter has no velocities.
-        inertial: of the gyroscope whose samples come with the frames; None: there is none. Needs a
-            camera alone, with a readout time. Unless the motion is remembered, its bias is any that
-            a gyroscope may have, and the offset of its stamps the given one.
+        inertial: of the gyroscope whose samples come with the frames of a camera alone, which needs
+            a readout time; None: there is none. Unless the motion is remembered, its bias is any
+            that a gyroscope may have, and the offset of its stamps the given one.
         memory: what frames tell the next ones.
 
     Raises:
@@ -127,12 +125,11 @@ class Tracker:
         self.of_rest = 0.0
         self._track: _Track | None = None
         self._last_ns, self._too_close = 0, 0
-        self._aid = (
-            None if inertial is None else GyroscopeAid(inertial, localizer.camera.readout_time)
-        )
-        self._beside_turn = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
-        if self._aid is not None:
+        self._aid: GyroscopeAid | None = None
+        if inertial is not None:
+            self._aid = GyroscopeAid(inertial, localizer.camera.readout_time)
             self._aid.warm_up()
+        self._beside_turn = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
 
     def reset(self) -> None:
         """Forget all frames so far."""
@@ -152,17 +149,13 @@ class Tracker:
             return False
         return track is not None and 0.0 < (time_ns - track.time_ns) * 1e-9 <= _LONGEST_GAP
 
-    @staticmethod
-    def _check_type(time_ns: int) -> None:
+    def _check_time(self, time_ns: int) -> None:
+        """Raise ``ValueError`` for a time that cannot be in nanoseconds."""
         if isinstance(time_ns, bool) or not isinstance(time_ns, (int, np.integer)):
             raise ValueError(
                 f"time_ns must be a whole number of nanoseconds, got {time_ns!r} "
                 f"({type(time_ns).__name__}): round(1e9 * seconds)"
             )
-
-    def _check_time(self, time_ns: int) -> None:
-        """Raise ``ValueError`` for a time that cannot be in nanoseconds."""
-        self._check_type(time_ns)
         step, self._last_ns = time_ns - self._last_ns, time_ns
         self._too_close = self._too_close + 1 if 0 < step < _LEAST_STEP_NS else 0
         if self._too_close >= _MOST_TOO_CLOSE:
@@ -174,7 +167,7 @@ class Tracker:
     def prediction(self, time_ns: int, span: float | None = None) -> Prior | None:
         """What the last frames say of the motion at a time; None when there is no track.
 
-        ``span``: s, as parts of which the frame counts its row times; None: as the last one.
+        ``span``: s, of the row times of the frame; None: as of the last one.
         """
         track = self._track
         if track is None or not self._follows(time_ns):
@@ -186,7 +179,10 @@ class Tracker:
         if track.estimate.turn is not None:
             motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
         if readout_time != track.estimate.span:
-            motion, covariance = _per_span(motion, covariance, readout_time / track.estimate.span)
+            units = (readout_time / track.estimate.span) ** np.array([0, 0, 1, 1, 2, 2])
+            each = zip(units, numbers_of(motion), strict=True)
+            motion, scale = motion_of(tuple(u * part for u, part in each)), np.repeat(units, 3)
+            covariance = covariance * np.outer(scale, scale)
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
         covariance += acceleration_covariance(
             _scaled(acceleration, track.process_noise_scale), dt, readout_time
@@ -223,25 +219,23 @@ class Tracker:
         Args:
             imu: samples from before the last frame with a pose, if there are any, until after the
                 exposure of this one; None: the camera goes alone.
-            stamps: of a rig, s after ``time_ns`` at which the first row of each image was exposed;
-                None: all then. The time of the estimate counts from there, too.
+            stamps: of a rig, s after ``time_ns`` that the first row of each image was exposed (None:
+                then), from when the time of the estimate counts, too.
         """
-        span = None
+        later, span = 0, None
         if isinstance(points, Mapping) and points:
-            self._check_type(time_ns)
             exposure = self.localizer.rig.exposure(tuple(points), stamps)
-            time_ns, span = time_ns + round(1e9 * exposure.time), exposure.span
+            later, span = round(1e9 * exposure.time), exposure.span
         if self._memory is Memory.MOTION:
             self._check_time(time_ns)
+            time_ns += later
             if not self._follows(time_ns):
                 self._track = None
         elif self._aid is not None:
             self._aid.reset()
         share = 0.0 if self._track is None else self._track.share
 
-        def localized(
-            predicted: GyroPrediction | None,
-        ) -> tuple[Estimate | Failure, Prior | None]:
+        def localized(predicted: GyroPrediction | None) -> Found:
             turn = None if predicted is None else predicted.turn
             prior = None if predicted is None else predicted.prior
             if prior is None:
@@ -262,10 +256,8 @@ class Tracker:
             if self._aid is not None and imu is not None and self._aid.wants_sight():
                 lens, camera = result.lens, self.localizer.camera
                 camera = camera if lens is None else lens.mended(camera)
-                assert pixels is not None  # a gyroscope goes with a camera alone
-                self._aid.seek(
-                    row_offset_likelihood(camera, points, pixels, result, time_ns)  # type: ignore
-                )
+                assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
+                self._aid.seek(row_offset_likelihood(camera, points, pixels, result, time_ns))
         elif self._track is not None and self._memory is Memory.MOTION:
             self._track.failures += 1
             if self._track.failures >= _MOST_FAILURES:
@@ -282,7 +274,7 @@ class Tracker:
         if prior is not None and not self.trusts_readout_time:
             rest = self.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
-        return prior if turn is None else _beside(prior, turn)
+        return prior if turn is None else beside_turn(prior, turn)
 
     def _remember(self, time_ns: int, prior: Prior | None, result: Estimate) -> None:
         """Keep what the next frames are to know of this one."""
@@ -329,33 +321,6 @@ def _check_motion(localizer: Localizer) -> None:
         raise ValueError(
             f"tracking needs velocities, which solver {localizer.config.solver} does not find"
         )
-
-
-def _per_span(motion: Motion, covariance: Array, ratio: float) -> tuple[Motion, Array]:
-    """A motion and its covariance (18,18) per another time: ``ratio`` times as long."""
-    scale = np.repeat([1.0, 1.0, ratio, ratio, ratio**2, ratio**2], 3)
-    return Motion(
-        motion.rotation,
-        motion.translation,
-        ratio * motion.angular_velocity,
-        ratio * motion.linear_velocity,
-        angular_acceleration=ratio**2 * motion.angular_acceleration,
-        linear_acceleration=ratio**2 * motion.linear_acceleration,
-    ), covariance * np.outer(scale, scale)
-
-
-def _beside(prior: Prior | None, turn: KnownTurn) -> Prior | None:
-    """What the camera alone predicts, for a motion beside a known turn."""
-    if prior is None:
-        return None
-    assert prior.motion is not None
-    assert prior.covariance is not None
-    covariance = prior.covariance.copy()
-    covariance[_TURNING] = 0.0
-    covariance[:, _TURNING] = 0.0
-    covariance[np.ix_(_TURNING, _TURNING)] = turn.error
-    still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
-    return replace(prior, motion=still, covariance=covariance)
 
 
 def _followed(track: _Track | None, prior: Prior | None, newest: Estimate, time_ns: int) -> _Track:
