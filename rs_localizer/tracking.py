@@ -219,8 +219,8 @@ class Tracker:
         Args:
             imu: samples from before the last frame with a pose, if there are any, until after the
                 exposure of this one; None: the camera goes alone.
-            stamps: of a rig, s after ``time_ns`` that the first row of each image was exposed (None:
-                then), from when the time of the estimate counts, too.
+            stamps: of a rig, s after ``time_ns`` at which the first rows were exposed (None: then);
+                the time of the estimate counts from there, too.
         """
         later, span = 0, None
         if isinstance(points, Mapping) and points:
