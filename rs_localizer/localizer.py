@@ -238,8 +238,8 @@ class Localizer:
             return self._exposure, [len(points)], points, pixels, scores
         if not isinstance(points, Mapping) or pixels is not None or scores is not None:
             raise ValueError(
-                "a frame of a rig is {name: (points, pixels)} or {name: (points, pixels, scores)}; "
-                f"its cameras are {', '.join(self.rig.cameras)}"
+                "a frame of a rig is {name: (points, pixels)}, also with scores behind them; its "
+                f"cameras are {', '.join(self.rig.cameras)}"
             )
         return checked_of_rig(self.rig, points, stamps)
 

@@ -14,6 +14,7 @@ from benchmarks.independent.motions import hand, steady
 from benchmarks.independent.rigs import Mounted, middle_of, views
 from benchmarks.independent.rotations import exponential, logarithm
 from rs_localizer.core.types import Estimate
+from rs_localizer.inertial.settings import InertialSettings
 
 UPRIGHT, TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
 ASKEW = exponential(np.array([0.2, -2.5, 0.4]))
@@ -168,3 +169,35 @@ def test_what_a_localizer_of_a_rig_takes():
     assert alone, alone
     assert alone.names == ("other",)
     assert alone.span == TRUE.readout_time
+
+
+def test_tracking_carries_a_rig_from_frame_to_frame():
+    """Frames whose cameras are now in step and now not, so that velocities are per other spans; the
+    motion of one predicts the next, and before a wall makes it better.
+    """
+    rng = np.random.default_rng(5)
+    motions = fast(1, rng)
+    alone, tracked = [], []
+    rig = rig_of(pair(UPRIGHT))
+    localizer = rsl.Localizer(rig)
+    tracker = rsl.Tracker(localizer)
+    for frame in range(12):
+        mounted = pair(UPRIGHT, start=0.01 * (frame % 3))
+        begin = frame / 30.0
+        seen = views(mounted, motions, np.array([begin]), 40, True, rng)
+        parts = {
+            name: (view.points[0], view.exact[0] + 0.5 * rng.normal(size=view.exact[0].shape))
+            for name, view in seen.items()
+        }
+        stamps = {name: each.start for name, each in mounted.items()}
+        single = localizer.localize(parts, stamps=stamps)
+        result = tracker.localize(round(1e9 * begin) + 10**12, parts, stamps=stamps)
+        assert result, result
+        assert result.time == pytest.approx(middle_of(mounted))
+        for each, found in ((single, alone), (result, tracked)):
+            if each and frame > 2:
+                found.append(errors(each, motions, 0, begin + middle_of(mounted)))
+        assert result.tracked == (frame > 0)
+    assert np.all(np.mean(tracked, axis=0)[:2] < 0.7 * np.mean(alone, axis=0)[:2])
+    with pytest.raises(ValueError, match="several cameras"):
+        rsl.Tracker(localizer, InertialSettings(1e-3, 1e-4, False))

@@ -9,7 +9,9 @@ from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation import observations, residuals
 
 from .projection import (
+    ALONE,
     AXIS,
+    MOUNTED,
     STILL,
     disturbed,
     gradient,
@@ -25,21 +27,29 @@ DIRECTIONS = list(AXIS)
 SHAKE = 0.003 * np.random.default_rng(7).normal(size=(4, 3))
 
 
-def packed(points, rays, direction, shift=0.0):
+def packed(points, rays, direction, shift=0.0, seat=ALONE):
     """Points as measured at their pixels and ``shift`` (n,2) px beside them, to first order."""
     by_ray = jacobian_of(rays)
     moved = rays + np.linalg.solve(by_ray, np.broadcast_to(shift, rays.shape)[..., None])[..., 0]
     tau = row_time(pixels_of(moved), direction)
-    mounts = Mounts.one(gradient(direction))
-    return observations.Observations.of(points, moved, tau, jacobian_of(moved), mounts).packed, tau
+    # Beside another camera, of which there are no points.
+    axes, centres = (np.stack(both) for both in zip(ALONE, seat, strict=True))
+    mounts = Mounts(axes, centres, np.stack([np.ones(2), gradient(direction)]))
+    second = np.ones(len(points), np.int64)
+    made = observations.Observations.of(points, moved, tau, jacobian_of(moved), mounts, second)
+    return made.packed, tau
 
 
-def numerical(state, points, direction, coefficients=STILL, h=1e-5):
+def numerical(state, points, direction, coefficients=STILL, h=1e-5, seat=ALONE):
     """Derivatives (n,2,18) of the pixels by a step."""
     columns = []
     for e in np.eye(18):
         ahead, behind = (
-            pixels_of(project(disturbed(state, sign * h * e), points, direction, coefficients)[0])
+            pixels_of(
+                project(disturbed(state, sign * h * e), points, direction, coefficients, seat=seat)[
+                    0
+                ]
+            )
             for sign in (1, -1)
         )
         columns.append((ahead - behind) / (2 * h))
@@ -47,12 +57,13 @@ def numerical(state, points, direction, coefficients=STILL, h=1e-5):
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_normal_equations_are_those_of_the_forward_projection(direction):
+@pytest.mark.parametrize("seat", [ALONE, MOUNTED], ids=["alone", "mounted"])
+def test_normal_equations_are_those_of_the_forward_projection(direction, seat):
     state, points = scene(direction)
-    rays, _ = project(state, points, direction)
-    jacobian = numerical(state, points, direction)
+    rays, _ = project(state, points, direction, seat=seat)
+    jacobian = numerical(state, points, direction, seat=seat)
     shift = np.array([2e-3, -3e-3])
-    data, _ = packed(points, rays, direction, shift)
+    data, _ = packed(points, rays, direction, shift, seat)
     information, slope = np.empty((18, 18)), np.empty(18)
     cost = residuals.normal_equations(data, state, 100.0, 0.0, 2, information, slope)
     assert cost == pytest.approx(len(points) * shift @ shift, rel=1e-3)
@@ -68,10 +79,11 @@ def test_normal_equations_are_those_of_the_forward_projection(direction):
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize("coefficients", [STILL, SHAKE], ids=["still", "shaking"])
-def test_lines_are_those_of_the_forward_projection(direction, coefficients):
+@pytest.mark.parametrize("seat", [ALONE, MOUNTED], ids=["alone", "mounted"])
+def test_lines_are_those_of_the_forward_projection(direction, coefficients, seat):
     state, points = scene(direction, seed=1)
-    rays, tau = project(state, points, direction, coefficients)
-    data, measured = packed(points, rays, direction)
+    rays, tau = project(state, points, direction, coefficients, seat=seat)
+    data, measured = packed(points, rays, direction, seat=seat)
     np.testing.assert_allclose(measured, tau, atol=1e-12)
     h = 1e-5
     rates = (shake(tau + h, coefficients) - shake(tau - h, coefficients)) / (2 * h)
@@ -80,7 +92,7 @@ def test_lines_are_those_of_the_forward_projection(direction, coefficients):
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)
     np.testing.assert_allclose(seen, tau, atol=1e-9)
     np.testing.assert_allclose(image, rays, atol=1e-9)
-    expected = numerical(state, points, direction, coefficients)
+    expected = numerical(state, points, direction, coefficients, seat=seat)
     scale = np.abs(expected).max(axis=(0, 1))
     # The rate of the shaking stands for the body rate that it makes.
     near = 1e-3 if len(coefficients) else 2e-5
@@ -89,7 +101,9 @@ def test_lines_are_those_of_the_forward_projection(direction, coefficients):
     columns = []
     for axis in np.eye(3):
         ahead, behind = (
-            pixels_of(project(state, points, direction, coefficients, sign * h * axis)[0])
+            pixels_of(
+                project(state, points, direction, coefficients, sign * h * axis, seat=seat)[0]
+            )
             for sign in (1, -1)
         )
         columns.append((ahead - behind) / (2 * h))
