@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import IntArray
-from rs_localizer.core.camera import Camera
+from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.io.video import read_video
 from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
@@ -119,7 +119,12 @@ def shutter_of(clip: Clip, cache: Path) -> Shutter:
     if not file.exists():
         file.write_text(json.dumps(_calibrated(clip, clip.images)), encoding="utf-8")
     found = json.loads(file.read_text(encoding="utf-8"))
-    lens = found["K"] and Camera(*clip.size, K=np.array(found["K"]), D=np.array(found["D"]))
+    lens = found["K"] and Camera(
+        *clip.size,
+        K=np.array(found["K"]),
+        D=np.array(found["D"]),
+        distortion_model=DistortionModel(found["distortion_model"]),
+    )
     known = found["readout_time"] > 1e-3
     return Shutter(
         found["readout_time"] if known else _PHONE,
@@ -143,6 +148,7 @@ def _calibrated(clip: Clip, images: list[Observed]) -> dict[str, object]:
         "verdict": f"refused, {value}" if refusal else value,
         "K": camera.K.tolist(),
         "D": camera.D.tolist(),
+        "distortion_model": str(camera.distortion_model),
     }
 
 
