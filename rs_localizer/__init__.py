@@ -10,12 +10,20 @@ if TYPE_CHECKING:
     from rs_localizer.core.camera import Camera, DistortionModel, Roi
     from rs_localizer.core.reasons import Reason
     from rs_localizer.core.rectification import rectify
+    from rs_localizer.core.rig import Rig, RigEstimate
     from rs_localizer.core.scanning import ScanDirection
     from rs_localizer.core.shutter import Motion
     from rs_localizer.core.types import Estimate, Failure
     from rs_localizer.core.units import CameraState, camera_state
     from rs_localizer.estimation.prior import Prior
     from rs_localizer.io.calibration import read_calibration
+    from rs_localizer.io.rigs import (
+        RigParts,
+        read_camchain,
+        read_rig_config,
+        write_camchain,
+        write_rig_config,
+    )
     from rs_localizer.localizer import Localizer
     from rs_localizer.offline.table import localize_recording
     from rs_localizer.solvers.minimal import solve_minimal
@@ -35,6 +43,9 @@ __all__ = [
     "Motion",
     "Prior",
     "Reason",
+    "Rig",
+    "RigEstimate",
+    "RigParts",
     "Roi",
     "ScanDirection",
     "Tracker",
@@ -42,8 +53,12 @@ __all__ = [
     "camera_state",
     "localize_recording",
     "read_calibration",
+    "read_camchain",
+    "read_rig_config",
     "rectify",
     "solve_minimal",
+    "write_camchain",
+    "write_rig_config",
 ]
 
 if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all others
@@ -54,12 +69,17 @@ if not TYPE_CHECKING:  # type checkers know the names from above, and refuse all
         "core.camera": ("Camera", "DistortionModel", "Roi"),
         "core.reasons": ("Reason",),
         "core.rectification": ("rectify",),
+        "core.rig": ("Rig", "RigEstimate"),
         "core.scanning": ("ScanDirection",),
         "core.shutter": ("Motion",),
         "core.types": ("Estimate", "Failure"),
         "core.units": ("CameraState", "camera_state"),
         "estimation.prior": ("Prior",),
         "io.calibration": ("read_calibration",),
+        "io.rigs": (
+            *("RigParts", "read_camchain", "read_rig_config"),
+            *("write_camchain", "write_rig_config"),
+        ),
         "localizer": ("Localizer",),
         "offline.table": ("localize_recording",),
         "solvers.minimal": ("solve_minimal",),

@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +19,7 @@ from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lens import LensError, with_lens
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.rig import Exposure, Rig, RigEstimate
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import POSE, step_between
 from rs_localizer.core.types import Estimate, Failure
@@ -36,8 +39,8 @@ from rs_localizer.estimation.observations import (
     Observed,
     Sighted,
     checked,
+    checked_of_rig,
     find_usable,
-    median_depth,
     packed,
     relinearized,
     unfit,
@@ -65,6 +68,8 @@ _STILL_TRACKED = 0.7
 class _Given(NamedTuple):
     """What :meth:`Localizer.find` is given."""
 
+    exposure: Exposure
+    counts: Sequence[int]  # points of each camera, one after the other
     points: Array
     pixels: Array
     scores: Array | None
@@ -77,7 +82,7 @@ class Localizer:
     """Rolling-shutter absolute pose of single frames.
 
     Args:
-        camera: calibrated camera with its shutter.
+        camera: calibrated camera with its shutter, or a :class:`rs_localizer.Rig` of several.
         config: all settings, or give single ones as keywords (see :class:`LocalizerConfig`).
 
     Raises:
@@ -85,23 +90,42 @@ class Localizer:
     """
 
     def __init__(
-        self, camera: Camera, config: LocalizerConfig | None = None, **settings: object
+        self, camera: Camera | Rig, config: LocalizerConfig | None = None, **settings: object
     ) -> None:
-        instance("camera", camera, Camera)
+        self._alone = not isinstance(camera, Rig)
+        if not isinstance(camera, Rig):
+            instance("camera", camera, Camera)
+            camera = Rig.of(camera)
         if config is not None:
             instance("config", config, LocalizerConfig)
         if config is not None and settings:
             raise ValueError(f"give either config or settings, got both: {', '.join(settings)}")
         self.config = config or localizer_config(settings)
-        self.camera = camera
+        self.rig = camera
         self._solver = find_solver(self.config.solver)
-        self._search = MotionSearch(camera, self.config, self._solver, start_solver(self._solver))
-        self._terms, self._assumed = assumptions(camera, self.config, self._solver)
+        self._search = MotionSearch(
+            camera.focal_length, self.config, self._solver, start_solver(self._solver)
+        )
+        self._exposure = camera.exposure()
+        # Of as many spans as a rig of cameras that are in step has.
+        self._assume = lru_cache(16)(
+            partial(assumptions, rig=camera, config=self.config, solver=self._solver)
+        )
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of a rig of one; ``ValueError`` where there are several."""
+        if len(self.rig.cameras) > 1:
+            raise ValueError(f"the rig has several cameras: {', '.join(self.rig.cameras)}")
+        return next(iter(self.rig.cameras.values()))
 
     def warm_up(self) -> None:
         """Compile every kernel that :meth:`localize`, or tracking, may need, or load it from the
         cache.
         """
+        if not self._alone:
+            Localizer(next(iter(self.rig.cameras.values())), self.config).warm_up()
+            return
         for part in (frame_fit, mirror, motion_model, observations, ransac):
             part.warm_up()
         # A still camera before a scene that is no plane; with half a prediction, which is dropped.
@@ -134,17 +158,19 @@ class Localizer:
 
     def localize(
         self,
-        points: ArrayLike,
-        pixels: ArrayLike,
+        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
+        pixels: ArrayLike | None = None,
         scores: ArrayLike | None = None,
         prior: Prior | None = None,
         expected_share: float = 0.5,
         turn: KnownTurn | None = None,
+        stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
-        """Estimate pose and velocities from one image.
+        """Estimate pose and velocities from one image, or from those of a rig.
 
         Args:
-            points: (n,3) in the map frame, metres.
+            points: (n,3) in the map frame, metres; of a rig ``{name: (points, pixels)}``, or
+                ``(points, pixels, scores)``, of the cameras that have a part in the frame.
             pixels: (n,2) raw image coordinates, first pixel centre at 0, 0.
             scores: (n,) quality of the matches, higher is better.
             prior: what else is known of the motion. A prior motion is also a first guess; if the
@@ -152,15 +178,17 @@ class Localizer:
             expected_share: share of inliers among the points that a prior motion should find.
             turn: how the camera turned during the readout, as a gyroscope knows it. A prior
                 motion is then the one beside it.
+            stamps: of a rig, s at which the first row of each image was exposed, relative to
+                anything; None: all at once.
 
         Returns:
-            an :class:`Estimate`, or a :class:`Failure` with its reason. Same seed and same input
-            give the same result.
+            an :class:`Estimate`, of a rig a :class:`RigEstimate`, or a :class:`Failure` with its
+            reason. Same seed and same input give the same result.
 
         Raises:
             ValueError: wrong shapes, or values that are not finite.
         """
-        return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn))
+        return self.accepted(self.find(points, pixels, scores, prior, expected_share, turn, stamps))
 
     def accepted(self, found: Estimate | Failure) -> Estimate | Failure:
         """The same, or a :class:`Failure` where the points tell too little of the orientation."""
@@ -171,45 +199,68 @@ class Localizer:
 
     def find(
         self,
-        points: ArrayLike,
-        pixels: ArrayLike,
+        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
+        pixels: ArrayLike | None = None,
         scores: ArrayLike | None = None,
         prior: Prior | None = None,
         expected_share: float = 0.5,
         turn: KnownTurn | None = None,
+        stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
         """As :meth:`localize`, however uncertain it is: the next frames may know better."""
         if prior is not None:
             instance("prior", prior, Prior)
-        points, pixels, scores = checked(points, pixels, scores)
         if not 0.0 <= expected_share <= 1.0:
             raise ValueError(f"expected_share must lie between 0 and 1, got {expected_share}")
-        given = _Given(points, pixels, scores, prior, expected_share, turn)
-        if prior is not None and prior.lens is not None:
-            found, plain = self._found(given, prior.lens), self._found(given, None)
+        sights = self._sights(points, pixels, scores, stamps)
+        given = _Given(*sights, prior, expected_share, turn)
+        lens = None if prior is None else prior.lens
+        if not given.exposure.alone and (turn is not None or lens is not None):
+            raise ValueError("a known turn, or a lens, is that of a camera alone, not of a rig")
+        found = self._found(given, lens)
+        if lens is not None:
+            plain = self._found(given, None)
             threshold = self.config.inlier_threshold
-            if found and not (plain and refuted(found.residuals, plain.residuals, threshold)):
-                return found
-            return plain
-        return self._found(given, None)
+            if not found or (plain and refuted(found.residuals, plain.residuals, threshold)):
+                found = plain
+        if self._alone or not found:
+            return found
+        return RigEstimate.of(found, given.exposure, given.counts)
+
+    def _sights(
+        self, points: Any, pixels: Any, scores: Any, stamps: Mapping[str, float] | None
+    ) -> tuple[Exposure, Sequence[int], Array, Array, Array | None]:
+        """As :func:`checked_of_rig`, of a camera alone or a rig."""
+        if self._alone:
+            if isinstance(points, Mapping) or stamps is not None:
+                raise ValueError("images by names, and their stamps, are those of a Rig")
+            points, pixels, scores = checked(points, pixels, scores)
+            return self._exposure, [len(points)], points, pixels, scores
+        if not isinstance(points, Mapping) or pixels is not None or scores is not None:
+            raise ValueError(
+                "a frame of a rig is {name: (points, pixels)}, also with scores behind them; its "
+                f"cameras are {', '.join(self.rig.cameras)}"
+            )
+        return checked_of_rig(self.rig, points, stamps)
 
     def _found(self, given: _Given, lens: LensError | None) -> Estimate | Failure:
         """What there is to find by a lens that other frames tell of, or by the calibration's."""
-        points, pixels, scores, prior, expected_share, turn = given
-        terms, assumed = self._terms, self._assumed
+        exposure, counts, points, pixels, scores, prior, expected_share, turn = given
+        terms, assumed = configured = self._assume(exposure.span)
         if prior is not None or turn is not None:
             if assumed.may_rest:
                 terms, prior = told_speed(terms, prior)
-            assumed = with_experience(assumed, prior, turn_seen(self._terms, turn))
+            assumed = with_experience(assumed, prior, turn_seen(configured[0], turn))
             terms = known_terms(terms, prior, turn)
-        camera = self.camera if lens is None else lens.mended(self.camera)
+        if lens is not None:
+            exposure = exposure.by(lens.mended(*exposure.cameras))
         # 1. What can be used: finite, distinct, inside the image; packed relative to its median.
-        usable = find_usable(camera, points, pixels, turn)
-        failure = unfit(camera, pixels, usable.indices, usable.shown, self.config.min_inliers)
+        usable = find_usable(exposure, points, pixels, counts, turn)
+        failure = unfit(exposure, pixels, usable, self.config.min_inliers)
         if failure is not None:
             return failure
         observed = Observed(
-            packed(camera, points, usable),
+            packed(exposure, points, usable),
             usable.indices,
             len(points),
             usable.centre,
@@ -217,7 +268,7 @@ class Localizer:
             terms,
             generator(self.config.seed),
             assumed,
-            Sighted(camera, points, pixels, usable, turn),
+            Sighted(exposure, points, pixels, usable, turn),
             lens,
             prior is not None and prior.asks_lens,
         )
@@ -244,6 +295,7 @@ class Localizer:
         threshold = self.config.inlier_threshold
         if (
             observed.lens is not None
+            or not observed.sighted.exposure.alone
             or not self._solver.rolling_shutter
             or not may_be_lens(found, posterior, threshold)
         ):
@@ -293,12 +345,14 @@ class Localizer:
 
     def _settle(self, observed: Observed, best: Candidate, terms: PriorTerms) -> Posterior:
         # Unless more is known of this very frame than the prior of the configuration.
-        may_rest = self._assumed.may_rest and len(terms.informations) == 1
         assumed = observed.assumed
+        may_rest = self._assume(self._exposure.span)[1].may_rest and len(terms.informations) == 1
         if may_rest != assumed.may_rest:
             assumed = replace(assumed, may_rest=may_rest)
         gate, sighted = self._gate(observed, best.state), observed.sighted
-        observations = relinearized(sighted.camera, observed.observations, best.state, sighted.turn)
+        observations = relinearized(
+            sighted.exposure, observed.observations, best.state, sighted.turn
+        )
         return frame_posterior(observations, best.state, terms, gate, assumed)
 
     def _gate(self, observed: Observed, state: Array) -> float:
@@ -306,8 +360,8 @@ class Localizer:
         threshold, deviation = self.config.inlier_threshold, self.config.map_deviation
         if not deviation > 0.0:
             return threshold
-        points = observed.observations.points
-        depth = median_depth(state, points, np.ones(len(points), dtype=np.bool_))
+        observations = observed.observations
+        depth = observations.median_depth(state, np.ones(len(observations), dtype=np.bool_))
         focal = observed.assumed.focal_length
         return math.hypot(threshold, _MAP_GATE * deviation * focal / max(depth, _NEAREST))
 
@@ -347,7 +401,8 @@ class Localizer:
             return failure
         still = self._search.global_shutter_inliers(observed, start)
         lens = None
-        if observed.lens is not None or observed.asks_lens:
+        asked = observed.lens is not None or observed.asks_lens
+        if asked and observed.sighted.exposure.alone:
             posterior, lens = told_of_lens(observed, posterior)
         estimate = estimate_of(observed, posterior, still, best.samples)
         return replace(

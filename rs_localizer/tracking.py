@@ -14,6 +14,7 @@ iterated update). A gyroscope takes the place of the motion model's rotation whe
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -23,7 +24,8 @@ from numpy.typing import ArrayLike
 from rs_localizer.config import Acceleration
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.known_turn import KnownTurn
-from rs_localizer.core.state import ANGULAR, ANGULAR_ACCELERATION, PARAMETERS, step_between
+from rs_localizer.core.shutter import motion_of, numbers_of
+from rs_localizer.core.state import PARAMETERS, step_between
 from rs_localizer.core.types import Estimate, Failure
 from rs_localizer.estimation.experience import Experience
 from rs_localizer.estimation.motion_model import (
@@ -35,7 +37,7 @@ from rs_localizer.estimation.motion_model import (
     with_mean_turn,
 )
 from rs_localizer.estimation.prior import Prior, state_in
-from rs_localizer.inertial.aiding import Before, GyroPrediction, GyroscopeAid
+from rs_localizer.inertial.aiding import Before, Found, GyroPrediction, GyroscopeAid, beside_turn
 from rs_localizer.inertial.row_offset_likelihood import row_offset_likelihood
 from rs_localizer.inertial.samples import ImuSamples
 from rs_localizer.inertial.settings import InertialSettings
@@ -66,8 +68,6 @@ _NEWEST = 0.3
 _LEARNING = 0.5
 # The least: with a tenth predictions hold 88 % of a webcam's frames, with this 93 and more.
 _LEAST_SCALE, _MOST_SCALE = 0.3, 1e4
-# What a gyroscope measures.
-_TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 # Of a motion that is but a first guess.
 _UNKNOWN = np.diag(np.full(PARAMETERS, np.inf))
 # The least acceleration that a configuration may have, rad/s^2 and m/s^2.
@@ -88,15 +88,15 @@ class _Track:
 
 
 class Tracker:
-    """Localizes the frames of one camera in their order.
+    """Localizes the frames of one camera, or of one rig, in their order.
 
     Args:
         localizer: to remember the motion, its camera must have a readout time, because the
             velocities of one image are per readout, and its solver must be one for rolling
             shutters, because a global shutter has no velocities.
-        inertial: of the gyroscope whose samples come with the frames; None: there is none. Needs a
-            readout time. Unless the motion is remembered, its bias is any that a gyroscope may
-            have, and the offset of its stamps the given one.
+        inertial: of the gyroscope whose samples come with the frames of a camera alone, which needs
+            a readout time; None: there is none. Unless the motion is remembered, its bias is any
+            that a gyroscope may have, and the offset of its stamps the given one.
         memory: what frames tell the next ones.
 
     Raises:
@@ -125,11 +125,11 @@ class Tracker:
         self.of_rest = 0.0
         self._track: _Track | None = None
         self._last_ns, self._too_close = 0, 0
-        readout_time = localizer.camera.readout_time
-        self._aid = None if inertial is None else GyroscopeAid(inertial, readout_time)
-        self._beside_turn = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
-        if self._aid is not None:
+        self._aid: GyroscopeAid | None = None
+        if inertial is not None:
+            self._aid = GyroscopeAid(inertial, localizer.camera.readout_time)
             self._aid.warm_up()
+        self._beside_turn = Acceleration(_LEAST_ACCELERATION, localizer.config.acceleration.linear)
 
     def reset(self) -> None:
         """Forget all frames so far."""
@@ -164,17 +164,25 @@ class Tracker:
                 "of a millisecond"
             )
 
-    def prediction(self, time_ns: int) -> Prior | None:
-        """What the last frames say of the motion at a time; None when there is no track."""
+    def prediction(self, time_ns: int, span: float | None = None) -> Prior | None:
+        """What the last frames say of the motion at a time; None when there is no track.
+
+        ``span``: s, of the row times of the frame; None: as of the last one.
+        """
         track = self._track
         if track is None or not self._follows(time_ns):
             return None
         dt = (time_ns - track.time_ns) * 1e-9
-        readout_time = self.localizer.camera.readout_time
+        readout_time = track.estimate.span if span is None else span
         acceleration = self.localizer.config.acceleration
         motion, covariance, swing = unshaken(track.estimate)
         if track.estimate.turn is not None:
             motion, covariance = with_mean_turn(motion, covariance, track.estimate.turn)
+        if readout_time != track.estimate.span:
+            units = (readout_time / track.estimate.span) ** np.array([0, 0, 1, 1, 2, 2])
+            each = zip(units, numbers_of(motion), strict=True)
+            motion, scale = motion_of(tuple(u * part for u, part in each)), np.repeat(units, 3)
+            covariance = covariance * np.outer(scale, scale)
         motion, covariance = predict(motion, covariance, dt / readout_time, FADING / readout_time)
         covariance += acceleration_covariance(
             _scaled(acceleration, track.process_noise_scale), dt, readout_time
@@ -197,10 +205,11 @@ class Tracker:
     def localize(
         self,
         time_ns: int,
-        points: ArrayLike,
-        pixels: ArrayLike,
+        points: ArrayLike | Mapping[str, Sequence[ArrayLike]],
+        pixels: ArrayLike | None = None,
         scores: ArrayLike | None = None,
         imu: ImuSamples | None = None,
+        stamps: Mapping[str, float] | None = None,
     ) -> Estimate | Failure:
         """Localize the frame whose middle row was exposed at ``time_ns``.
 
@@ -210,25 +219,31 @@ class Tracker:
         Args:
             imu: samples from before the last frame with a pose, if there are any, until after the
                 exposure of this one; None: the camera goes alone.
+            stamps: of a rig, s after ``time_ns`` at which the first rows were exposed (None: then);
+                the time of the estimate counts from there, too.
         """
+        later, span = 0, None
+        if isinstance(points, Mapping) and points:
+            exposure = self.localizer.rig.exposure(tuple(points), stamps)
+            later, span = round(1e9 * exposure.time), exposure.span
         if self._memory is Memory.MOTION:
             self._check_time(time_ns)
+            time_ns += later
             if not self._follows(time_ns):
                 self._track = None
         elif self._aid is not None:
             self._aid.reset()
         share = 0.0 if self._track is None else self._track.share
 
-        def localized(
-            predicted: GyroPrediction | None,
-        ) -> tuple[Estimate | Failure, Prior | None]:
+        def localized(predicted: GyroPrediction | None) -> Found:
             turn = None if predicted is None else predicted.turn
             prior = None if predicted is None else predicted.prior
             if prior is None:
-                prior = self._prior(time_ns, turn)
+                prior = self._prior(time_ns, turn, span)
             if self._track is not None:
                 prior = self._track.experience.with_lens(prior)
-            return self.localizer.find(points, pixels, scores, prior, share, turn), prior
+            found = self.localizer.find(points, pixels, scores, prior, share, turn, stamps)
+            return found, prior
 
         if self._aid is None:
             result, prior = localized(None)
@@ -241,6 +256,7 @@ class Tracker:
             if self._aid is not None and imu is not None and self._aid.wants_sight():
                 lens, camera = result.lens, self.localizer.camera
                 camera = camera if lens is None else lens.mended(camera)
+                assert pixels is not None and not isinstance(points, Mapping)  # noqa: PT018
                 self._aid.seek(row_offset_likelihood(camera, points, pixels, result, time_ns))
         elif self._track is not None and self._memory is Memory.MOTION:
             self._track.failures += 1
@@ -248,17 +264,17 @@ class Tracker:
                 self._track = None
         return self.localizer.accepted(result)
 
-    def _prior(self, time_ns: int, turn: KnownTurn | None) -> Prior | None:
+    def _prior(self, time_ns: int, turn: KnownTurn | None, span: float | None) -> Prior | None:
         """What is known of a frame of whose motion a gyroscope predicts no more than the turn."""
         if self._memory is Memory.NOTHING:
             return Prior(of_rest=self.of_rest) if turn is None else None
         if self._memory is Memory.MAP_AND_LENS:
             return None if self._track is None else Prior(scales=self._track.experience.scales)
-        prior = self.prediction(time_ns)
+        prior = self.prediction(time_ns, span)
         if prior is not None and not self.trusts_readout_time:
             rest = self.of_rest if turn is None else 0.0
             prior = replace(prior, covariance=_UNKNOWN, of_rest=rest)
-        return prior if turn is None else _beside(prior, turn)
+        return prior if turn is None else beside_turn(prior, turn)
 
     def _remember(self, time_ns: int, prior: Prior | None, result: Estimate) -> None:
         """Keep what the next frames are to know of this one."""
@@ -298,26 +314,13 @@ class Tracker:
 
 def _check_motion(localizer: Localizer) -> None:
     """Raise ``ValueError`` where frames do not say how the camera moves."""
-    if not localizer.camera.readout_time > 0.0:
+    cameras = localizer.rig.cameras.values()
+    if not all(camera.readout_time > 0.0 for camera in cameras):
         raise ValueError("tracking needs the readout time of the camera, which is 0 (unknown)")
     if not find_solver(localizer.config.solver).rolling_shutter:
         raise ValueError(
             f"tracking needs velocities, which solver {localizer.config.solver} does not find"
         )
-
-
-def _beside(prior: Prior | None, turn: KnownTurn) -> Prior | None:
-    """What the camera alone predicts, for a motion beside a known turn."""
-    if prior is None:
-        return None
-    assert prior.motion is not None
-    assert prior.covariance is not None
-    covariance = prior.covariance.copy()
-    covariance[_TURNING] = 0.0
-    covariance[:, _TURNING] = 0.0
-    covariance[np.ix_(_TURNING, _TURNING)] = turn.error
-    still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
-    return replace(prior, motion=still, covariance=covariance)
 
 
 def _followed(track: _Track | None, prior: Prior | None, newest: Estimate, time_ns: int) -> _Track:

@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import rs_localizer as rsl
+from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.shutter import project_rolling
 from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
@@ -73,7 +74,10 @@ def exact_minimum(points, pixels, posterior, terms):
 def test_the_best_motion_is_the_minimum_of_the_exact_problem(tilt, turn, travel):
     # All points are inliers here, and nothing is averaged yet.
     localizer = rsl.Localizer(CAMERA, inlier_threshold=4.0)
-    terms, _ = assumptions(CAMERA, localizer.config, find_solver(localizer.config.solver))
+    terms, _ = assumptions(
+        CAMERA.readout_time, Rig.of(CAMERA), localizer.config,
+        find_solver(localizer.config.solver),
+    )  # fmt: skip
     compared = 0
     for seed in range(12):
         points, pixels, _ = plane_frame(seed, tilt, turn, travel, 1.0)
@@ -83,7 +87,7 @@ def test_the_best_motion_is_the_minimum_of_the_exact_problem(tilt, turn, travel)
         rays, centre = CAMERA.rays(pixels), points.mean(axis=0)
         observations = Observations.of(
             points - centre, rays, CAMERA.row_time(pixels), CAMERA.pixel_jacobian(rays),
-            CAMERA.row_time_gradient,
+            Mounts.one(CAMERA.row_time_gradient),
         )  # fmt: skip
         best = maximum_a_posteriori(observations, state_in(estimate, centre), terms, 4.0)
         if best.inliers.all():

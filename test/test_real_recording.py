@@ -10,6 +10,7 @@ from scipy.stats import chi2
 import rs_localizer as rsl
 from rs_localizer import data
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import PriorTerms, state_in
@@ -44,14 +45,14 @@ def residual(camera: Camera, cloud, start: rsl.Motion, velocities) -> tuple[rsl.
     rays, centre = camera.rays(cloud.pixels), cloud.points.mean(axis=0)
     observations = Observations.of(
         cloud.points - centre, rays, camera.row_time(cloud.pixels), camera.pixel_jacobian(rays),
-        camera.row_time_gradient,
+        Mounts.one(camera.row_time_gradient),
     )  # fmt: skip
     held = np.concatenate([np.eye(3).ravel(), np.zeros(3), velocities, np.zeros(6)])
     precision = np.diag(np.concatenate([np.zeros(6), np.full(12, 1e12)]))
     state = state_in(start, centre)
     state[12:] = held[12:]
     state = refine(
-        observations.packed, state, camera.row_time_gradient, 1e6, 0.0,
+        observations.packed, state, 1e6, 0.0,
         PriorTerms(precision[None], held[None], np.zeros(7)), 0.1, 2, 50, 1e-6,
     )[0]  # fmt: skip
     rotation = state[:9].reshape(3, 3)
@@ -177,11 +178,9 @@ def test_corners_lie_where_those_of_other_rows_say(recording):
         rays, still = camera.rays(pixels), np.zeros((len(pixels), 6))
         observations = Observations.of(
             points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays),
-            camera.row_time_gradient,
+            Mounts.one(camera.row_time_gradient),
         )  # fmt: skip
-        errors, by_motion, *_ = linearized(
-            observations.packed, len(points), state_of(found), camera.row_time_gradient, still
-        )
+        errors, by_motion, *_ = linearized(observations.packed, len(points), state_of(found), still)
         motion = found.joint_covariance[:18, :18]
         spread = by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
         # Twelve corners leave some 14 of their 24 coordinates to the noise.

@@ -21,10 +21,10 @@ def median_bound(trials: Trials, points: int, noise: float, seed: int) -> Array:
     Args:
         noise: px.
     """
-    world, rays, tau, by_ray, gradient = view_arguments(trials)
+    world, rays, tau, by_ray, mounts = view_arguments(trials)
     information = informations(
         states(trials.truth), _first(world, points), _first(rays, points), _first(tau, points),
-        by_ray[:points], gradient,
+        by_ray[:points], mounts,
     )  # fmt: skip
     scale = 1.0 / np.sqrt(np.einsum("hii->hi", information))
     scaled = information * scale[:, :, None] * scale[:, None, :]

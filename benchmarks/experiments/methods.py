@@ -20,6 +20,7 @@ from benchmarks.experiments.kernels import best_solutions, refine_frames
 from benchmarks.experiments.trials import POINTS, Motions, Trials, camera
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array
+from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import SOLVERS, find_solver
@@ -146,11 +147,11 @@ def _motions(models: Array) -> Motions:
                    models[:, 15:18])  # fmt: skip
 
 
-def view_arguments(trials: Trials) -> tuple[Array, Array, Array, Array, Array]:
+def view_arguments(trials: Trials) -> tuple[Array, Array, Array, Array, Mounts]:
     """What the kernels of many frames need to know of them."""
     view = camera()
     by_ray = view.pixel_jacobian(trials.rays[0])
-    return trials.points, trials.rays, trials.tau, by_ray, view.row_time_gradient
+    return trials.points, trials.rays, trials.tau, by_ray, Mounts.one(view.row_time_gradient)
 
 
 def _best(models: Array, trials: Trials, scale: float) -> Array:
@@ -159,7 +160,9 @@ def _best(models: Array, trials: Trials, scale: float) -> Array:
 
 
 def _refined(models: Array, trials: Trials, threshold: float) -> Motions:
-    prior, _ = assumptions(camera(), LocalizerConfig(), find_solver("r6p_vcwt"))
+    prior, _ = assumptions(
+        camera().readout_time, Rig.of(camera()), LocalizerConfig(), find_solver("r6p_vcwt")
+    )
     found = refine_frames(np.ascontiguousarray(models), *view_arguments(trials), threshold, prior)
     w, velocity = -found[:, 12:15], found[:, 15:18]
     translation = found[:, 9:12]

@@ -49,7 +49,7 @@ class FreeMotion:
         """
         errors: Array = _squared_errors(
             self.model, observations.points, observations.rays, observations.tau, by_ray,
-            observations.row_time_gradient, 2,
+            observations.mounts.gradients[0], 2,
         )  # fmt: skip
         return errors
 
@@ -75,7 +75,7 @@ def best_free_motion(
     """Of models (h,3,8) the one with the least squared error, truncated at ``scale`` px."""
     costs = _costs(
         models, observations.points, observations.rays, observations.tau, by_ray,
-        observations.row_time_gradient, scale,
+        observations.mounts.gradients[0], scale,
     )  # fmt: skip
     best = int(np.argmin(costs))
     return FreeMotion(models[best]) if np.isfinite(costs[best]) else None

@@ -15,10 +15,12 @@ from benchmarks.experiments.methods import Method
 from benchmarks.experiments.own_model import best_free_motion, solve_all
 from rs_localizer.core.arrays import Array, IntArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR, STATE_TRANSLATION, rotation_of
 from rs_localizer.estimation.observations import Observations
-from rs_localizer.estimation.ransac import MODEL_SIZE, best_models, draw, generator
+from rs_localizer.estimation.ransac import best_models, draw, generator
+from rs_localizer.solvers.batch import MODEL_SIZE
 from rs_localizer.solvers.table import find_solver
 
 
@@ -31,7 +33,7 @@ def observe(camera: Camera, points: Array, pixels: Array) -> Observations:
         rays[usable],
         camera.row_time(pixels[usable]),
         camera.pixel_jacobian(rays[usable]),
-        camera.row_time_gradient,
+        Mounts.one(camera.row_time_gradient),
     )
 
 
@@ -86,7 +88,7 @@ class PlainRansac:
             method.iterations, models,
         )  # fmt: skip
         states, costs = best_models(
-            models, observations.packed, observations.row_time_gradient, self.threshold, 1,
+            models, observations.packed, self.threshold, 1,
             math.inf,
         )  # fmt: skip
         if not math.isfinite(costs[0]):
@@ -114,6 +116,6 @@ class PlainRansac:
         drawn = np.empty((self.samples, find_solver(method.solver).sample_size), dtype=np.int64)
         draw(
             np.arange(count), np.full(self.samples, count), self.observations.tau,
-            self.observations.row_range, generator(self.seed), drawn,
+            float(np.ptp(self.observations.tau)), generator(self.seed), drawn,
         )  # fmt: skip
         return drawn

@@ -15,7 +15,7 @@ from benchmarks.experiments.startup import Startup, cold_and_warm
 from benchmarks.experiments.stopwatch import Subject, interleaved, ratio
 from benchmarks.experiments.trials import Setting, Trials, draw_trials
 from rs_localizer.core.arrays import Array
-from rs_localizer.estimation.ransac import MODEL_SIZE
+from rs_localizer.solvers.batch import MODEL_SIZE
 from rs_localizer.solvers.minimal import solve_minimal
 from rs_localizer.solvers.table import SOLVERS, find_solver
 

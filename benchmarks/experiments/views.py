@@ -14,6 +14,7 @@ from benchmarks.experiments.methods import states
 from benchmarks.experiments.trials import Setting, camera, draw_trials
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import (
     MOTION_PARAMETERS,
@@ -52,7 +53,7 @@ class View:
         found: Array = informations(
             state_in(self.motion, centre)[None], (points - centre)[None], rays[None],
             self.camera.row_time(pixels)[None], self.camera.pixel_jacobian(rays),
-            self.camera.row_time_gradient,
+            Mounts.one(self.camera.row_time_gradient),
         )[0]  # fmt: skip
         return found / self.noise**2
 

@@ -31,6 +31,7 @@ from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, BoolArray
 from rs_localizer.core.camera import Camera as Believed
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.rig import Rig
 from rs_localizer.estimation.assumptions import (
     assumptions,
     known_terms,
@@ -162,10 +163,11 @@ def _found(
 ) -> tuple[Array, int]:
     """Rotation (3,3) camera_from_map by the robust loop and the refinement."""
     config = LocalizerConfig()
-    terms, assumed = assumptions(camera, config, solver)
-    usable = find_usable(camera, *given, turn)
+    exposure = Rig.of(camera).exposure()
+    terms, assumed = assumptions(camera.readout_time, Rig.of(camera), config, solver)
+    usable = find_usable(exposure, *given, [len(given[0])], turn)
     observed = Observed(
-        packed(camera, given[0], usable),
+        packed(exposure, given[0], usable),
         usable.indices,
         len(given[0]),
         usable.centre,
@@ -173,9 +175,11 @@ def _found(
         known_terms(terms, prior, turn),
         generator(config.seed),
         with_experience(assumed, prior, turn_seen(terms, turn)),
-        Sighted(camera, *given, usable, turn),
+        Sighted(exposure, *given, usable, turn),
     )
-    start, best = MotionSearch(camera, config, solver, start_solver(solver)).find(observed)
+    start, best = MotionSearch(camera.focal_length, config, solver, start_solver(solver)).find(
+        observed
+    )
     if not start.found:
         return np.diag([1.0, -1.0, -1.0]), best.samples
     threshold = config.inlier_threshold

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from rs_localizer.core import lens_laws
 from rs_localizer.core.arrays import Array
-from rs_localizer.core.lens_laws import LensLaw
+from rs_localizer.core.double_sphere import DOUBLE_SPHERE
+from rs_localizer.core.eucm import EUCM
+from rs_localizer.core.lens_laws import LensLaw, Sphere
 from rs_localizer.core.scanning import ScanDirection
 
 # NumPy's ArrayLike is so wide that type checkers take [[500, 0], [0, 500]] for a list of objects.
@@ -57,7 +59,9 @@ def choice(name: str, kind: type[E], value: Any) -> E:
 
 
 class DistortionModel(StrEnum):
-    """THE list of lenses: names in sensor_msgs/CameraInfo, and their laws."""
+    """THE list of lenses: names in sensor_msgs/CameraInfo (the last two: Kalibr's), and their
+    laws.
+    """
 
     law: LensLaw
 
@@ -71,6 +75,8 @@ class DistortionModel(StrEnum):
     PLUMB_BOB = "plumb_bob", lens_laws.PLUMB_BOB
     RATIONAL_POLYNOMIAL = "rational_polynomial", lens_laws.RATIONAL_POLYNOMIAL
     EQUIDISTANT = "equidistant", lens_laws.EQUIDISTANT
+    EUCM = "eucm", EUCM
+    DOUBLE_SPHERE = "ds", DOUBLE_SPHERE
 
 
 _LONGEST_READOUT = 1.0  # s: more than any camera takes for a picture of a moving world
@@ -97,9 +103,10 @@ class Camera:
     Args:
         width, height: size of the full sensor image to which K belongs, pixels.
         K: (3,3) intrinsic matrix without skew.
-        D: distortion coefficients in OpenCV's order (empty or None: none).
-        distortion_model: ``plumb_bob``, ``rational_polynomial`` or ``equidistant``; see
-            :class:`DistortionModel`.
+        D: distortion coefficients in OpenCV's order (empty or None: none); alpha, beta of
+            ``eucm``, xi, alpha of ``ds``.
+        distortion_model: ``plumb_bob``, ``rational_polynomial``, ``equidistant``, ``eucm`` or
+            ``ds``; see :class:`DistortionModel`.
         readout_time: s from the first to the last row of the full sensor; 0 = unknown.
         scan_direction: see :class:`ScanDirection`.
         binning: sensor pixels per delivered pixel, (x, y).
@@ -159,6 +166,11 @@ class Camera:
             )
         if not np.all(np.isfinite(D)):
             raise ValueError(f"D must be finite, got {D.tolist()}")
+        for value, (low, high) in zip(D, model.law.limits or (), strict=False):
+            if not low <= value <= high:
+                raise ValueError(
+                    f"D of {model} must lie within {model.law.limits}, got {D.tolist()}"
+                )
         direction = choice("scan_direction", ScanDirection, self.scan_direction)
         if min(self.width, self.height) < 2:
             raise ValueError(f"the image must be at least 2x2, got {self.width}x{self.height}")
@@ -279,10 +291,45 @@ class Camera:
         return rays, jacobian
 
     def project(self, points: Array) -> Array:
-        """Raw pixels (n,2) of points (n,3) in the camera frame; NaN behind the camera."""
+        """Raw pixels (n,2) of points (n,3) in the camera frame; NaN where the lens sees none.
+
+        Lenses of more than 180 degrees see what lies behind the image plane.
+        """
         points = np.asarray(points, float)
+        if (sphere := self._sphere) is not None:
+            sensor = sphere.see(points, self.D) * np.diag(self.K)[:2] + self.K[:2, 2]
+            return np.asarray((sensor - self._offset()) / self.binning)
         depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
         return self.distort(points[:, :2] / depth[:, None])[0]
+
+    def bearings(self, pixels: Array) -> Array:
+        """Unit vectors (n,3) from the camera towards what raw pixels (n,2) show; NaN for none.
+
+        Unlike :meth:`rays`, also of what lies behind the image plane.
+        """
+        pixels = np.asarray(pixels, float)
+        if (sphere := self._sphere) is None:
+            towards = np.column_stack([self.rays(pixels), np.ones(len(pixels))])
+        else:
+            sensor = pixels * self.binning + self._offset()
+            towards = sphere.look((sensor - self.K[:2, 2]) / np.diag(self.K)[:2], self.D)
+            lost = ~(np.abs(self.project(towards) - pixels) < _ROUND_TRIP_TOLERANCE).all(axis=1)
+            towards[lost] = np.nan
+        return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+
+    @property
+    def sees_behind(self) -> bool:
+        """Whether some of the image shows what lies behind the image plane."""
+        if self._sphere is None:
+            return False
+        right, bottom = np.array(self.size) - 1.0
+        across, down = np.meshgrid([0.0, 0.5 * right, right], [0.0, 0.5 * bottom, bottom])
+        border = np.column_stack([across.ravel(), down.ravel()])
+        return bool(np.any(self.bearings(border)[:, 2] <= 0.0))  # NaN compares false
+
+    @property
+    def _sphere(self) -> Sphere | None:
+        return self.law.sphere if len(self.D) else None
 
     def pixel_jacobian(self, rays: Array) -> Array:
         """Derivatives (n,2,2) of the raw pixel by the ray at rays (n,2)."""

@@ -1,9 +1,11 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lens laws: where a bearing falls on the sensor, and back. The three of sensor_msgs/CameraInfo.
+"""Lens laws: where a bearing falls on the sensor, and back.
 
-A new law is a file with its own :class:`LensLaw`, and a row in
-:class:`rs_localizer.core.camera.DistortionModel`; all else reads what stands here.
+Three are those of sensor_msgs/CameraInfo; :mod:`rs_localizer.core.eucm` and
+:mod:`rs_localizer.core.double_sphere` have their names from Kalibr. A new law is a file with its
+own :class:`LensLaw`, and a row in :class:`rs_localizer.core.camera.DistortionModel`; all else
+reads what stands here.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from rs_localizer.core import equidistant
 from rs_localizer.core.arrays import Array
 
 # OpenCV's own default of five iterations leaves errors of pixels at the rim of wide lenses.
@@ -27,6 +30,13 @@ class Projection(NamedTuple):
     by_ray: Array  # (n,2,2)
     by_matrix: Array  # (n,2,4) fx, fy, cx, cy
     by_coefficients: Array  # (n,2,d)
+
+
+class Sphere(NamedTuple):
+    """How a lens sees bearings of any direction, also those behind the image plane."""
+
+    see: Callable[[Array, Array], Array]  # bearings (n,3), D: places (n,2), in focal lengths
+    look: Callable[[Array, Array], Array]  # places, D: bearings (n,3) of any length
 
 
 class LensLaw(NamedTuple):
@@ -45,6 +55,10 @@ class LensLaw(NamedTuple):
     project: Callable[[Array, Array, Array], Projection]
     undistort: Callable[[Array, Array, Array], Array]
     is_polynomial: bool = False  # OpenCV's pinhole polynomials, which core.bearings inverts
+    sphere: Sphere | None = None  # of a lens that may see more than the half space before it
+    # Between which each coefficient lies; None: anywhere. The coefficients of such a law act at all
+    # powers of the radius at once: one of 1 moves the corner by its distance from the centre.
+    limits: tuple[tuple[float, float], ...] | None = None
 
     @property
     def correctable(self) -> tuple[int | None, ...]:
@@ -87,10 +101,75 @@ def _undistort_fisheye(pixels: Array, K: Array, D: Array) -> Array:
     return np.asarray(rays[:, 0], np.float64)
 
 
+class Seen(NamedTuple):
+    """Where bearings are seen, in focal lengths from the centre."""
+
+    places: Array  # (n,2)
+    by_bearing: Array  # (n,2,3)
+    by_coefficients: Array  # (n,2,d)
+
+
+def onto_sensor(bearings: Array, below: Array, by_bearing: Array, by_coefficients: Array) -> Seen:
+    """``x, y`` of bearings (n,3) divided by a number each.
+
+    Args:
+        below: (n,) the numbers.
+        by_bearing, by_coefficients: (n,3) and (n,d), their derivatives.
+    """
+    places = bearings[:, :2] / below[:, None]
+    shrink = -places[:, :, None] / below[:, None, None]
+    seen = Seen(
+        places, shrink * by_bearing[:, None, :], shrink * by_coefficients[:, None, :]
+    )  # fmt: skip
+    for axis in range(2):
+        seen.by_bearing[:, axis, axis] += 1.0 / below
+    return seen
+
+
+def sphere_law(
+    see: Callable[[Array, Array], Seen],
+    look: Callable[[Array, Array], Array],
+    limits: tuple[tuple[float, float], ...],
+) -> LensLaw:
+    """The law of a lens with a closed formula for bearings (n,3) of any direction.
+
+    Args:
+        see: of bearings and D.
+        look: bearings of places (n,2), in focal lengths from the centre, and D.
+        limits: of each coefficient.
+    """
+
+    def project(rays: Array, K: Array, D: Array) -> Projection:
+        seen = see(np.column_stack([rays, np.ones(len(rays))]), D)
+        focal = np.diag(K)[:2]
+        by_matrix = np.zeros((len(rays), 2, 4))
+        for axis in range(2):
+            by_matrix[:, axis, axis], by_matrix[:, axis, 2 + axis] = seen.places[:, axis], 1.0
+        return Projection(
+            seen.places * focal + K[:2, 2],
+            seen.by_bearing[:, :, :2] * focal[:, None],
+            by_matrix,
+            seen.by_coefficients * focal[:, None],
+        )
+
+    def undistort(pixels: Array, K: Array, D: Array) -> Array:
+        bearings = look((pixels - K[:2, 2]) / np.diag(K)[:2], D)
+        ahead = np.where(bearings[:, 2:] > 0.0, bearings[:, 2:], np.nan)
+        return np.asarray(bearings[:, :2] / ahead)
+
+    # All coefficients act from the third power on: the lowest, and one that differs above it.
+    orders = tuple(range(len(limits)))
+    sphere = Sphere(lambda bearings, D: see(bearings, D).places, look)
+    return LensLaw((len(limits),), orders, project, undistort, sphere=sphere, limits=limits)
+
+
 PLUMB_BOB = LensLaw(  # k1 k2 p1 p2 k3
     (0, 4, 5), (0, 1, None, None, 2), _project, _undistort, is_polynomial=True
 )
 RATIONAL_POLYNOMIAL = LensLaw(  # k1 k2 p1 p2 k3, k4 k5 k6, s1 s2 s3 s4, tau_x tau_y
     (0, 8, 12, 14), (0, 1, None, None, 2, 0, 1, 2), _project, _undistort, is_polynomial=True
 )
-EQUIDISTANT = LensLaw((0, 4), (0, 1, 2, 3), _project_fisheye, _undistort_fisheye)  # k1 k2 k3 k4
+EQUIDISTANT = LensLaw(  # k1 k2 k3 k4
+    (0, 4), (0, 1, 2, 3), _project_fisheye, _undistort_fisheye,
+    sphere=Sphere(equidistant.see, equidistant.look),
+)  # fmt: skip

@@ -54,16 +54,38 @@ def rectify(
         raise ValueError(f"pixels must be (n,2), got {pixels.shape}")
     if not np.isfinite(tau):
         raise ValueError(f"tau must be finite, got {tau!r}")
-    rows = camera.row_time(pixels)
+    rotations, translations = motion.at_rows(camera.row_time(pixels))
+    return transferred(camera, pixels, (rotations, translations), motion.at(float(tau)), depths)
+
+
+def transferred(
+    camera: Camera,
+    pixels: Array,
+    poses: tuple[Array, Array],
+    wanted: tuple[Array, Array],
+    depths: ArrayLike | None = None,
+) -> Array:
+    """Where a camera elsewhere would have seen what these pixels show.
+
+    Args:
+        camera: that took the image.
+        pixels: (n,2) raw.
+        poses: rotations (n,3,3) and translations (n,3), camera_from_map, when each was exposed.
+        wanted: rotation and translation of the other: (3,3) and (3,), or for each pixel.
+        depths: (n,) or one for all, as of :func:`rectify`.
+
+    Returns:
+        (n,2) as of :func:`rectify`.
+    """
+    rotations, translations = poses
+    turn = "...ij,...kj,...k->...i"  # wanted_from_own
     points = np.column_stack([camera.rays(pixels), np.ones(len(pixels))])
-    rotations, translations = motion.at_rows(rows)
-    wanted, translation = motion.at(float(tau))
-    turned = np.einsum("ij,nkj,nk->ni", wanted, rotations, points)
+    turned = np.einsum(turn, wanted[0], rotations, points)
     if depths is None:
         return camera.project(turned)
     z = np.asarray(depths, np.float64)
     if z.shape not in ((), (len(pixels),)) or not np.all(z > 0.0):
         raise ValueError(f"depths must be one or (n,) numbers above 0, got {depths!r}")
     # In units of the depth, which may be infinite.
-    shift = translation - np.einsum("ij,nkj,nk->ni", wanted, rotations, translations)
+    shift = wanted[1] - np.einsum(turn, wanted[0], rotations, translations)
     return camera.project(turned + shift / np.broadcast_to(z, len(pixels))[:, None])

@@ -59,6 +59,7 @@ class Estimate(Motion):
     # What the calibration lacks, if the motion was found with it: project with lens.mended(camera)
     lens: LensError | None = None
     of_lens: LensError | None = None  # what the frame says of that; None: not asked
+    span: float = 0.0  # s of a readout, as which row times count; 0: unknown
 
     @property
     def covariance(self) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from rs_localizer.core import so3
 from rs_localizer.core.arrays import Array, instance
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Rig, RigEstimate
 from rs_localizer.core.shutter import Motion
 
 
@@ -42,24 +43,31 @@ class CameraState:
         return np.asarray(self.rotation @ self.angular_velocity)
 
 
-def camera_state(motion: Motion, camera: Camera, tau: float = 0.0) -> CameraState:
+def camera_state(motion: Motion, camera: Camera | Rig, tau: float = 0.0) -> CameraState:
     """An estimate in SI units, at one of its rows.
 
     Args:
-        motion: an :class:`rs_localizer.Estimate`, or any motion.
-        camera: with its readout time.
+        motion: an :class:`rs_localizer.Estimate`, or any motion; of a rig a ``RigEstimate``, of
+            whose span ``tau`` is a part, and whose axes and origin take the place of the camera's.
+        camera: with its readout time, or the rig.
         tau: row time: 0 for the middle row, -0.5 for the first, 0.5 for the last.
 
     Raises:
         ValueError: for a row time that is not finite, or a Failure instead of a motion.
     """
     instance("motion", motion, Motion)
-    instance("camera", camera, Camera)
+    if isinstance(camera, Rig):
+        if not isinstance(motion, RigEstimate):
+            raise ValueError(f"a rig's motion must be a RigEstimate, got {type(motion).__name__}")
+        seconds = motion.span
+    else:
+        instance("camera", camera, Camera)
+        seconds = camera.readout_time
     if not np.isfinite(tau):
         raise ValueError(f"tau must be finite, got {tau!r}")
     rotation, translation = motion.at(tau)
     in_map = np.ascontiguousarray(rotation.T)
-    per_readout = camera.readout_time if camera.readout_time > 0.0 else np.nan
+    per_readout = seconds if seconds > 0.0 else np.nan
     return CameraState(
         position=-in_map @ translation,
         orientation=so3.quaternion(in_map),

@@ -11,7 +11,7 @@ import numpy as np
 from rs_localizer.core.reasons import Reason
 from rs_localizer.core.state import STATE_ANGULAR, STATE_LINEAR
 from rs_localizer.core.types import Estimate, Failure
-from rs_localizer.estimation.observations import Observations, median_depth, median_of
+from rs_localizer.estimation.observations import Observations, median_of
 from rs_localizer.estimation.posterior import Mirror, Posterior
 
 # Beyond this the camera turns by more than the motion model is meant for, rad per readout.
@@ -128,7 +128,7 @@ def refusal(
             Reason.IMPLAUSIBLE,
             f"the camera would turn by {math.degrees(turn):.0f} deg per readout",
         )
-    depth = median_depth(state, observations.points, posterior.inliers)
+    depth = observations.median_depth(state, posterior.inliers)
     travel = float(np.linalg.norm(state[STATE_LINEAR]))
     if travel > depth:
         return Failure(

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rs_localizer.config import LocalizerConfig
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.scales import SPEEDS, Scales
 from rs_localizer.core.state import ANGULAR
 from rs_localizer.estimation.prior import (
@@ -57,22 +57,26 @@ class Assumed:
 
 
 def assumptions(
-    camera: Camera, config: LocalizerConfig, solver: Solver
+    span: float, rig: Rig, config: LocalizerConfig, solver: Solver
 ) -> tuple[PriorTerms, Assumed]:
-    """What the configuration assumes of motion, camera and map, per readout."""
-    readout_time = camera.readout_time or _UNKNOWN_READOUT_TIME
+    """What the configuration assumes of motion, cameras and map, per span of the row times.
+
+    Args:
+        span: s; 0: unknown.
+    """
+    span = span or _UNKNOWN_READOUT_TIME
     velocity, acceleration = config.velocity_prior, config.acceleration
     terms = (
         motion_terms(
-            (velocity.angular * readout_time, velocity.linear * readout_time),
-            (acceleration.angular * readout_time**2, acceleration.linear * readout_time**2),
+            (velocity.angular * span, velocity.linear * span),
+            (acceleration.angular * span**2, acceleration.linear * span**2),
         )
         if solver.rolling_shutter
         else held_terms()
     )
     return terms, Assumed(
         map_deviation=config.map_deviation,
-        focal_length=camera.focal_length,
+        focal_length=rig.focal_length,
         may_rest=solver.rolling_shutter and min(velocity.angular, velocity.linear) > 0.0,
         rolling=solver.rolling_shutter,
         scales=Scales.nothing(),

@@ -31,6 +31,8 @@ from rs_localizer.estimation.prior import PriorTerms, add_prior, terms_at
 from rs_localizer.estimation.refine import inverted
 from rs_localizer.estimation.residuals import Lines, linearized
 
+# Of each camera: centre (2), focal length, distortion.
+_ERRORS = 4
 # Of a combination of typical speeds, the part of one that does not count.
 _NO_PART = 0.02
 _CONFIGURED = np.array([speed == 1.0 for speed in SPEEDS], float)
@@ -58,11 +60,16 @@ def calibration_effect(
     """
     observations, chosen = observed.observations, posterior.inliers
     lines = linearized(
-        observations.packed, len(observations), posterior.state, observations.row_time_gradient,
+        observations.packed, len(observations), posterior.state,
         shake_at(observations.tau, posterior.shake),
     )  # fmt: skip
     rays = rays_of_lens(observed.sighted, observations.tau[chosen], lines.image[chosen])
-    columns = _columns(observed.sighted.camera, rays, deviation)
+    of_camera, cameras = observations.camera[chosen], observed.sighted.exposure.cameras
+    columns = np.zeros((len(rays), 2, _ERRORS * len(cameras)))
+    for place, camera in enumerate(cameras):
+        here, own = of_camera == place, slice(_ERRORS * place, _ERRORS * (place + 1))
+        if np.any(here):
+            columns[here, :, own] = _columns(camera, rays[here], deviation)
     smooth = _smooth_columns(posterior, lines, chosen)
     pixels = columns.reshape(-1, columns.shape[2])
     by_motion = np.ascontiguousarray(lines.by_motion[chosen].reshape(-1, PARAMETERS))
@@ -120,7 +127,7 @@ def _columns(camera: Camera, rays: Array, deviation: CalibrationErrors) -> Array
     by_all = by_lens(camera, rays)
     focal = coefficients_of(camera) - 4
     corner = corner_of(camera) * camera.focal_length / camera.binning[0]
-    columns = np.zeros((len(rays), 2, 4))
+    columns = np.zeros((len(rays), 2, _ERRORS))
     columns[:, 0, 0] = columns[:, 1, 1] = deviation.principal_point
     columns[:, :, 2] = deviation.focal_length * by_all[:, :, focal : focal + 2].sum(axis=2)
     columns[:, :, 3] = deviation.distortion / corner * by_all[:, :, 0]

@@ -579,7 +579,7 @@ def _row_times(data: Array, count: int) -> Array:
 
 @kernel
 def fit_frame(
-    data: Array, count: int, start: Array, gradient: Array, prior: PriorTerms, threshold: float,
+    data: Array, count: int, start: Array, prior: PriorTerms, threshold: float,
     first_gate: float, first_noise: float, log_scales: Array, hyper_mean: Array,
     hyper_precision: Array, with_turns: bool, with_smooth: bool, bend: Array, most: int,
 ) -> FrameFit:  # fmt: skip
@@ -588,7 +588,6 @@ def fit_frame(
     Args:
         data: packed points, ``count`` of them.
         start: state (24,).
-        gradient: (2,) row time by pixel.
         prior: of the motion without its in-frame turn.
         threshold: px, of inliers.
         first_gate, first_noise: px; the gate closes from there to what the noise decides.
@@ -608,10 +607,10 @@ def fit_frame(
     )
     tau = _row_times(data, count)
     turns = np.zeros((FUNCTIONS if with_turns else 0, 3))
-    inliers = squared_errors(data, count, state, gradient) < gate * gate
+    inliers = squared_errors(data, count, state) < gate * gate
     prior_cost, finite, done = 0.0, True, False
-    lines = linearized(data, count, state, gradient, shake_at(tau, turns))
-    errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:], bend)
+    lines = linearized(data, count, state, shake_at(tau, turns))
+    errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
     for turn in range(most):
         kept = int(np.count_nonzero(inliers))
         if kept < _FEWEST:
@@ -633,8 +632,8 @@ def fit_frame(
         for k in range(len(turns)):
             for axis in range(3):
                 turns[k, axis] = coefficients[3 * k + axis]
-        lines = linearized(data, count, state, gradient, shake_at(tau, turns))
-        errors, squared = _beside(data, state, gradient, lines, inliers, coefficients[first:], bend)
+        lines = linearized(data, count, state, shake_at(tau, turns))
+        errors, squared = _beside(data, state, lines, inliers, coefficients[first:], bend)
         noise = noise_deviation(squared, gate, max(2.0 * kept - solved.freedom, 0.0))
         closed = gate <= WIDEST_GATE * threshold
         gate = max(_CLOSING * gate, min(max(threshold, GATE * noise), WIDEST_GATE * threshold))
@@ -663,7 +662,6 @@ def fit_frame(
 def _beside(
     data: Array,
     state: Array,
-    gradient: Array,
     lines: Lines,
     inliers: BoolArray,
     smooth: Array,
@@ -673,7 +671,7 @@ def _beside(
     errors = lines.errors.copy()
     if len(smooth) > 0:
         errors += smooth_at(lines, inliers, smooth, bend)
-    squared = squared_errors(data, len(errors), state, gradient)
+    squared = squared_errors(data, len(errors), state)
     for i in range(len(errors)):
         if np.isfinite(squared[i]):
             squared[i] = errors[i, 0] ** 2 + errors[i, 1] ** 2
@@ -706,7 +704,7 @@ class ScoreProducts(NamedTuple):
 
 @kernel
 def score_products(
-    data: Array, count: int, state: Array, gradient: Array, inliers: BoolArray, prior: PriorTerms,
+    data: Array, count: int, state: Array, inliers: BoolArray, prior: PriorTerms,
     variance: float, turns: bool,
 ) -> tuple[ScoreProducts, float]:  # fmt: skip
     """What tells how much an in-frame turn and a smooth error would explain (Rao 1948).
@@ -721,8 +719,8 @@ def score_products(
     Returns:
         the products, and how much the errors of neighbouring rows agree.
     """
-    lines = linearized(data, count, state, gradient, np.zeros((count, 6)))
-    front = squared_errors(data, count, state, gradient)
+    lines = linearized(data, count, state, np.zeros((count, 6)))
+    front = squared_errors(data, count, state)
     frequencies = SCALES - 1
     information, slope = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     add_prior(

@@ -42,7 +42,7 @@ from rs_localizer.estimation.modes import (
     log_evidence,
     mixture_of,
 )
-from rs_localizer.estimation.observations import Observations, median_depth
+from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import GATE, WIDEST_GATE, Posterior, maximum_a_posteriori
 from rs_localizer.estimation.prior import PriorTerms
 from rs_localizer.estimation.refine import apply_step, inverted
@@ -143,7 +143,7 @@ def frame_posterior(
         inliers = errors <= gate**2
         bend = part.bend
         if bend.shape[1]:
-            depth = max(median_depth(part.state, observations.points, inliers), _NEAREST)
+            depth = max(observations.median_depth(part.state, inliers), _NEAREST)
             bend = _bend(observations.points, inliers, depth / assumed.focal_length)
         return replace(part, squared_errors=errors, inliers=inliers, bend=bend)
     return _of_points(observations, start, terms, threshold, assumed)
@@ -164,11 +164,11 @@ def _of_points(
             and (np.count_nonzero(again.inliers) >= np.count_nonzero(best.inliers))
         ):
             best, other = again, mirrored(observations.points, again.inliers, again.state)
-    depth = max(median_depth(best.state, observations.points, best.inliers), _NEAREST)
+    depth = max(observations.median_depth(best.state, best.inliers), _NEAREST)
     declared = assumed.map_deviation * assumed.focal_length / depth  # px
     hyper = _hyperprior(assumed, declared)
     explained, agreement, vibration = _look(
-        observations.packed, observations.count, best.state, observations.row_time_gradient,
+        observations.packed, observations.count, best.state,
         best.inliers, terms, best.noise, best.freedom, hyper.mean, hyper.precision,
         assumed.rolling,
     )  # fmt: skip
@@ -304,7 +304,7 @@ def _shaken(frame: _Frame, asked: Asked, other: Array | None) -> tuple[Posterior
     fits: list[FrameFit] = []
     for state in (best.state,) if other is None else (best.state, other):
         fit = fit_frame(
-            observations.packed, observations.count, state, observations.row_time_gradient, terms,
+            observations.packed, observations.count, state, terms,
             threshold, gate, noise, first, mean, precision,
             True, asked.smooth, bend, STEPS,
         )  # fmt: skip
@@ -404,7 +404,7 @@ def _smooth(frame: _Frame) -> SmoothError:
 def _inliers(frame: _Frame) -> Inliers:
     observations, best = frame.observations, frame.best
     return Inliers(
-        observations.packed, observations.points, observations.row_time_gradient, best.inliers,
+        observations.packed, observations.points, best.inliers,
         best.noise, best.freedom, best.cost / best.noise**2, best.inflation,
         frame.assumed.focal_length, frame.threshold,
     )  # fmt: skip
@@ -443,7 +443,7 @@ def _either(
 
 @kernel
 def _look(
-    data: Array, count: int, state: Array, gradient: Array, inliers: BoolArray, prior: PriorTerms,
+    data: Array, count: int, state: Array, inliers: BoolArray, prior: PriorTerms,
     noise: float, freedom: float, means: Array, precisions: Array, turns: bool,
 ) -> tuple[Array, float, Undetected]:  # fmt: skip
     """What each frequency of an in-frame turn, and a smooth error, would explain of the errors.
@@ -457,9 +457,7 @@ def _look(
     """
     statistic = np.zeros(SCALES)
     variance, frequencies = noise * noise, len(CYCLES)
-    products, agreement = score_products(
-        data, count, state, gradient, inliers, prior, variance, turns
-    )
+    products, agreement = score_products(data, count, state, inliers, prior, variance, turns)
     own, crossed, along, within, across, beside, inverse = products
     pull = np.zeros((frequencies if turns else 0, 6, PARAMETERS))
     for f in range(len(pull)):

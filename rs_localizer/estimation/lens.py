@@ -103,7 +103,7 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
         best = maximum_a_posteriori(observations, state, terms, gate * threshold)
         if not (best.determined and np.all(np.isfinite(best.state))):
             return None
-        by_mended = replace(sighted, camera=mended)
+        by_mended = replace(sighted, exposure=sighted.exposure.by(mended))
         step, lens, _ = _told(by_mended, observations, best, terms, coefficients)
         if not np.all(np.isfinite(step)):
             return None
@@ -115,7 +115,7 @@ def find_lens(observed: Observed, refused: Posterior, threshold: float) -> Mende
     observations = sighted.by(mended)
     if observations is None:
         return None
-    return Mended(replace(sighted, camera=mended), lens, observations, state)
+    return Mended(replace(sighted, exposure=sighted.exposure.by(mended)), lens, observations, state)
 
 
 def told_of_lens(observed: Observed, posterior: Posterior) -> tuple[Posterior, LensError | None]:
@@ -274,12 +274,11 @@ def _told(
     """
     count, chosen = observations.count, best.inliers
     # The noise in derivatives looks like a lens, the same in all frames, and these are joined.
-    observations = relinearized(sighted.camera, observations, best.state, sighted.turn, fewest=0)
+    observations = relinearized(sighted.exposure, observations, best.state, sighted.turn, fewest=0)
     lines = linearized(
         observations.packed,
         count,
         best.state,
-        observations.row_time_gradient,
         shake_at(observations.tau, best.shake),
     )
     camera = sighted.camera

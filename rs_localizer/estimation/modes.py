@@ -214,7 +214,6 @@ class Inliers(NamedTuple):
 
     data: Array  # packed, all points
     points: Array  # (n,3)
-    gradient: Array  # (2,) row time by pixel
     chosen: BoolArray  # (n,)
     noise: float  # px
     freedom: float
@@ -368,7 +367,7 @@ def _mode(
     state, information, cost = start, np.empty((PARAMETERS, PARAMETERS)), 0.0
     for _ in range(_FITS):
         state, information, cost, converged = refine(
-            data, state, inliers.gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
+            data, state, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, _FINE
         )
         if converged:
             break
@@ -383,7 +382,7 @@ def _mode(
     scale = 0.0
     if smooth.fitted and np.isfinite(evidence):
         fit = fit_frame(
-            inliers.data, len(inliers.chosen), state, inliers.gradient, terms, inliers.threshold,
+            inliers.data, len(inliers.chosen), state, terms, inliers.threshold,
             WIDEST_GATE * inliers.threshold, noise, smooth.first, smooth.mean, smooth.precision,
             False, True, smooth.bend, STEPS,
         )  # fmt: skip

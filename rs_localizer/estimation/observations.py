@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,12 +19,22 @@ from rs_localizer.core.gyro_compensated import gyro_compensated
 from rs_localizer.core.known_turn import KnownTurn
 from rs_localizer.core.lens import LensError
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.rig import Exposure, Mounts, Rig
 from rs_localizer.core.simd.jit import inlined, kernel
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Failure
 from rs_localizer.estimation.assumptions import Assumed
 from rs_localizer.estimation.prior import PriorTerms
-from rs_localizer.estimation.residuals import POINT_SIZE, linearized, row_paces, squared_errors
+from rs_localizer.estimation.residuals import (
+    AXES,
+    CENTRE,
+    GRADIENT,
+    POINT_SIZE,
+    WEIGHT,
+    linearized,
+    row_paces,
+    squared_errors,
+)
 
 
 @kernel
@@ -45,12 +56,17 @@ def median_point(points: Array, chosen: BoolArray) -> Array:
 
 
 @kernel
-def median_depth(state: Array, points: Array, chosen: BoolArray) -> float:
-    """How far before the camera of a state (24,) the median of some points (n,3) is; NaN: none."""
-    depths = np.empty(len(points))
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        depths[i] = x * state[6] + y * state[7] + z * state[8] + state[11]
+def _median_depth(data: Array, state: Array, chosen: BoolArray) -> float:
+    depths = np.empty(len(chosen))
+    for i in range(len(chosen)):
+        block, lane = data[i // LANES], i % LANES
+        x, y, z = block[lane], block[LANES + lane], block[2 * LANES + lane]
+        depth = 0.0
+        for k in range(3):
+            place = x * state[3 * k] + y * state[3 * k + 1] + z * state[3 * k + 2] + state[9 + k]
+            place -= block[(CENTRE + k) * LANES + lane]
+            depth += block[(AXES + 6 + k) * LANES + lane] * place
+        depths[i] = depth
     return median_of(depths, chosen)
 
 
@@ -89,13 +105,49 @@ def checked(
     return points, pixels, scores
 
 
-def distinct(points: Array, pixels: Array, chosen: IntArray) -> IntArray:
-    """The chosen correspondences without those that repeat another one: a copy says nothing new."""
+def checked_of_rig(
+    rig: Rig, parts: Mapping[str, Sequence[ArrayLike]], stamps: Mapping[str, float] | None
+) -> tuple[Exposure, list[int], Array, Array, Array | None]:
+    """When and from where a frame is seen, how many points each camera sees, and the points,
+    pixels and scores of all, as :func:`checked`.
+
+    Args:
+        parts: (points, pixels) or (points, pixels, scores) by the names of the cameras.
+        stamps: s, of the first rows.
+    """
+    if not parts:
+        raise ValueError("the frame has no image")
+    exposure, checks = rig.exposure(tuple(parts), stamps), []
+    for name, part in parts.items():
+        if len(part) not in (2, 3):
+            raise ValueError(f"{name}: (points, pixels) or (points, pixels, scores) are needed")
+        try:
+            checks.append(checked(part[0], part[1], part[2] if len(part) == 3 else None))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+    points, pixels, scores = zip(*checks, strict=True)
+    scored = [values for values in scores if values is not None]
+    if scored and len(scored) < len(parts):
+        raise ValueError("either all images of a frame have scores or none has")
+    return (
+        exposure,
+        [len(each) for each in points],
+        np.concatenate(points),
+        np.concatenate(pixels),
+        np.concatenate(scored) if scored else None,
+    )
+
+
+def distinct(points: Array, pixels: Array, camera: IntArray, chosen: IntArray) -> IntArray:
+    """The chosen correspondences without those that repeat another one: a copy says nothing new.
+
+    ``camera`` (n,): which one saw each of the points.
+    """
     # Equal pixels have equal keys; nearly always there are none, and one sort says so.
     keys = np.sort(pixels[chosen, 0] + math.pi * pixels[chosen, 1])
     if np.all(keys[1:] != keys[:-1]):
         return chosen
-    pairs = np.hstack([points[chosen], pixels[chosen]])
+    pairs = np.hstack([points[chosen], pixels[chosen], camera[chosen, None]])
     first = np.unique(pairs, axis=0, return_index=True)[1]
     return chosen[np.sort(first)]
 
@@ -123,39 +175,43 @@ def _extent(pixels: Array, chosen: IntArray) -> float:
     return largest
 
 
-def unfit(
-    camera: Camera, pixels: Array, usable: IntArray, shown: BoolArray, needed: int
-) -> Failure | None:
+def unfit(exposure: Exposure, pixels: Array, usable: Usable, needed: int) -> Failure | None:
     """Why points cannot carry a pose whatever the motion, or None.
 
     Args:
         pixels: (n,2) of all points.
-        usable: indices of those that can be used.
-        shown: (n,) which lie in the image.
+        usable: which of them can be used.
         needed: fewest points of a pose.
     """
-    if len(usable) < needed:
-        outside = int(np.count_nonzero(~shown))
-        width, height = camera.size
-        hint = f"; {outside} lie outside the image of {width} x {height} pixels" if outside else ""
+    indices = usable.indices
+    if len(indices) < needed:
+        outside = int(np.count_nonzero(~usable.shown))
+        sizes = " or ".join(sorted({f"{w} x {h}" for w, h in (c.size for c in exposure.cameras)}))
+        hint = f"; {outside} lie outside the image of {sizes} pixels" if outside else ""
         return Failure(
             Reason.TOO_FEW_POINTS,
-            f"{len(usable)} usable points of {len(pixels)}, {needed} are needed{hint}",
+            f"{len(indices)} usable points of {len(pixels)}, {needed} are needed{hint}",
         )
-    extent = _extent(pixels, usable)
+    of_camera = usable.camera[indices]
+    extent = max(
+        _extent(pixels, indices[of_camera == place]) for place in range(len(exposure.cameras))
+    )
     if extent < _LEAST_EXTENT:
         return Failure(
             Reason.DEGENERATE,
-            f"all {len(usable)} points lie within {extent:.2g} pixels; are these normalized "
+            f"all {len(indices)} points lie within {extent:.2g} pixels; are these normalized "
             "coordinates? Pixels of the raw image are needed",
         )
     return None
 
 
 @kernel
-def pack(points: Array, rays: Array, tau: Array, by_ray: Array) -> Array:
-    """Points in lanes: (blocks, values, LANES) of points (n,3), rays (n,2), row times (n,) and
-    derivatives of the pixel by the ray (n,2,2). The last block is filled up with weight zero.
+def pack(
+    points: Array, rays: Array, tau: Array, by_ray: Array, camera: IntArray, mounts: Mounts
+) -> Array:
+    """Points in lanes: (blocks, values, LANES) of points (n,3), rays (n,2), row times (n,),
+    derivatives of the pixel by the ray (n,2,2), and of which camera (n,) they are. The last block
+    is filled up with weight zero.
     """
     count = len(points)
     blocks = (count + LANES - 1) // LANES
@@ -171,7 +227,14 @@ def pack(points: Array, rays: Array, tau: Array, by_ray: Array) -> Array:
             row[5 * LANES + lane] = tau[i]
             for k in range(4):
                 row[(6 + k) * LANES + lane] = by_ray[i, k // 2, k % 2]
-            row[10 * LANES + lane] = 1.0 if block * LANES + lane < count else 0.0
+            row[WEIGHT * LANES + lane] = 1.0 if block * LANES + lane < count else 0.0
+            mount = camera[i]
+            for k in range(2):
+                row[(GRADIENT + k) * LANES + lane] = mounts.gradients[mount, k]
+            for k in range(9):
+                row[(AXES + k) * LANES + lane] = mounts.axes[mount, k // 3, k % 3]
+            for k in range(3):
+                row[(CENTRE + k) * LANES + lane] = mounts.centres[mount, k]
     return data
 
 
@@ -185,7 +248,7 @@ def thin(data: Array, chosen: IntArray) -> Array:
         i = chosen[min(place, count - 1)]
         for k in range(POINT_SIZE):
             value = data[i // LANES, k * LANES + i % LANES]
-            if k == POINT_SIZE - 1 and place >= count:
+            if k == WEIGHT and place >= count:
                 value = 0.0
             thinned[place // LANES, k * LANES + place % LANES] = value
     return thinned
@@ -196,7 +259,7 @@ def weighted(data: Array, weights: Array | BoolArray) -> Array:
     """The packed points with these weights (n,): 1 or 0."""
     data = data.copy()
     for i in range(len(weights)):
-        data[i // LANES, 10 * LANES + i % LANES] = weights[i]
+        data[i // LANES, WEIGHT * LANES + i % LANES] = weights[i]
     return data
 
 
@@ -210,30 +273,34 @@ class Observations:
     """The points of one frame, ready for the kernels."""
 
     points: Array  # (n,3) m, in a frame near them
-    rays: Array  # (n,2)
+    rays: Array  # (n,2) in the axes of their cameras
     tau: Array  # (n,)
-    row_range: float  # of tau
-    row_time_gradient: Array  # (2,) per pixel
+    camera: IntArray  # (n,) which of the mounted ones sees each
+    mounts: Mounts
     packed: Array
     count: int
 
     @classmethod
     def of(
-        cls, points: Array, rays: Array, tau: Array, by_ray: Array, row_time_gradient: Array
-    ) -> Observations:
-        """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2)."""
-        packed = pack(points, rays, tau, by_ray)
-        return cls(
-            points, rays, tau, float(np.ptp(tau)), row_time_gradient, packed, len(points)
-        )  # fmt: skip
+        cls, points: Array, rays: Array, tau: Array, by_ray: Array, mounts: Mounts,
+        camera: IntArray | None = None,
+    ) -> Observations:  # fmt: skip
+        """Pack points (n,3), rays (n,2), row times (n,) and pixel derivatives (n,2,2).
+
+        ``camera`` (n,): None for those of the first one.
+        """
+        if camera is None:
+            camera = np.zeros(len(points), np.int64)
+        packed = pack(points, rays, tau, by_ray, camera, mounts)
+        return cls(points, rays, tau, camera, mounts, packed, len(points))
 
     def thinned(self, count: int) -> Observations:
         """So many of the points, evenly taken."""
         chosen = np.linspace(0, len(self) - 1, count).astype(np.int64)
         packed = thin(self.packed, chosen)
         return Observations(
-            self.points[chosen], self.rays[chosen], self.tau[chosen], self.row_range,
-            self.row_time_gradient, packed, count,
+            self.points[chosen], self.rays[chosen], self.tau[chosen], self.camera[chosen],
+            self.mounts, packed, count,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -241,13 +308,18 @@ class Observations:
 
     def squared_errors(self, state: Array) -> Array:
         """Squared reprojection errors (n,) in raw pixels."""
-        errors: Array = squared_errors(self.packed, self.count, state, self.row_time_gradient)
+        errors: Array = squared_errors(self.packed, self.count, state)
         return errors
 
     def row_paces(self, state: Array) -> Array:
         """How much faster than the image points the rows move (n,): 1 at rest, 0 in step."""
-        paces: Array = row_paces(self.packed, self.count, state, self.row_time_gradient)
+        paces: Array = row_paces(self.packed, self.count, state)
         return paces
+
+    def median_depth(self, state: Array, chosen: BoolArray) -> float:
+        """How far before their cameras the median of some points is (chosen: (n,)); NaN: none."""
+        depth: float = _median_depth(self.packed, state, chosen)
+        return depth
 
 
 # What fewer points see of it is lost in their noise.
@@ -257,7 +329,7 @@ _NEAR = 10.0
 
 
 def relinearized(
-    camera: Camera,
+    exposure: Exposure,
     observations: Observations,
     state: Array,
     turn: KnownTurn | None,
@@ -276,15 +348,19 @@ def relinearized(
         fewest: points that are not few.
     """
     count = observations.count
-    if count < fewest or (len(camera.D) == 0 and turn is None):
+    bends = any(len(camera.D) > 0 for camera in exposure.cameras)
+    if count < fewest or not (bends or turn is not None):
         return observations
-    gradient = observations.row_time_gradient
-    lines = linearized(observations.packed, count, state, gradient, np.zeros((count, 6)))
+    lines = linearized(observations.packed, count, state, np.zeros((count, 6)))
     near = np.abs(lines.errors).max(axis=1) < _NEAR  # NaN compares false
     rays = np.where(near[:, None], lines.image, observations.rays)
     if turn is None:
-        by_ray = camera.pixel_jacobian(rays)
+        by_ray = np.empty((count, 2, 2))
+        for place, camera in enumerate(exposure.cameras):
+            here = observations.camera == place
+            by_ray[here] = camera.pixel_jacobian(rays[here])
     else:
+        (camera,), gradient = exposure.cameras, observations.mounts.gradients[0]
         local = np.einsum(
             "nij,nj->ni", turn.at_rows(observations.tau)[0], np.column_stack([rays, np.ones(count)])
         )
@@ -293,8 +369,9 @@ def relinearized(
             raw, observations.tau, camera.pixel_jacobian(raw), gradient, turn
         )[1]
     return Observations.of(
-        observations.points, observations.rays, observations.tau, by_ray, gradient
-    )
+        observations.points, observations.rays, observations.tau, by_ray, observations.mounts,
+        observations.camera,
+    )  # fmt: skip
 
 
 # Points farther away than this (m) are faults, and their squares would be infinite.
@@ -310,24 +387,34 @@ class Usable(NamedTuple):
     rays: Array  # (n,2), compensated
     by_ray: Array  # (n,2,2) derivatives of the pixels by them
     tau: Array  # (n,) row times
+    camera: IntArray  # (n,) which of the frame's cameras sees each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighted:
-    """The points of one image as they were given, and what of them can be used."""
+    """The points of one frame as they were given, and what of them can be used."""
 
-    camera: Camera
+    exposure: Exposure
     points: Array  # (n,3)
     pixels: Array  # (n,2)
     usable: Usable
     turn: KnownTurn | None  # what the rays are compensated by
 
+    @property
+    def camera(self) -> Camera:
+        """The only camera of the frame."""
+        (camera,) = self.exposure.cameras
+        return camera
+
     def by(self, camera: Camera) -> Observations | None:
-        """The same points through another lens; None where it has no bearing for one."""
-        rays, by_ray = _rays(camera, self.pixels, self.usable.tau, self.turn)
+        """The same points of a camera alone through another lens; None where it has no bearing for
+        one.
+        """
+        exposure = self.exposure.by(camera)
+        rays, by_ray = _rays(exposure, 0, self.pixels, self.usable.tau, self.turn)
         if not np.all(np.isfinite(rays[self.usable.indices])):
             return None
-        return packed(camera, self.points, self.usable._replace(rays=rays, by_ray=by_ray))
+        return packed(exposure, self.points, self.usable._replace(rays=rays, by_ray=by_ray))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -347,22 +434,37 @@ class Observed:
     asks_lens: bool = False  # what the frame says of that
 
 
-def find_usable(camera: Camera, points: Array, pixels: Array, turn: KnownTurn | None) -> Usable:
-    """Find the usable ones of points (n,3) and pixels (n,2); a known turn is taken out of these."""
-    tau = camera.row_time(pixels)
-    rays, by_ray = _rays(camera, pixels, tau, turn)
-    width, height = camera.size
-    shown = near_image(pixels, float(width), float(height))
+def find_usable(
+    exposure: Exposure, points: Array, pixels: Array, counts: Sequence[int], turn: KnownTurn | None
+) -> Usable:
+    """Find the usable ones of points (n,3) and pixels (n,2), so many of each camera in turn.
+
+    A known turn is taken out of them.
+    """
+    rays, by_ray = np.empty((len(pixels), 2)), np.empty((len(pixels), 2, 2))
+    tau, shown = np.empty(len(pixels)), np.empty(len(pixels), dtype=np.bool_)
+    first = 0
+    for place, (camera, count) in enumerate(zip(exposure.cameras, counts, strict=True)):
+        here = slice(first, first + count)
+        tau[here] = exposure.row_time(place, pixels[here])
+        rays[here], by_ray[here] = _rays(exposure, place, pixels[here], tau[here], turn)
+        width, height = camera.size
+        shown[here] = near_image(pixels[here], float(width), float(height))
+        first += count
+    of_camera = np.repeat(np.arange(len(counts)), counts)
     centre, candidates = _candidates(points, rays, shown)
-    return Usable(distinct(points, pixels, candidates), shown, centre, rays, by_ray, tau)
+    chosen = distinct(points, pixels, of_camera, candidates)
+    return Usable(chosen, shown, centre, rays, by_ray, tau, of_camera)
 
 
-def _rays(camera: Camera, pixels: Array, tau: Array, turn: KnownTurn | None) -> tuple[Array, Array]:
-    """Bearings (n,2) and derivatives (n,2,2) of the pixels by them, compensated."""
-    rays, by_ray = bearings(camera, pixels)
+def _rays(
+    exposure: Exposure, place: int, pixels: Array, tau: Array, turn: KnownTurn | None
+) -> tuple[Array, Array]:
+    """Bearings (n,2) and derivatives (n,2,2) of a camera's pixels by them, compensated."""
+    rays, by_ray = bearings(exposure.cameras[place], pixels)
     if turn is None:
         return rays, by_ray
-    return gyro_compensated(rays, tau, by_ray, camera.row_time_gradient, turn)
+    return gyro_compensated(rays, tau, by_ray, exposure.mounts.gradients[place], turn)
 
 
 @kernel
@@ -381,24 +483,24 @@ def _candidates(points: Array, rays: Array, shown: BoolArray) -> tuple[Array, In
     return centre, np.flatnonzero(seen)
 
 
-def packed(camera: Camera, points: Array, usable: Usable) -> Observations:
+def packed(exposure: Exposure, points: Array, usable: Usable) -> Observations:
     """The usable points (of these (n,3)), relative to their median."""
-    indices, _, centre, rays, by_ray, tau = usable
-    found = _packed(points, rays, tau, by_ray, indices, centre)
-    near, bearing, times, row_range, lanes = found
-    return Observations(
-        near, bearing, times, row_range, camera.row_time_gradient, lanes, len(near)
+    indices, mounts = usable.indices, exposure.mounts
+    near, bearing, times, of_camera, lanes = _packed(
+        points, usable.rays, usable.tau, usable.by_ray, usable.camera, indices, usable.centre,
+        mounts,
     )  # fmt: skip
+    return Observations(near, bearing, times, of_camera, mounts, lanes, len(near))
 
 
 @kernel
 def _packed(
-    points: Array, rays: Array, tau: Array, by_ray: Array, indices: IntArray, centre: Array
-) -> tuple[Array, Array, Array, float, Array]:
-    """Points, bearings and row times at these indices, the range of the times, and all packed."""
-    near, bearing, times = points[indices], rays[indices], tau[indices]
+    points: Array, rays: Array, tau: Array, by_ray: Array, camera: IntArray, indices: IntArray,
+    centre: Array, mounts: Mounts,
+) -> tuple[Array, Array, Array, IntArray, Array]:  # fmt: skip
+    """Points, bearings, row times and cameras at these indices, and all packed."""
+    near, bearing, times, chosen = points[indices], rays[indices], tau[indices], camera[indices]
     for i in range(len(near)):
         for axis in range(3):
             near[i, axis] -= centre[axis]
-    row_range = np.max(times) - np.min(times) if len(times) > 0 else 0.0
-    return near, bearing, times, row_range, pack(near, bearing, times, by_ray[indices])
+    return near, bearing, times, chosen, pack(near, bearing, times, by_ray[indices], chosen, mounts)

@@ -173,7 +173,6 @@ def _rounds(
     data: Array,
     count: int,
     start: Array,
-    gradient: Array,
     prior: PriorTerms,
     threshold: float,
 ) -> _Best:
@@ -181,7 +180,7 @@ def _rounds(
     # From the wide side: a start that fits few points well would see little noise and keep few.
     state, gate, noise, freedom = start, WIDEST_GATE * threshold, EXPECTED_NOISE * threshold, 0.0
     cost = 0.0
-    errors = squared_errors(data, count, state, gradient)
+    errors = squared_errors(data, count, state)
     weights = np.empty(count)
     information = np.empty((PARAMETERS, PARAMETERS))
     inverse = information
@@ -191,7 +190,6 @@ def _rounds(
         state, information, cost, _ = refine(
             weighted(data, weights),
             state,
-            gradient,
             _NO_SCALE,
             0.0,
             prior,
@@ -200,7 +198,7 @@ def _rounds(
             _ITERATIONS,
             _FIRST if turn == 0 else _LATER,
         )
-        errors = squared_errors(data, count, state, gradient)
+        errors = squared_errors(data, count, state)
         inverse = inverted(information)
         # The prior takes its part of the parameters that the points decide.
         freedom = decided(inverse, prior, noise)
@@ -227,7 +225,6 @@ def maximum_a_posteriori(
             observations.packed,
             observations.count,
             start,
-            observations.row_time_gradient,
             prior,
             threshold,
         )
@@ -236,19 +233,18 @@ def maximum_a_posteriori(
 
 @kernel
 def fit(
-    data: Array, start: Array, gradient: Array, terms: PriorTerms, noise: float, tolerance: float
+    data: Array, start: Array, terms: PriorTerms, noise: float, tolerance: float
 ) -> tuple[Array, float, bool]:
     """State (24,), cost and convergence of a fit to some of the points (see :func:`.refine`).
 
     Args:
         data: the points, packed, with weight 1 where they count.
         start: state (24,).
-        gradient: (2,) row time by pixel.
         terms: of the prior.
         noise: px.
         tolerance: gain of the last step, noise variances.
     """
     state, _, cost, converged = refine(
-        data, start, gradient, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, tolerance
+        data, start, _NO_SCALE, 0.0, terms, noise, 2, _ITERATIONS, tolerance
     )
     return state, cost, converged

@@ -23,6 +23,7 @@ from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.refine import anneal, refine
 from rs_localizer.estimation.residuals import POINT_SIZE, truncated_cost
+from rs_localizer.solvers.batch import MODEL_SIZE, into_rig
 
 
 def generator(seed: int) -> Random:
@@ -39,14 +40,16 @@ _RANKED_HORIZON = 200_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pool:
-    """Points to draw from.
+    """Points of one camera to draw from.
 
     ``ranked``: they are sorted from the best to the worst and the first samples come from the
     first of them (PROSAC: Chum, Matas, "Matching with PROSAC", CVPR 2005).
     """
 
     points: IntArray
+    row_range: float  # of the row times of its camera's points
     ranked: bool = False
+    share: float = 1.0  # of the samples, beside those of the other pools
 
     def prefix_sizes(self, first: int, count: int, size: int) -> IntArray:
         """From how many points of the pool samples ``first ... first + count - 1`` are drawn."""
@@ -123,7 +126,7 @@ def state_of_model(model: Array) -> Array:
 
 @kernel
 def best_models(
-    models: Array, data: Array, gradient: Array, scale: float, keep: int, bar: float
+    models: Array, data: Array, scale: float, keep: int, bar: float
 ) -> tuple[Array, Array]:
     """States (keep,24) and costs (keep,) of the models (k,18,h) with the least truncated error.
 
@@ -140,7 +143,7 @@ def best_models(
                 continue
             state = state_of_model(models[s, :, h])
             limit = min(costs[keep - 1], bar)
-            cost = truncated_cost(data, state, gradient, scale, limit)
+            cost = truncated_cost(data, state, scale, limit)
             if cost < limit:
                 place = keep - 1
                 while place > 0 and cost < costs[place - 1]:
@@ -157,7 +160,6 @@ def optimize(
     states: Array,
     costs: Array,
     data: Array,
-    gradient: Array,
     first_scale: float,
     last_scale: float,
     prior: PriorTerms,
@@ -173,11 +175,11 @@ def optimize(
     for i in range(len(states)):
         if not np.isfinite(costs[i]):
             continue
-        state = anneal(data, states[i], gradient, first_scale, last_scale, prior, noise)
+        state = anneal(data, states[i], first_scale, last_scale, prior, noise)
         state, _, _, _ = refine(
-            data, state, gradient, last_scale, 1.0, prior, noise, 1, _ITERATIONS, _TOLERANCE
+            data, state, last_scale, 1.0, prior, noise, 1, _ITERATIONS, _TOLERANCE
         )
-        cost = truncated_cost(data, state, gradient, last_scale, best_cost)
+        cost = truncated_cost(data, state, last_scale, best_cost)
         if cost < best_cost:
             best, best_cost = state, cost
     return best, best_cost
@@ -187,7 +189,6 @@ def optimize(
 def descend(
     data: Array,
     start: Array,
-    gradient: Array,
     first_scale: float,
     last_scale: float,
     prior: PriorTerms,
@@ -199,23 +200,17 @@ def descend(
     """
     state, scale, iterations = start, first_scale, _FIRST_STEPS
     while scale > last_scale:
-        state, _, _, _ = refine(
-            data, state, gradient, scale, 1.0, prior, noise, 1, iterations, _TOLERANCE
-        )
+        state, _, _, _ = refine(data, state, scale, 1.0, prior, noise, 1, iterations, _TOLERANCE)
         scale, iterations = _RATIO * scale, _STEPS
-    state, _, _, _ = refine(
-        data, state, gradient, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE
-    )
-    return state, truncated_cost(data, state, gradient, last_scale, np.inf)
+    state, _, _, _ = refine(data, state, last_scale, 1.0, prior, noise, 1, _FIRST_STEPS, _TOLERANCE)
+    return state, truncated_cost(data, state, last_scale, np.inf)
 
 
 def warm_up() -> None:
     """Compile what a plane comes to that faces the camera."""
     nothing = np.zeros((0, POINT_SIZE * LANES))
-    descend(nothing, np.zeros(STATE_SIZE), np.zeros(2), 1.0, 1.0, held_terms(), 1.0)
+    descend(nothing, np.zeros(STATE_SIZE), 1.0, 1.0, held_terms(), 1.0)
 
-
-MODEL_SIZE = 18
 
 # Of every block this many hypotheses are optimised: a six-point model of inliers alone is often
 # not the first in a block, because noise makes it miss most of the other inliers.
@@ -293,17 +288,19 @@ def search(
         models = np.empty((hypotheses.solutions, MODEL_SIZE, len(samples)))
         blocks += 1
         rotation = draws.rotations[blocks % len(draws.rotations)]
+        camera, mounts = observations.camera[samples[:, 0]], observations.mounts
         hypotheses.solve(
             observations.points, observations.rays, observations.tau, samples,
-            rotation[None], hypotheses.iterations, models,
+            mounts.axes[camera] @ rotation, hypotheses.iterations, models,
         )  # fmt: skip
+        into_rig(models, camera, mounts)
         states, costs = best_models(
-            models, observations.packed, observations.row_time_gradient,
+            models, observations.packed,
             hypotheses.score_scale, _KEEP, no_fit - best_gain,
         )  # fmt: skip
         best_gain = max(best_gain, no_fit - float(costs[0]))
         state, cost = optimize(
-            states, costs, observations.packed, observations.row_time_gradient,
+            states, costs, observations.packed,
             2.0 * hypotheses.score_scale, hypotheses.final_scale, prior, hypotheses.noise,
         )  # fmt: skip
         if cost < best.cost:
@@ -321,16 +318,18 @@ def _draw(
     random: Random,
     samples: IntArray,
 ) -> None:
-    """Fill the samples from all pools in equal parts, and count what each has given."""
+    """Fill the samples from all pools by their shares, and count what each has given."""
     count, size = samples.shape
+    total, share = sum(pool.share for pool in pools), 0.0
     first = 0
     for index, pool in enumerate(pools):
-        part = samples[first : (index + 1) * count // len(pools)]
+        share += pool.share
+        part = samples[first : count if index == len(pools) - 1 else int(share * count / total)]
         if pool.ranked:
             prefixes = pool.prefix_sizes(drawn[index], len(part), size)
         else:
             prefixes = np.full(len(part), len(pool.points), dtype=np.int64)
-        draw(pool.points, prefixes, observations.tau, observations.row_range, random, part)
+        draw(pool.points, prefixes, observations.tau, pool.row_range, random, part)
         drawn[index] += len(part)
         first += len(part)
 

@@ -95,7 +95,6 @@ def solve_positive(matrix: Array, right: Array) -> tuple[Array, bool]:
 def _posterior(
     data: Array,
     state: Array,
-    gradient: Array,
     scale: float,
     softness: float,
     prior: PriorTerms,
@@ -105,7 +104,7 @@ def _posterior(
     slope: Array,
 ) -> float:
     """Normal equations and cost with the prior, in squared pixels."""
-    cost = normal_equations(data, state, gradient, scale, softness, looks, information, slope)
+    cost = normal_equations(data, state, scale, softness, looks, information, slope)
     return cost + add_prior(
         prior.informations,
         prior.references,
@@ -121,7 +120,6 @@ def _posterior(
 def refine(
     data: Array,
     start: Array,
-    gradient: Array,
     scale: float,
     softness: float,
     prior: PriorTerms,
@@ -135,7 +133,6 @@ def refine(
     Args:
         data: packed points, with weights.
         start: state (24,).
-        gradient: (2,) row time by pixel.
         scale, softness: of the robust loss, see :mod:`rs_localizer.estimation.residuals`.
         prior: see :mod:`rs_localizer.estimation.prior`.
         noise: standard deviation of the pixels, against which the prior is weighed.
@@ -155,9 +152,7 @@ def refine(
     slope = np.empty(size)
     next_information = np.empty((size, size))
     next_slope = np.empty(size)
-    cost = _posterior(
-        data, state, gradient, scale, softness, prior, noise, looks, information, slope
-    )
+    cost = _posterior(data, state, scale, softness, prior, noise, looks, information, slope)
     damping, growth = 0.0, _GROWTH
     converged = False
     for _ in range(iterations):
@@ -177,7 +172,7 @@ def refine(
                 # So near the optimum a look at where it leads would tell nothing new.
                 return trial, information, cost - gain, True
             trial_cost = _posterior(
-                data, trial, gradient, scale, softness, prior, noise, looks,
+                data, trial, scale, softness, prior, noise, looks,
                 next_information, next_slope,
             )  # fmt: skip
             accepted = trial_cost <= cost
@@ -202,7 +197,7 @@ def refine(
 
 @inlined
 def anneal(
-    data: Array, start: Array, gradient: Array, first_scale: float, last_scale: float,
+    data: Array, start: Array, first_scale: float, last_scale: float,
     prior: PriorTerms, noise: float,
 ) -> Array:  # fmt: skip
     """State after one Gauss-Newton step at each scale of Tukey's loss, from the first to the last.
@@ -214,7 +209,7 @@ def anneal(
     slope = np.empty(MOTION_PARAMETERS)
     scale = first_scale
     while scale > last_scale:
-        _posterior(data, state, gradient, scale, 1.0, prior, noise, 1, information, slope)
+        _posterior(data, state, scale, 1.0, prior, noise, 1, information, slope)
         for i in range(MOTION_PARAMETERS):
             information[i, i] *= 1.0 + _ANNEALING_DAMPING
         step, solved = solve_positive(information, -slope)

@@ -3,7 +3,9 @@
 """Reprojection errors of many points under one motion, and their normal equations.
 
 Points lie in lanes (:func:`rs_localizer.estimation.observations.pack`); a motion is a state of
-:mod:`rs_localizer.core.state`.
+:mod:`rs_localizer.core.state`. Each point is seen by a camera of a rig: the motion, that of the
+rig, takes it to its place ``Y`` before the rig at its row time, and the camera, whose centre in the
+rig is ``c`` and whose axes are ``R``, sees it at ``R (Y - c)``. A single camera is its own rig.
 
 The error of a point is measured where the model puts it on the image, although the model is
 evaluated at the *measured* row: noise of the row is noise of the time. With ``m`` the velocity of
@@ -30,10 +32,13 @@ from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Lanes, Vector, select, traced, traced_sums
 from rs_localizer.core.state import MOTION_PARAMETERS, PARAMETERS, STATE_SIZE
 
-POINT_SIZE = 11  # X (3), ray (2), row time, pixel by ray (4), weight
+# X (3), ray (2), row time, pixel by ray (4), weight, row time by pixel (2); of the camera in its
+# rig: its axes (9) and its centre (3)
+POINT_SIZE = 25
+WEIGHT, GRADIENT, AXES, CENTRE = 10, 11, 13, 22
 # Behind them where the camera shakes: its turn (3) at the measured row, and the turn's rate (3).
 SHAKE_SIZE = 6
-UNIFORM_SIZE = STATE_SIZE + 5  # state, row time by pixel (2), squared scale, its inverse, softness
+UNIFORM_SIZE = STATE_SIZE + 3  # state, squared scale, its inverse, softness
 
 # Terms of the power series; exact to double precision up to a turn of 90 degrees per half readout.
 _SERIES_TERMS = 10
@@ -78,7 +83,9 @@ class View:
     def __init__(self, values: Sequence[Lanes], looks: int, shaking: bool = False) -> None:
         self.point, self._ray, self._measured_tau = values[0:3], values[3:5], values[5]
         self._raw_by_ray = [values[6:8], values[8:10]]
-        self.weight = values[10]
+        self.weight = values[WEIGHT]
+        self._gradient, self._axes = values[GRADIENT:AXES], _matrix(values[AXES:CENTRE])
+        self._centre = values[CENTRE:POINT_SIZE]
         first = POINT_SIZE + (SHAKE_SIZE if shaking else 0)
         self._shake = values[POINT_SIZE:first]
         state = values[first : first + STATE_SIZE]
@@ -87,8 +94,7 @@ class View:
         # Structural zeros cost nothing.
         accelerations: Vector = [*state[18:24]] if looks > 1 else [0.0] * 6
         self._alpha, self._acceleration = accelerations[:3], accelerations[3:]
-        self._gradient = values[first + STATE_SIZE : first + STATE_SIZE + 2]
-        self.scale, self._inverse_scale, self.softness = values[first + STATE_SIZE + 2 :]
+        self.scale, self._inverse_scale, self.softness = values[first + STATE_SIZE :]
         moved = multiply([state[0:3], state[3:6], state[6:9]], self.point)
         self.at_middle = [a + b for a, b in zip(moved, state[9:12], strict=True)]
         self._look(self._measured_tau)
@@ -114,20 +120,19 @@ class View:
         self.c = _series(self.angle_squared, 2)
         self.third = _series(self.angle_squared, 3)
         self.turn = _outer_turn(theta, _series(self.angle_squared, 1), self.c)
-        seen_from = multiply(self.turn, self.shifted)
+        self.rig_point = multiply(self.turn, self.shifted)
         offset = self._measured_tau - tau
         if self._shake:
             self._shaken = self._shake_turn(offset)
-            seen_from = multiply(self._shaken, seen_from)
-        self.camera_point = seen_from
-        x, y, z = seen_from
+            self.rig_point = multiply(self._shaken, self.rig_point)
+        x, y, z = _seen(self.rig_point, self._axes, self._centre)
         in_front = z > 0.0
         # A zero in place of the inverse depth keeps points behind the camera finite and harmless.
         self.inverse_depth = select(in_front, 1.0 / z, 0.0)
         u, v = x * self.inverse_depth, y * self.inverse_depth
         self.image = [u, v]
 
-        rate = self._rate([x, y, z])
+        rate = multiply(self._axes, self._rate())
         ray_rate = [
             (rate[0] - u * rate[2]) * self.inverse_depth,
             (rate[1] - v * rate[2]) * self.inverse_depth,
@@ -148,8 +153,8 @@ class View:
         self.error = [a + b * offset for a, b in zip(at_this_row, lead, strict=True)]
         self.squared = select(seen, dot(self.error, self.error), math.inf)
 
-    def _rate(self, camera_point: Vector) -> Vector:
-        """Velocity of the point in the camera axes, per unit of row time."""
+    def _rate(self) -> Vector:
+        """Velocity of the point in the rig's axes, per unit of row time."""
         omega, velocity = self._omega, self._velocity
         if self._accelerating:
             now = [w + self.tau * a for w, a in zip(omega, self._alpha, strict=True)]
@@ -165,7 +170,7 @@ class View:
             turned = multiply(self._shaken, omega)
             omega = [a + b for a, b in zip(turned, self._shake[3:6], strict=True)]
             drift = multiply(self._shaken, drift)
-        return [-(a + b) for a, b in zip(cross(omega, camera_point), drift, strict=True)]
+        return [a - b for a, b in zip(cross(self.rig_point, omega), drift, strict=True)]
 
     def _shake_turn(self, offset: Any) -> list[Vector]:
         """By how much the camera is turned beside its motion, this far from the measured row."""
@@ -194,10 +199,10 @@ class View:
         alpha = [-x for x in self.theta]
         before_shake = self.turn
         rows = []
-        for by_camera_point in self._by_camera_point():
+        for by_rig_point in self._by_rig_point():
             if self._shake:
-                by_camera_point = _transposed(self._shaken, by_camera_point)
-            b = _transposed(before_shake, by_camera_point)
+                by_rig_point = _transposed(self._shaken, by_rig_point)
+            b = _transposed(before_shake, by_rig_point)
             r = cross(b, self.shifted)
             r_alpha = cross(r, alpha)
             r_alpha2 = cross(r_alpha, alpha)
@@ -214,13 +219,25 @@ class View:
         return rows
 
     def by_shake(self) -> list[Vector]:
-        """Derivatives of the error by a turn (3) of the camera in its own axes at this row."""
-        return [cross(row, self.camera_point) for row in self._by_camera_point()]
+        """Derivatives of the error by a turn (3) of the rig in its own axes at this row."""
+        return [cross(row, self.rig_point) for row in self._by_rig_point()]
 
-    def _by_camera_point(self) -> list[Vector]:
+    def _by_rig_point(self) -> list[Vector]:
         u, v = self.image
         depth = self.inverse_depth
-        return [[p * depth, q * depth, -((p * u + q * v) * depth)] for p, q in self.by_ray]
+        by_camera_point = [
+            [p * depth, q * depth, -((p * u + q * v) * depth)] for p, q in self.by_ray
+        ]
+        return [_transposed(self._axes, row) for row in by_camera_point]
+
+
+def _matrix(values: Sequence[Lanes]) -> list[Vector]:
+    return [[*values[3 * i : 3 * i + 3]] for i in range(3)]
+
+
+def _seen(rig_point: Vector, axes: list[Vector], centre: Sequence[Lanes]) -> Vector:
+    """A point before a rig, in the axes of one of its cameras."""
+    return multiply(axes, [a - b for a, b in zip(rig_point, centre, strict=True)])
 
 
 def _transposed(matrix: list[Vector], vector: Vector) -> Vector:
@@ -232,12 +249,13 @@ def still_cost(values: Sequence[Lanes]) -> Any:
     point, ray, by_ray = values[0:3], values[3:5], [values[6:8], values[8:10]]
     state = values[POINT_SIZE : POINT_SIZE + STATE_SIZE]
     moved = multiply([state[0:3], state[3:6], state[6:9]], point)
-    x, y, z = (a + b for a, b in zip(moved, state[9:12], strict=True))
+    rig_point = [a + b for a, b in zip(moved, state[9:12], strict=True)]
+    x, y, z = _seen(rig_point, _matrix(values[AXES:CENTRE]), values[CENTRE:POINT_SIZE])
     inverse_depth = 1.0 / z
     offset = [x * inverse_depth - ray[0], y * inverse_depth - ray[1]]
     error = multiply(by_ray, offset)
-    squared, scale = dot(error, error), values[POINT_SIZE + STATE_SIZE + 2]
-    return values[10] * select((z > 0.0) & (squared < scale), squared, scale)
+    squared, scale = dot(error, error), values[POINT_SIZE + STATE_SIZE]
+    return values[WEIGHT] * select((z > 0.0) & (squared < scale), squared, scale)
 
 
 # So many blocks at a time stay in the fast caches.
@@ -326,25 +344,21 @@ _closer_sums = _summing(PARAMETERS, _CLOSER_TILES)
 
 
 @kernel
-def spread_state(
-    state: Array, gradient: Array, scale: float, softness: float, uniform: Array
-) -> None:
+def spread_state(state: Array, scale: float, softness: float, uniform: Array) -> None:
     """Write a state and the settings of the robust loss into all lanes."""
     for lane in range(LANES):
         for k in range(STATE_SIZE):
             uniform[k * LANES + lane] = state[k]
-        uniform[STATE_SIZE * LANES + lane] = gradient[0]
-        uniform[(STATE_SIZE + 1) * LANES + lane] = gradient[1]
-        uniform[(STATE_SIZE + 2) * LANES + lane] = scale * scale
-        uniform[(STATE_SIZE + 3) * LANES + lane] = 1.0 / (scale * scale)
-        uniform[(STATE_SIZE + 4) * LANES + lane] = softness
+        uniform[STATE_SIZE * LANES + lane] = scale * scale
+        uniform[(STATE_SIZE + 1) * LANES + lane] = 1.0 / (scale * scale)
+        uniform[(STATE_SIZE + 2) * LANES + lane] = softness
 
 
 @kernel
-def squared_errors(data: Array, count: int, state: Array, gradient: Array) -> Array:
+def squared_errors(data: Array, count: int, state: Array) -> Array:
     """Squared reprojection errors (count,) in raw pixels; infinite behind the camera."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
-    spread_state(state, gradient, 1.0, 0.0, uniform)
+    spread_state(state, 1.0, 0.0, uniform)
     block_errors = np.empty(LANES)
     errors = np.empty(count)
     for block in range(len(data)):
@@ -355,10 +369,10 @@ def squared_errors(data: Array, count: int, state: Array, gradient: Array) -> Ar
 
 
 @kernel
-def row_paces(data: Array, count: int, state: Array, gradient: Array) -> Array:
+def row_paces(data: Array, count: int, state: Array) -> Array:
     """How much faster than the image points the rows move (count,): 1 at rest, 0 in step."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
-    spread_state(state, gradient, 1.0, 0.0, uniform)
+    spread_state(state, 1.0, 0.0, uniform)
     block_paces = np.empty(LANES)
     paces = np.empty(count)
     for block in range(len(data)):
@@ -369,10 +383,10 @@ def row_paces(data: Array, count: int, state: Array, gradient: Array) -> Array:
 
 
 @kernel
-def truncated_cost(data: Array, state: Array, gradient: Array, scale: float, bound: float) -> float:
+def truncated_cost(data: Array, state: Array, scale: float, bound: float) -> float:
     """Sum of the truncated squared errors, px^2; stops early once it exceeds ``bound``."""
     uniform = np.empty(UNIFORM_SIZE * LANES)
-    spread_state(state, gradient, scale, 0.0, uniform)
+    spread_state(state, scale, 0.0, uniform)
     still = True
     for k in range(12, STATE_SIZE):
         still = still and state[k] == 0.0
@@ -394,7 +408,6 @@ def truncated_cost(data: Array, state: Array, gradient: Array, scale: float, bou
 def normal_equations(
     data: Array,
     state: Array,
-    gradient: Array,
     scale: float,
     softness: float,
     looks: int,
@@ -407,7 +420,7 @@ def normal_equations(
     parameters of a search, 2 for all 18.
     """
     uniform = np.empty(UNIFORM_SIZE * LANES)
-    spread_state(state, gradient, scale, softness, uniform)
+    spread_state(state, scale, softness, uniform)
     pairs = _PAIRS if looks == 1 else _CLOSER_PAIRS
     size = _ROWS_SIZE if looks == 1 else _CLOSER_ROWS_SIZE
     rows = np.empty((_CHUNK, size * LANES))
@@ -448,16 +461,16 @@ class Lines(NamedTuple):
 
 
 @kernel
-def linearized(data: Array, count: int, state: Array, gradient: Array, shake: Array) -> Lines:
+def linearized(data: Array, count: int, state: Array, shake: Array) -> Lines:
     """Each point's error and its derivatives at a motion and what the camera turns beside it.
 
     Args:
         data: packed points, ``count`` of them; weights are ignored.
-        state, gradient: as above.
+        state: (24,).
         shake: (count,6) the camera's turn at each measured row, in its own axes, and the rate.
     """
     uniform = np.empty(UNIFORM_SIZE * LANES)
-    spread_state(state, gradient, 1.0, 0.0, uniform)
+    spread_state(state, 1.0, 0.0, uniform)
     block_data = np.zeros((POINT_SIZE + SHAKE_SIZE) * LANES)
     lines = np.empty((2 * _LINE + 3) * LANES)
     errors, by_motion = np.empty((count, 2)), np.empty((count, 2, PARAMETERS))

@@ -91,7 +91,6 @@ def _costs(
         observations.packed,
         count,
         posterior.state,
-        observations.row_time_gradient,
         np.zeros((count, 6)),
     )
     inliers = posterior.inliers & np.isfinite(observations.squared_errors(posterior.state))
@@ -166,4 +165,5 @@ def estimate_of(observed: Observed, posterior: Posterior, still: int, samples: i
         iterations=samples,
         turn=turn,
         delay=delay,
+        span=observed.sighted.exposure.span,
     )

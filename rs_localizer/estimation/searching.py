@@ -8,10 +8,9 @@ import numpy as np
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.arrays import Array, BoolArray, IntArray
-from rs_localizer.core.camera import Camera
 from rs_localizer.core.state import at_rest, rotation_of
 from rs_localizer.estimation.mirror import facing
-from rs_localizer.estimation.observations import Observed
+from rs_localizer.estimation.observations import Observations, Observed
 from rs_localizer.estimation.posterior import WIDEST_GATE
 from rs_localizer.estimation.prior import PriorTerms, held_terms
 from rs_localizer.estimation.ransac import (
@@ -49,12 +48,12 @@ class MotionSearch:
     """Finds the motion that most points of a frame agree on."""
 
     def __init__(
-        self, camera: Camera, config: LocalizerConfig, solver: Solver, start: Solver
+        self, focal_length: float, config: LocalizerConfig, solver: Solver, start: Solver
     ) -> None:
         self._config = config
         self._solver = solver
         self._start = start  # a global-shutter solver
-        self._focal_length = camera.focal_length
+        self._focal_length = focal_length
         threshold = config.inlier_threshold
         wide = max(_GLOBAL_SHUTTER_SCALE * self._focal_length, threshold)
         if not solver.rolling_shutter:
@@ -160,7 +159,8 @@ class MotionSearch:
             before = self.optimize(observed, start.state, scale, observed.terms)
             before = self._facing(observed, start, near, before)
         rotations = [rotation_of(start.state)]
-        pools = [Pool(near), *_pools(observed, np.arange(observed.observations.count))]
+        pools = _pools_of(observed.observations, near)
+        pools += _pools(observed, np.arange(observed.observations.count))
         draws = Draws(rotations, pools, self._config.confidence, most, observed.random)
         return search(observed.observations, self._motions, observed.terms, draws, before)
 
@@ -181,7 +181,7 @@ class MotionSearch:
         if towards is None:
             return found
         state, cost = descend(
-            observations.packed, towards, observations.row_time_gradient,
+            observations.packed, towards,
             _POOL_SCALE * self._focal_length, threshold, observed.terms,
             EXPECTED_NOISE * threshold,
         )  # fmt: skip
@@ -209,7 +209,6 @@ class MotionSearch:
             state[None],
             np.zeros(1),
             observed.observations.packed,
-            observed.observations.row_time_gradient,
             first_scale,
             self._config.inlier_threshold,
             terms,
@@ -229,8 +228,20 @@ class MotionSearch:
 
 
 def _pools(observed: Observed, among: IntArray) -> list[Pool]:
-    everything = Pool(among)
+    everything = _pools_of(observed.observations, among)
     # Half of the samples ignore the scores, so that wrong ones cost a factor of two at most.
     if observed.ranking is None:
-        return [everything]
-    return [Pool(observed.ranking[np.isin(observed.ranking, among)], ranked=True), everything]
+        return everything
+    ranked = observed.ranking[np.isin(observed.ranking, among)]
+    return _pools_of(observed.observations, ranked, ranked=True) + everything
+
+
+def _pools_of(observations: Observations, among: IntArray, ranked: bool = False) -> list[Pool]:
+    """A pool for each camera, which gives a share of the samples that is as large as its own."""
+    pools, of_camera = [], observations.camera
+    for camera in range(len(observations.mounts.axes)):
+        chosen = among[of_camera[among] == camera]
+        if len(chosen):
+            rows = float(np.ptp(observations.tau[of_camera == camera]))
+            pools.append(Pool(chosen, rows, ranked, len(chosen) / len(among)))
+    return pools

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,8 @@ _BETTER_SHARE, _BETTER_COUNT = 1.05, 1
 _WIDER = 3.0
 
 Found = tuple[Estimate | Failure, Prior | None]
+# What a gyroscope measures.
+_TURNING = np.r_[ANGULAR, ANGULAR_ACCELERATION]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,3 +298,17 @@ def _contradicts(foreseen: GyroPrediction, step: Array) -> bool:
     if foreseen.predicted is None:
         return contradicts(step[ANGULAR], foreseen.turn.error, _FIRST)
     return contradicts(step, foreseen.predicted.covariance, _SEEN)
+
+
+def beside_turn(prior: Prior | None, turn: KnownTurn) -> Prior | None:
+    """What the camera alone predicts, for a motion beside a known turn."""
+    if prior is None:
+        return None
+    assert prior.motion is not None
+    assert prior.covariance is not None
+    covariance = prior.covariance.copy()
+    covariance[_TURNING] = 0.0
+    covariance[:, _TURNING] = 0.0
+    covariance[np.ix_(_TURNING, _TURNING)] = turn.error
+    still = replace(prior.motion, angular_velocity=np.zeros(3), angular_acceleration=np.zeros(3))
+    return replace(prior, motion=still, covariance=covariance)

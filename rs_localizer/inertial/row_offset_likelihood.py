@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.shutter import Motion
 from rs_localizer.core.state import ACCELERATIONS, PARAMETERS, TURN, VELOCITIES
 from rs_localizer.core.types import Estimate
@@ -56,11 +57,12 @@ def row_offset_likelihood(
     if len(chosen) < _LEAST_POINTS:
         return None
     given = np.asarray(points, float)[chosen], np.asarray(pixels, float)[chosen]
-    usable = find_usable(camera, *given, found.turn)
-    seen = packed(camera, given[0], usable)
+    exposure = Rig.of(camera).exposure()
+    usable = find_usable(exposure, *given, [len(chosen)], found.turn)
+    seen = packed(exposure, given[0], usable)
     count, motion = len(seen), found.beside_turn()
     errors, by_motion, by_turn, tau, _ = linearized(
-        seen.packed, count, state_in(motion, usable.centre), seen.row_time_gradient,
+        seen.packed, count, state_in(motion, usable.centre),
         np.zeros((count, 6)),
     )  # fmt: skip
     sound = np.isfinite(errors).all(axis=1)

@@ -155,6 +155,27 @@ def colmap_camera(text: str, chosen: str | None) -> Camera:
     )
 
 
+# The numbers of these models in COLMAP's binary files.
+_COLMAP_NUMBERS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
+    "FULL_OPENCV",
+)
+
+
+def colmap_line(number: int, model: int, width: int, height: int, parameters: Array) -> str:
+    """A camera of COLMAP's binary files as a line of its text files.
+
+    Raises:
+        ValueError: for a model that is not supported.
+    """
+    if not 0 <= model < len(_COLMAP_NUMBERS):
+        raise ValueError(
+            f"model must be one of {', '.join(_COLMAP_MODELS)}; found COLMAP's number {model}"
+        )
+    values = " ".join(repr(float(value)) for value in parameters)
+    return f"{number} {_COLMAP_NUMBERS[model]} {width} {height} {values}"
+
+
 def colmap_parameters(camera: Camera) -> dict[str, Any]:
     """``model`` and ``params`` that COLMAP knows a camera's delivered images by.
 
@@ -199,6 +220,7 @@ _MODELS = {
     "radtan": DistortionModel.PLUMB_BOB,
     "pinhole": DistortionModel.PLUMB_BOB,
     "none": DistortionModel.PLUMB_BOB,
+    "double_sphere": DistortionModel.DOUBLE_SPHERE,
 }
 
 
@@ -346,11 +368,11 @@ def _camera(text: str, chosen: str | None) -> Camera | None:
         return None
     cameras = {name: item for name, item in tree.items() if _is_kalibr(item)}
     if cameras:
-        return _kalibr(choose(cameras, chosen))
+        return kalibr_camera(choose(cameras, chosen))
     if chosen is not None:
         raise ValueError(f"it has no camera {chosen!r} to choose")
     readers: tuple[tuple[bool, Callable[[dict[str, Any]], Camera]], ...] = (
-        (_is_kalibr(tree), _kalibr),
+        (_is_kalibr(tree), kalibr_camera),
         ("pinhole" in tree, _boofcv),
         (looks_like_fields(tree), camera_of_fields),
     )
@@ -366,29 +388,69 @@ def _fields_in_words(text: str) -> str:
     return f"found {', '.join(keys[:8]) or 'neither'}"
 
 
+# Kalibr's names of lenses, for pinholes; the others stand as camera_model.
+_KALIBR_LENSES = {
+    "radtan": DistortionModel.PLUMB_BOB,
+    "equidistant": DistortionModel.EQUIDISTANT,
+    "none": DistortionModel.PLUMB_BOB,
+}
+_KALIBR_SPHERES = (str(DistortionModel.EUCM), str(DistortionModel.DOUBLE_SPHERE))
+
+
 def _is_kalibr(tree: Any) -> bool:
     return isinstance(tree, dict) and {"camera_model", "intrinsics", "resolution"} <= set(tree)
 
 
-def _kalibr(tree: dict[str, Any]) -> Camera:
-    if tree["camera_model"] != "pinhole":
+def kalibr_camera(tree: dict[str, Any]) -> Camera:
+    """The lens of one camera of a camchain.
+
+    Raises:
+        ValueError, KeyError, TypeError: when something is missing or impossible.
+    """
+    kind, name = tree["camera_model"], tree.get("distortion_model", "none")
+    if kind not in ("pinhole", *_KALIBR_SPHERES):
         raise ValueError(
-            f"camera_model must be pinhole, found {tree['camera_model']!r}: calibrate with "
-            "pinhole-radtan or, for a wide lens, pinhole-equi"
+            f"camera_model must be pinhole, {' or '.join(_KALIBR_SPHERES)}, found {kind!r}: "
+            "calibrate with pinhole-radtan or, for a wide lens, pinhole-equi, eucm-none or ds-none"
         )
-    models = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
-    name = tree.get("distortion_model", "none")
-    if name not in models:
-        raise ValueError(f"distortion_model must be one of {', '.join(models)}; found {name!r}")
-    fx, fy, cx, cy = map(float, tree["intrinsics"])
+    if name not in (_KALIBR_LENSES if kind == "pinhole" else ("none",)):
+        known = ", ".join(_KALIBR_LENSES) if kind == "pinhole" else f"none with {kind}"
+        raise ValueError(f"distortion_model must be one of {known}; found {name!r}")
+    # Coefficients of eucm and ds stand before the focal lengths.
+    *front, fx, fy, cx, cy = map(float, tree["intrinsics"])
+    behind = [] if name == "none" else tree["distortion_coeffs"]
     width, height = tree["resolution"]
     return Camera(
         width=int(width),
         height=int(height),
         K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        D=np.array([] if name == "none" else tree["distortion_coeffs"], np.float64),
-        distortion_model=models[name],
+        D=np.array([*front, *behind], np.float64),
+        distortion_model=_KALIBR_LENSES[name] if kind == "pinhole" else kind,
     )
+
+
+def kalibr_fields(camera: Camera) -> dict[str, Any]:
+    """What Kalibr's camchain says of a camera's lens, by its names.
+
+    Raises:
+        ValueError: for a lens that it has no name for, or a binned or cropped image.
+    """
+    model, D = DistortionModel(camera.distortion_model), camera.D.tolist()
+    if camera.roi is not None or camera.binning != (1, 1):
+        raise ValueError("a camchain knows neither binning nor regions of the sensor")
+    sphere = str(model) in _KALIBR_SPHERES
+    names = {lens: name for name, lens in _KALIBR_LENSES.items() if name != "none"}
+    if (model not in names and not sphere) or (model == DistortionModel.PLUMB_BOB and any(D[4:])):
+        raise ValueError(f"Kalibr has no lens {model} with {len(D)} coefficients")
+    intrinsics = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
+    plain = sphere or len(D) == 0
+    return {
+        "camera_model": str(model) if sphere else "pinhole",
+        "intrinsics": [float(value) for value in (*(D if sphere else ()), *intrinsics)],
+        "distortion_model": "none" if plain else names[model],
+        "distortion_coeffs": [] if plain else D[:4],
+        "resolution": [camera.width, camera.height],
+    }
 
 
 def _boofcv(tree: dict[str, Any]) -> Camera:

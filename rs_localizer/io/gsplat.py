@@ -14,11 +14,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
-from rs_localizer.io.calibration import colmap_parameters
+from rs_localizer.io.maps.colmap import ModelImage, Points, write_model
 from rs_localizer.io.nerfstudio import pixel_intrinsics
 
 
@@ -52,24 +51,14 @@ def write_gsplat(
     np.save(folder / "viewmats.npy", views[:, 0])
     np.save(folder / "viewmats_rs.npy", views[:, 2])
     np.save(folder / "Ks.npy", np.broadcast_to(K, (len(names), 3, 3)))
-    width, height = camera.size
-    lens = colmap_parameters(camera)
-    images = []
-    for number, (name, view) in enumerate(zip(names, views[:, 1], strict=True), 1):
-        x, y, z, w = Rotation.from_matrix(view[:3, :3]).as_quat(canonical=True)
-        images.append(f"{number} {_line([w, x, y, z, *view[:3, 3]])} 1 {name}\n\n")
-    for file, text in (
-        ("names.txt", "".join(f"{name}\n" for name in names)),
-        ("shutter.txt", f"{shutter_type(camera)}\n"),
-        ("cameras.txt", f"1 {lens['model']} {width} {height} {_line(lens['params'])}\n"),
-        ("images.txt", "".join(images)),
-        (
-            "points3D.txt",
-            "".join(f"{k} {_line(point)} 128 128 128 0\n" for k, point in enumerate(points, 1)),
-        ),
-    ):
-        (folder / file).write_text(text, encoding="utf-8")
-
-
-def _line(values: Array | list[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
+    nothing = np.zeros((0, 2)), np.zeros(0, np.int64)
+    images = {
+        name: ModelImage(number, 1, view[:3, :3], view[:3, 3], *nothing)
+        for number, (name, view) in enumerate(zip(names, views[:, 1], strict=True), 1)
+    }
+    count = len(points)
+    grey = np.full((count, 3), 128, np.uint8)
+    described = Points(np.arange(1, count + 1), points, grey, np.zeros(count))
+    write_model(folder, camera, images, described)
+    (folder / "names.txt").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+    (folder / "shutter.txt").write_text(f"{shutter_type(camera)}\n", encoding="utf-8")

@@ -46,7 +46,7 @@ from rs_localizer.mapping.views import View, blurred
 
 # Settings of the localizer are in metres: so far (m) is the median landmark taken to be from where
 # it is seen, until it is known how far it is.
-_USUAL_DISTANCE = 2.5
+USUAL_DISTANCE = 2.5
 # A view with fewer features is blurred, dark, or of a blank wall.
 _FEW_FEATURES = 50
 _LEAST_VIEWS = 3
@@ -64,7 +64,7 @@ _LEAST_SIGHTS, _MOST_DEVIATION = 3, 0.03
 # How well COLMAP's lens is known: focal length and centre by focal length (of one phone's video 21
 # images give 384.2 px, 42 give 383.2), distortion. Under a steady motion a focal length along the
 # scan stands for a shutter: looser ones leave the two to chance.
-_LENS = 0.005, 0.02
+LENS_DEVIATIONS = 0.005, 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,7 +267,7 @@ def _structure(given: Given, keyframes: IntArray, work: Workshop) -> Structure:
         )
     places = structure.positions[np.searchsorted(structure.views, structure.seen_views)]
     depths = np.linalg.norm(structure.points[structure.seen_points] - places, axis=1)
-    return structure.moved(scaled(_USUAL_DISTANCE / float(np.median(depths))))
+    return structure.moved(scaled(USUAL_DISTANCE / float(np.median(depths))))
 
 
 def _refined(
@@ -299,7 +299,7 @@ def _refined(
     freedom = replace(
         freedom,
         lens=given.camera is None,
-        lens_deviations=_LENS,
+        lens_deviations=LENS_DEVIATIONS,
         angular_acceleration=max(freedom.angular_acceleration, angular),
         linear_acceleration=max(freedom.linear_acceleration, linear),
     )

@@ -42,7 +42,7 @@ _SCRIPT = Path(__file__).with_name("colmap_process.py")
 # sequential matching), and every n-th with every n-th, so many of them: there loops close.
 _EXHAUSTIVE, _OVERLAP = 30, 10
 # COLMAP has the corner of the first pixel at 0, 0; here that is its centre.
-_HALF = 0.5
+HALF = 0.5
 
 Stage = Callable[[str, int], AbstractContextManager[Callable[[int], object]]]
 
@@ -199,7 +199,7 @@ def _structure(left: dict[str, Any], folder: Path, lens: Camera | None) -> Struc
         descriptors=described.descriptors[order].astype(np.float32),
         seen_points=left["tracks"][:, 0],
         seen_views=rows[left["tracks"][:, 1]],
-        pixels=left["pixels"] - _HALF,
+        pixels=left["pixels"] - HALF,
         camera=lens or colmap_camera(str(left["camera"]), None),
         parts=tuple(left["parts"].tolist()),
         error=float(left["error"]),

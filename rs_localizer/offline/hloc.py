@@ -58,10 +58,11 @@ class Reference:
             HlocError: when the image has fewer keypoints.
         """
         known = self.images[image]
-        if known.features and keypoints.max(initial=-1) >= known.features:
+        count = len(known.pixels)
+        if count and keypoints.max(initial=-1) >= count:
             raise HlocError(
                 f"the matches are of keypoint {keypoints.max()} of {image}, which has "
-                f"{known.features} in the model: are model and matches of one run?"
+                f"{count} in the model: are model and matches of one run?"
             )
         rows = self._rows.get(known.number)
         if rows is None or not len(keypoints):

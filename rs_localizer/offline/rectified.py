@@ -18,8 +18,10 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.shutter import Motion, project_rolling
 
-Depths = Callable[[Motion, Array], Array]
-"""Depths z (n,) m of rays ``x, y, 1`` (n,3) of the camera at the middle row; NaN: not known."""
+Depths = Callable[[Array, Array, Array], Array]
+"""Depths z (n,) m, by rotation (3,3) and translation (3,) camera_from_map and rays ``x, y, 1``
+(n,3) of a camera; NaN: not known.
+"""
 
 # Between points so far apart (px) the displacement of pixels is interpolated: it is as smooth as
 # the lens and the depth.
@@ -60,10 +62,10 @@ def plane_depths(points: Array) -> Depths:
         )
     normal = axes[2]
 
-    def depths(motion: Motion, rays: Array) -> Array:
+    def depths(rotation: Array, translation: Array, rays: Array) -> Array:
         # R X + t = z ray, normal X = normal middle
-        ahead = rays @ (motion.rotation @ normal)
-        distance = normal @ middle + (motion.rotation @ normal) @ motion.translation
+        ahead = rays @ (rotation @ normal)
+        distance = normal @ middle + (rotation @ normal) @ translation
         with np.errstate(divide="ignore"):
             z: Array = distance / ahead
         return np.where((z > 0.0) & np.isfinite(z), z, np.nan)
@@ -76,8 +78,8 @@ def map_depths(points: Array) -> Depths:
     interpolated in the image; around them, those of the nearest. Who hides whom is not known.
     """
 
-    def depths(motion: Motion, rays: Array) -> Array:
-        seen = points @ motion.rotation.T + motion.translation
+    def depths(rotation: Array, translation: Array, rays: Array) -> Array:
+        seen = points @ rotation.T + translation
         seen = seen[seen[:, 2] > 0.0]
         places, inverse = seen[:, :2] / seen[:, 2:], 1.0 / seen[:, 2]
         near = np.abs(places).max(axis=1) < 2.0 * np.abs(rays[:, :2]).max()
@@ -93,15 +95,20 @@ def map_depths(points: Array) -> Depths:
 
 
 def rectified(
-    camera: Camera, image: NDArray[np.uint8], motion: Motion, depths: Depths | None = None
+    camera: Camera,
+    image: NDArray[np.uint8],
+    motion: Motion,
+    depths: Depths | None = None,
+    tau: float = 0.0,
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The image that a global shutter would have taken with the middle row.
+    """The image that a global shutter would have taken.
 
     Args:
         camera: that took it, with its shutter.
         image: (h,w) or (h,w,3).
         motion: during the readout.
         depths: of what it shows; None: far away, so that only the rotation counts.
+        tau: row time of the global shutter: 0 the middle row, -0.5 the first, 0.5 the last.
 
     Returns:
         the image, and (h,w) which pixels are known: the others are 0.
@@ -111,14 +118,16 @@ def rectified(
     grid = np.stack(np.meshgrid(columns, rows), axis=2).reshape(-1, 2).astype(float)
     rays = np.column_stack([camera.rays(grid), np.ones(len(grid))])
     poses_at: Callable[[Array], tuple[Array, Array]] = motion.at_rows
+    rotation, translation = motion.at(tau)
     if depths is None:
-        points = rays @ motion.rotation
+        points = rays @ rotation
 
         def poses_at(tau: Array) -> tuple[Array, Array]:
             return motion.at_rows(tau)[0], np.zeros((len(tau), 3))
 
     else:
-        points = (rays * depths(motion, rays)[:, None] - motion.translation) @ motion.rotation
+        away = depths(rotation, translation, rays)[:, None]
+        points = (rays * away - translation) @ rotation
     pixels, _ = project_rolling(camera, poses_at, points)
     moved = (pixels - grid).reshape(len(rows), len(columns), 2)
     places = np.meshgrid(

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.simd.algebra import multiply
 from rs_localizer.core.simd.jit import kernel
 from rs_localizer.core.simd.tracing import LANES, Vector
@@ -65,6 +66,28 @@ def scatter(work: Array, offset: int, start: int, model: Array) -> None:
             finite = finite and np.isfinite(work[(offset + k) * LANES + lane])
         for k in range(MODEL_SIZE):
             model[k, start + lane] = work[(offset + k) * LANES + lane] if finite else np.nan
+
+
+@kernel
+def into_rig(models: Array, camera: IntArray, mounts: Mounts) -> None:
+    """Turn models (k,18,h) of cameras (h,) into those of their rig.
+
+    ``exp(tau [w]x) R X + C + tau t`` in the axes of a camera is, with all four turned into those of
+    the rig and ``C`` moved by the camera's centre, the same model of the rig.
+    """
+    turned = np.empty(3)
+    for h in range(len(camera)):
+        axes, centre = mounts.axes[camera[h]], mounts.centres[camera[h]]
+        for s in range(len(models)):
+            for column in range(6):
+                # Columns of R, and C, w, t.
+                first, step = (column, 3) if column < 3 else (3 * column, 1)
+                for i in range(3):
+                    turned[i] = centre[i] if column == 3 else 0.0
+                    for k in range(3):
+                        turned[i] += axes[k, i] * models[s, first + step * k, h]
+                for i in range(3):
+                    models[s, first + step * i, h] = turned[i]
 
 
 @kernel

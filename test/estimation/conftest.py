@@ -9,6 +9,7 @@ import pytest
 
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.shutter import Motion, project_rolling
 from rs_localizer.estimation import observations
 
@@ -56,9 +57,12 @@ def frame(direction="top_to_bottom", speed=0.15, noise=0.0, count=21, seed=0, ac
     return camera, motion, points, true, true + noise * rng.normal(size=true.shape)
 
 
-def pack(camera, points, pixels):
+def pack(camera, points, pixels, gradient=None):
     rays = camera.rays(pixels)
-    return observations.pack(points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays))
+    mounts = Mounts.one(camera.row_time_gradient if gradient is None else gradient)
+    return observations.Observations.of(
+        points, rays, camera.row_time(pixels), camera.pixel_jacobian(rays), mounts
+    ).packed
 
 
 @pytest.fixture

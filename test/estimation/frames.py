@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.config import LocalizerConfig
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Mounts, Rig
 from rs_localizer.core.state import step_between
 from rs_localizer.estimation.assumptions import assumptions
 from rs_localizer.estimation.observations import Observations
@@ -16,7 +17,7 @@ from .projection import gradient, in_camera, jacobian_of, pixels_of, row_time
 
 READOUT = 0.03
 CAMERA = Camera(640, 480, np.diag([590.0, 590.0, 1.0]), readout_time=READOUT)
-PRIOR, ASSUMED = assumptions(CAMERA, LocalizerConfig(), find_solver("r6p_vcwt"))
+PRIOR, ASSUMED = assumptions(READOUT, Rig.of(CAMERA), LocalizerConfig(), find_solver("r6p_vcwt"))
 DIRECTION = "top_to_bottom"
 
 
@@ -33,7 +34,7 @@ def observe(state, points, noise, rng, swing=lambda tau: np.zeros((len(tau), 3))
         rays -= np.linalg.solve(jacobian_of(rays), (pixels_of(rays) - measured)[..., None])[..., 0]
     return Observations.of(
         points if seen_as is None else seen_as, rays, row_time(measured, DIRECTION),
-        jacobian_of(rays), gradient(DIRECTION),
+        jacobian_of(rays), Mounts.one(gradient(DIRECTION)),
     )  # fmt: skip
 
 

@@ -68,18 +68,21 @@ def in_camera(state, tau, points, extra):
 
 
 STILL = np.zeros((0, 3))
+ALONE = np.eye(3), np.zeros(3)
+# Axes and centre of a camera in its rig: nearly upside down, with a lever arm.
+MOUNTED = Rotation.from_rotvec([0.1, -0.05, 2.9]).as_matrix(), np.array([0.3, -0.2, 0.1])
 
 
-def project(state, points, direction, coefficients=STILL, extra=0.0):
+def project(state, points, direction, coefficients=STILL, extra=0.0, seat=ALONE):
     """Rays (n,2) and row times (n,) at which each point is seen by its own row.
 
-    ``extra`` turns (n,3) or (3,) the camera once more, the same at all rows.
+    ``extra`` turns (n,3) or (3,) the camera, or its rig, once more, the same at all rows.
     """
     tau = np.zeros(len(points))
     for _ in range(200):
         swing = Rotation.from_rotvec(shake(tau, coefficients))
         turn = (swing * Rotation.from_rotvec(extra * np.ones((len(points), 3)))).as_rotvec()
-        seen = in_camera(state, tau, points, turn)
+        seen = (in_camera(state, tau, points, turn) - seat[1]) @ seat[0].T
         rays = seen[:, :2] / seen[:, 2:]
         later = row_time(pixels_of(rays), direction)
         if np.abs(later - tau).max() < 1e-15:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rs_localizer.core.reasons import Reason
+from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation.acceptance import refusal, uncertain
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import Mirror, maximum_a_posteriori
@@ -24,7 +25,7 @@ def good(scene):
     rays = camera.rays(measured)
     observations = Observations.of(
         points, rays, camera.row_time(measured), camera.pixel_jacobian(rays),
-        camera.row_time_gradient,
+        Mounts.one(camera.row_time_gradient),
     )  # fmt: skip
     return observations, maximum_a_posteriori(
         observations, scene.state_of(motion), PRIOR, THRESHOLD

@@ -5,10 +5,13 @@
 import numpy as np
 import pytest
 
+from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation import observations, residuals
 
 from .projection import (
+    ALONE,
     AXIS,
+    MOUNTED,
     STILL,
     disturbed,
     gradient,
@@ -24,20 +27,29 @@ DIRECTIONS = list(AXIS)
 SHAKE = 0.003 * np.random.default_rng(7).normal(size=(4, 3))
 
 
-def packed(points, rays, direction, shift=0.0):
+def packed(points, rays, direction, shift=0.0, seat=ALONE):
     """Points as measured at their pixels and ``shift`` (n,2) px beside them, to first order."""
     by_ray = jacobian_of(rays)
     moved = rays + np.linalg.solve(by_ray, np.broadcast_to(shift, rays.shape)[..., None])[..., 0]
     tau = row_time(pixels_of(moved), direction)
-    return observations.pack(points, moved, tau, jacobian_of(moved)), tau
+    # Beside another camera, of which there are no points.
+    axes, centres = (np.stack(both) for both in zip(ALONE, seat, strict=True))
+    mounts = Mounts(axes, centres, np.stack([np.ones(2), gradient(direction)]))
+    second = np.ones(len(points), np.int64)
+    made = observations.Observations.of(points, moved, tau, jacobian_of(moved), mounts, second)
+    return made.packed, tau
 
 
-def numerical(state, points, direction, coefficients=STILL, h=1e-5):
+def numerical(state, points, direction, coefficients=STILL, h=1e-5, seat=ALONE):
     """Derivatives (n,2,18) of the pixels by a step."""
     columns = []
     for e in np.eye(18):
         ahead, behind = (
-            pixels_of(project(disturbed(state, sign * h * e), points, direction, coefficients)[0])
+            pixels_of(
+                project(disturbed(state, sign * h * e), points, direction, coefficients, seat=seat)[
+                    0
+                ]
+            )
             for sign in (1, -1)
         )
         columns.append((ahead - behind) / (2 * h))
@@ -45,16 +57,15 @@ def numerical(state, points, direction, coefficients=STILL, h=1e-5):
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_normal_equations_are_those_of_the_forward_projection(direction):
+@pytest.mark.parametrize("seat", [ALONE, MOUNTED], ids=["alone", "mounted"])
+def test_normal_equations_are_those_of_the_forward_projection(direction, seat):
     state, points = scene(direction)
-    rays, _ = project(state, points, direction)
-    jacobian = numerical(state, points, direction)
+    rays, _ = project(state, points, direction, seat=seat)
+    jacobian = numerical(state, points, direction, seat=seat)
     shift = np.array([2e-3, -3e-3])
-    data, _ = packed(points, rays, direction, shift)
+    data, _ = packed(points, rays, direction, shift, seat)
     information, slope = np.empty((18, 18)), np.empty(18)
-    cost = residuals.normal_equations(
-        data, state, gradient(direction), 100.0, 0.0, 2, information, slope
-    )
+    cost = residuals.normal_equations(data, state, 100.0, 0.0, 2, information, slope)
     assert cost == pytest.approx(len(points) * shift @ shift, rel=1e-3)
     expected = np.einsum("nci,ncj->ij", jacobian, jacobian)
     scale = np.sqrt(np.diag(expected))
@@ -68,21 +79,20 @@ def test_normal_equations_are_those_of_the_forward_projection(direction):
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize("coefficients", [STILL, SHAKE], ids=["still", "shaking"])
-def test_lines_are_those_of_the_forward_projection(direction, coefficients):
+@pytest.mark.parametrize("seat", [ALONE, MOUNTED], ids=["alone", "mounted"])
+def test_lines_are_those_of_the_forward_projection(direction, coefficients, seat):
     state, points = scene(direction, seed=1)
-    rays, tau = project(state, points, direction, coefficients)
-    data, measured = packed(points, rays, direction)
+    rays, tau = project(state, points, direction, coefficients, seat=seat)
+    data, measured = packed(points, rays, direction, seat=seat)
     np.testing.assert_allclose(measured, tau, atol=1e-12)
     h = 1e-5
     rates = (shake(tau + h, coefficients) - shake(tau - h, coefficients)) / (2 * h)
     turns = np.column_stack([shake(tau, coefficients), rates])
-    errors, by_motion, by_turn, seen, image = residuals.linearized(
-        data, len(points), state, gradient(direction), turns
-    )
+    errors, by_motion, by_turn, seen, image = residuals.linearized(data, len(points), state, turns)
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)
     np.testing.assert_allclose(seen, tau, atol=1e-9)
     np.testing.assert_allclose(image, rays, atol=1e-9)
-    expected = numerical(state, points, direction, coefficients)
+    expected = numerical(state, points, direction, coefficients, seat=seat)
     scale = np.abs(expected).max(axis=(0, 1))
     # The rate of the shaking stands for the body rate that it makes.
     near = 1e-3 if len(coefficients) else 2e-5
@@ -91,7 +101,9 @@ def test_lines_are_those_of_the_forward_projection(direction, coefficients):
     columns = []
     for axis in np.eye(3):
         ahead, behind = (
-            pixels_of(project(state, points, direction, coefficients, sign * h * axis)[0])
+            pixels_of(
+                project(state, points, direction, coefficients, sign * h * axis, seat=seat)[0]
+            )
             for sign in (1, -1)
         )
         columns.append((ahead - behind) / (2 * h))
@@ -109,7 +121,7 @@ def test_errors_beside_the_shaking_are_distances_of_pixels():
     h = 1e-5
     rates = (shake(measured + h, SHAKE) - shake(measured - h, SHAKE)) / (2 * h)
     errors, *_ = residuals.linearized(
-        data, len(points), state, gradient(direction),
+        data, len(points), state,
         np.column_stack([shake(measured, SHAKE), rates]),
     )  # fmt: skip
     np.testing.assert_allclose(errors, -off, atol=5e-3)
@@ -122,15 +134,13 @@ def test_a_still_camera_has_the_lines_of_its_normal_equations():
     off = 0.5 * np.random.default_rng(1).normal(size=rays.shape)
     data, _ = packed(points, rays, direction, off)
     errors, by_motion, *_ = residuals.linearized(
-        data, len(points), state, gradient(direction), np.zeros((len(points), 6))
+        data, len(points), state, np.zeros((len(points), 6))
     )
     information, slope = np.empty((18, 18)), np.empty(18)
-    cost = residuals.normal_equations(
-        data, state, gradient(direction), 1e3, 0.0, 2, information, slope
-    )
+    cost = residuals.normal_equations(data, state, 1e3, 0.0, 2, information, slope)
     assert cost == pytest.approx(np.sum(errors**2), rel=1e-10)
     products = np.einsum("nci,ncj->ij", by_motion, by_motion)
     np.testing.assert_allclose(information, products, rtol=1e-9, atol=1e-9 * products.max())
     np.testing.assert_allclose(slope, np.einsum("nci,nc->i", by_motion, errors), rtol=1e-8)
-    squared = residuals.squared_errors(data, len(points), state, gradient(direction))
+    squared = residuals.squared_errors(data, len(points), state)
     np.testing.assert_allclose(squared, np.sum(errors**2, axis=1), rtol=1e-10)

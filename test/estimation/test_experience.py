@@ -9,6 +9,7 @@ import numpy as np
 from rs_localizer.config import LocalizerConfig, VelocityPrior
 from rs_localizer.core import so3
 from rs_localizer.core.camera import Camera
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.scales import SCALES, SPEEDS, Scales, joined
 from rs_localizer.core.types import Estimate
 from rs_localizer.estimation.assumptions import assumptions, told_speed
@@ -102,7 +103,9 @@ def test_they_forget_it():
 
 def test_what_frames_deny_is_no_prior_of_the_next():
     camera = Camera(640, 480, np.diag([500.0, 500.0, 1.0]), readout_time=0.02)
-    terms, _ = assumptions(camera, LocalizerConfig(), find_solver("r6p_vcwt"))
+    terms, _ = assumptions(
+        camera.readout_time, Rig.of(camera), LocalizerConfig(), find_solver("r6p_vcwt")
+    )
     calm = speeds_after(0.003, 0.005).prior
     slow, prior = told_speed(terms, calm)
     own, told = (one.informations[0].diagonal()[6:12] for one in (terms, slow))

@@ -9,6 +9,7 @@ import pytest
 from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
+from rs_localizer.core.rig import Mounts
 from rs_localizer.core.scales import SCALES
 from rs_localizer.core.shake import CYCLES, FUNCTIONS, shake_at
 from rs_localizer.estimation.frame_fit import (
@@ -293,7 +294,7 @@ def fitted(observations, start, scales=(5e-3, 0.3), hyper=0.2, turns=True, smoot
     first[-1] = np.log(scales[1])
     mean = HYPER_MEAN if hyper < 1.0 else first
     return fit_frame(
-        observations.packed, len(observations), start, observations.row_time_gradient, PRIOR, 2.0,
+        observations.packed, len(observations), start, PRIOR, 2.0,
         30.0, 2.0, first, mean, np.full(SCALES, hyper), turns, smooth, bend, 25,
     )  # fmt: skip
 
@@ -306,7 +307,11 @@ def test_a_motion_with_an_in_frame_turn_is_recovered_without_noise(direction):
     coefficients[[4, 5, 10, 11]] = 0.003 * rng.normal(size=(4, 3))
     rays, _ = project(state, points, direction, coefficients)
     observations = Observations.of(
-        points, rays, row_time(pixels_of(rays), direction), jacobian_of(rays), gradient(direction)
+        points,
+        rays,
+        row_time(pixels_of(rays), direction),
+        jacobian_of(rays),
+        Mounts.one(gradient(direction)),
     )
     start = apply_step(state, 0.002 * rng.normal(size=18))
     fit = fitted(observations, start, smooth=False)
@@ -379,7 +384,7 @@ def test_the_covariance_is_beside_the_smooth_error_and_allows_for_it(of_map):
     fit = fitted(observations, state, (5e-3, scale), 1e9, turns=False, bend=bend)
     assert fit.inliers.all()
     lines = linearized(
-        observations.packed, len(observations), fit.state, observations.row_time_gradient,
+        observations.packed, len(observations), fit.state,
         np.zeros((len(observations), 6)),
     )  # fmt: skip
     matrix, _ = design(lines, fit.inliers, turns=False, smooth=not of_map)

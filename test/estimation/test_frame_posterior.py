@@ -217,7 +217,7 @@ def shaken(seed, cycles=4.0, swings=SWING, noise=0.2, wrong=0, count=80):
     points[:wrong] += np.random.default_rng(seed).uniform(-2.0, 2.0, (wrong, 3))
     return type(observations).of(
         points, observations.rays, observations.tau, jacobian_of(observations.rays),
-        observations.row_time_gradient,
+        observations.mounts,
     ), state  # fmt: skip
 
 
@@ -328,7 +328,7 @@ def test_points_just_beyond_the_gate_that_nothing_explains_are_counted():
             rays[:8] += factor * off
             moved = type(observations).of(
                 observations.points, rays, observations.tau, jacobian_of(rays),
-                observations.row_time_gradient,
+                observations.mounts,
             )  # fmt: skip
             found = frame_posterior(moved, state, PRIOR, 2.0, ASSUMED)
             assert least <= found.near_outliers <= most
@@ -342,7 +342,7 @@ def test_scores_are_chi_squared_where_there_is_nothing():
         observations, state = frame(seed, 0.02, 0.5, 60)
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
         statistic, _, _ = _look(
-            observations.packed, len(observations), best.state, observations.row_time_gradient,
+            observations.packed, len(observations), best.state,
             best.inliers, PRIOR, 0.5, best.freedom, np.full(SCALES, -8.0), np.ones(SCALES), True,
         )  # fmt: skip
         statistics.append(statistic)
@@ -359,7 +359,7 @@ def test_scores_tell_the_frequency():
         observations, state = shaken(1, cycles, 0.3 * SWING, 0.2)
         best = maximum_a_posteriori(observations, state, PRIOR, 2.0)
         statistic, _, _ = _look(
-            observations.packed, len(observations), best.state, observations.row_time_gradient,
+            observations.packed, len(observations), best.state,
             best.inliers, PRIOR, best.noise, best.freedom, np.full(SCALES, -8.0),
             np.ones(SCALES), True,
         )  # fmt: skip

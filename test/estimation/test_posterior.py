@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.posterior import decided, maximum_a_posteriori, noise_deviation
 from rs_localizer.estimation.prior import held_terms, motion_terms
@@ -37,7 +38,7 @@ def observe(scene, speed, noise, count, seed, outliers=0):
     rays = camera.rays(measured)
     observations = Observations.of(
         points, rays, camera.row_time(measured), camera.pixel_jacobian(rays),
-        camera.row_time_gradient,
+        Mounts.one(camera.row_time_gradient),
     )  # fmt: skip
     return observations, scene.state_of(motion)
 

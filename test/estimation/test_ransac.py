@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 
+from rs_localizer.core.rig import Mounts
 from rs_localizer.estimation.observations import Observations
 from rs_localizer.estimation.prior import motion_terms
 from rs_localizer.estimation.ransac import (
@@ -19,6 +20,7 @@ from rs_localizer.estimation.ransac import (
 
 IDENTITY = np.eye(3)
 FREE = motion_terms((0.0, 0.0), (0.0, 0.0))
+ROWS = 1.0  # range of the row times
 
 
 class Solver:
@@ -47,7 +49,7 @@ def problem(scene):
         rays = camera.rays(measured)
         observations = Observations.of(
             points, rays, camera.row_time(measured), camera.pixel_jacobian(rays),
-            camera.row_time_gradient,
+            Mounts.one(camera.row_time_gradient),
         )  # fmt: skip
         w = -motion.angular_velocity
         drift = np.cross(w, motion.translation) - motion.linear_velocity
@@ -68,7 +70,7 @@ def run(observations, solver, pools, max_samples=2000, confidence=0.99, rotation
 
 
 def everything(observations):
-    return Pool(np.arange(len(observations)))
+    return Pool(np.arange(len(observations)), ROWS)
 
 
 def test_it_finds_the_inliers_and_stops_when_it_is_sure(problem):
@@ -105,7 +107,7 @@ def test_a_better_start_is_kept(problem, scene):
 def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
     observations, model, outliers = problem(0.7)
     solver = Solver(model, outliers)
-    good = Pool(np.flatnonzero(~outliers))
+    good = Pool(np.flatnonzero(~outliers), ROWS)
     found = run(observations, solver, [good, everything(observations)])
     assert found.samples == 50
     (samples,) = solver.samples
@@ -116,10 +118,10 @@ def test_good_pools_stop_the_search_early_and_all_are_drawn_from(problem):
 def test_pools_that_are_too_small_are_left_out(problem):
     observations, model, outliers = problem(0.0)
     found = run(
-        observations, Solver(model, outliers), [Pool(np.arange(5)), everything(observations)]
+        observations, Solver(model, outliers), [Pool(np.arange(5), ROWS), everything(observations)]
     )
     assert found.found
-    nothing = run(observations, Solver(model, outliers), [Pool(np.arange(5))])
+    nothing = run(observations, Solver(model, outliers), [Pool(np.arange(5), ROWS)])
     assert not nothing.found
     assert nothing.samples == 0
 
@@ -134,7 +136,7 @@ def test_initial_rotations_take_turns(problem):
 
 def test_scores_put_good_samples_first(problem):
     observations, model, outliers = problem(0.7)
-    ranked = Pool(np.argsort(outliers, kind="stable"), ranked=True)
+    ranked = Pool(np.argsort(outliers, kind="stable"), ROWS, ranked=True)
     solver = Solver(model, outliers)
     run(observations, solver, [ranked], max_samples=1000)
     assert not outliers[solver.samples[0]].any()

@@ -53,7 +53,7 @@ def test_the_truth_is_found_from_a_global_shutter_start(scene):
     start[12:] = 0.0
     start = apply_step(start, 0.05 * np.random.default_rng(0).normal(size=18))
     state, _, cost, converged = refine(
-        scene.pack(camera, points, true), start, camera.row_time_gradient, 1e3, 0.0, NO_PRIOR,
+        scene.pack(camera, points, true), start, 1e3, 0.0, NO_PRIOR,
         1e-3, 2, 30, 1e-6,
     )  # fmt: skip
     assert converged
@@ -64,12 +64,12 @@ def test_the_truth_is_found_from_a_global_shutter_start(scene):
 def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=60, seed=2)
     measured[:15] = np.random.default_rng(1).uniform([0, 0], [639, 479], (15, 2))
-    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    data = scene.pack(camera, points, measured)
     start = apply_step(scene.state_of(motion), 0.003 * np.random.default_rng(3).normal(size=18))
     previous = np.inf
     for iterations in (0, 1, 2, 5, 20):
         state, information, cost, _ = refine(
-            data, start, gradient, 4.0, 1.0, NO_PRIOR, 0.5, 2, iterations, 1e-6
+            data, start, 4.0, 1.0, NO_PRIOR, 0.5, 2, iterations, 1e-6
         )
         assert cost <= previous
         previous = cost
@@ -80,13 +80,13 @@ def test_the_cost_never_rises_and_outliers_lose_their_weight(scene):
 
 def test_the_noise_decides_between_prior_and_data(scene):
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
-    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    data = scene.pack(camera, points, measured)
     start = scene.state_of(motion)
-    held = refine(data, start, gradient, 1e3, 0.0, held_terms(), 1.0, 2, 30, 1e-6)[0]
+    held = refine(data, start, 1e3, 0.0, held_terms(), 1.0, 2, 30, 1e-6)[0]
     np.testing.assert_allclose(held[12:], 0.0, atol=1e-9)
     prior = motion_terms((0.1, 0.1), (0.1, 0.1))
     free, weak, strong = (
-        refine(data, start, gradient, 1e3, 0.0, p, noise, 2, 30, 1e-6)[0][12:]
+        refine(data, start, 1e3, 0.0, p, noise, 2, 30, 1e-6)[0][12:]
         for p, noise in ((NO_PRIOR, 1.0), (prior, 0.5), (prior, 50.0))
     )
     assert np.linalg.norm(weak) < np.linalg.norm(free)
@@ -97,14 +97,14 @@ def test_the_minimum_has_no_slope_of_the_posterior(scene):
     """The gradient of cost plus prior vanishes, by finite differences of the cost itself."""
     camera, motion, points, _, measured = scene.frame(speed=0.1, noise=0.5, count=30)
     # Without the row's part the cost is exactly that of the residuals.
-    data, gradient = scene.pack(camera, points, measured), np.zeros(2)
+    data = scene.pack(camera, points, measured, np.zeros(2))
     prior, noise, h = motion_terms((0.2, 0.1), (0.1, 0.05)), 0.5, 1e-6
     precisions = np.repeat([25.0, 100.0, 100.0, 400.0], 3)
-    state = refine(data, scene.state_of(motion), gradient, 1e3, 0.0, prior, noise, 2, 50, 1e-6)[0]
+    state = refine(data, scene.state_of(motion), 1e3, 0.0, prior, noise, 2, 50, 1e-6)[0]
 
     def posterior(s):
         changes = s[12:]
-        errors = squared_errors(data, len(points), s, gradient)
+        errors = squared_errors(data, len(points), s)
         return errors.sum() + noise**2 * changes @ (precisions * changes)
 
     for e in np.eye(18):

@@ -7,6 +7,7 @@ import pytest
 
 from rs_localizer.core.camera import Camera
 from rs_localizer.core.known_turn import KnownTurn
+from rs_localizer.core.rig import Rig
 from rs_localizer.core.simd.tracing import LANES
 from rs_localizer.core.types import Motion
 from rs_localizer.estimation.experience import Experience
@@ -22,6 +23,7 @@ FISHEYE = Camera(
     640, 480, K, np.array([0.02, -0.01, 0.0, 0.0]), distortion_model="equidistant",
     readout_time=0.03,
 )  # fmt: skip
+EXPOSURE = Rig.of(FISHEYE).exposure()
 STILL = Motion(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
 TAU = np.linspace(-0.7, 0.7, 29)
 TURN = KnownTurn.of(TAU, np.tile([0.1, -0.2, 0.15], (29, 1)), 1e-8 * np.eye(6))
@@ -50,13 +52,13 @@ def test_derivatives_are_those_of_exact_points(turn):
     noisy = pixels + np.random.default_rng(1).normal(size=pixels.shape)
 
     def observed(measured):
-        usable = find_usable(FISHEYE, points, measured, turn)
+        usable = find_usable(EXPOSURE, points, measured, [len(points)], turn)
         assert len(usable.indices) == len(points)
-        return packed(FISHEYE, points, usable), usable.centre
+        return packed(EXPOSURE, points, usable), usable.centre
 
     exact, _ = observed(pixels)
     measured, centre = observed(noisy)
-    found = relinearized(FISHEYE, measured, state_in(STILL, centre), turn)
+    found = relinearized(EXPOSURE, measured, state_in(STILL, centre), turn)
     before = np.abs(by_ray(measured) - by_ray(exact)).max()
     after = np.abs(by_ray(found) - by_ray(exact)).max()
     assert after < 0.1 * before
@@ -66,12 +68,14 @@ def test_derivatives_are_those_of_exact_points(turn):
 
 def test_few_points_and_lost_ones_keep_their_derivatives():
     points, pixels = seen(400)
-    usable = find_usable(FISHEYE, points, pixels, None)
-    few = packed(FISHEYE, points[:100], find_usable(FISHEYE, points[:100], pixels[:100], None))
-    assert relinearized(FISHEYE, few, np.zeros(24), None) is few
+    usable = find_usable(EXPOSURE, points, pixels, [len(points)], None)
+    few = packed(
+        EXPOSURE, points[:100], find_usable(EXPOSURE, points[:100], pixels[:100], [100], None)
+    )
+    assert relinearized(EXPOSURE, few, np.zeros(24), None) is few
     far = Motion(np.eye(3), np.array([5.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
-    observations = packed(FISHEYE, points, usable)
-    found = relinearized(FISHEYE, observations, state_in(far, usable.centre), None)
+    observations = packed(EXPOSURE, points, usable)
+    found = relinearized(EXPOSURE, observations, state_in(far, usable.centre), None)
     np.testing.assert_allclose(by_ray(found), by_ray(observations), rtol=1e-6)
 
 

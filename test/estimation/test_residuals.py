@@ -20,7 +20,6 @@ def test_the_error_is_measured_at_the_row_where_the_model_puts_the_point(scene, 
         scene.pack(camera, points, measured),
         len(points),
         scene.state_of(motion),
-        camera.row_time_gradient,
     )
     expected = np.linalg.norm(measured - true, axis=1)
     # The naive error, with the pose of the measured row, is off by up to a third here.
@@ -32,23 +31,21 @@ def test_the_cost_of_a_still_camera_is_that_of_one_that_hardly_moves(scene):
     still, creeping = scene.state_of(motion), scene.state_of(motion)
     still[12:], creeping[12:] = 0.0, 1e-12
     points[0] -= 10 * motion.rotation[2]  # behind the camera
-    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
-    cost = residuals.truncated_cost(data, still, gradient, 50.0, np.inf)
+    data = scene.pack(camera, points, measured)
+    cost = residuals.truncated_cost(data, still, 50.0, np.inf)
     assert 2500 < cost < 2500 * len(points)
-    assert cost == pytest.approx(
-        residuals.truncated_cost(data, creeping, gradient, 50.0, np.inf), rel=1e-9
-    )
+    assert cost == pytest.approx(residuals.truncated_cost(data, creeping, 50.0, np.inf), rel=1e-9)
 
 
 @pytest.mark.parametrize("softness", [0.0, 1.0])
 def test_robust_cost_and_its_slope_belong_together(scene, softness):
     camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5, acceleration=0.2)
-    data, gradient = scene.pack(camera, points, measured), np.zeros(2)
+    data = scene.pack(camera, points, measured, np.zeros(2))
     state, scale, h = scene.state_of(motion), 3.0, 1e-6
     information, slope = np.empty((18, 18)), np.empty(18)
 
     def cost_of(s):
-        return residuals.normal_equations(data, s, gradient, scale, softness, 2, information, slope)
+        return residuals.normal_equations(data, s, scale, softness, 2, information, slope)
 
     steps = [sign * h * np.eye(18)[k] for k in range(18) for sign in (1, -1)]
     around = [cost_of(apply_step(state, step)) for step in steps]
@@ -61,23 +58,20 @@ def test_robust_cost_and_its_slope_belong_together(scene, softness):
 def test_truncated_costs_are_those_of_the_formulas(scene):
     # A search's cost is that of its one look, which knows no accelerations.
     camera, motion, points, _, measured = scene.frame(noise=2.0, seed=5)
-    data, state, gradient = (
-        scene.pack(camera, points, measured),
-        scene.state_of(motion),
-        np.zeros(2),
-    )
-    squared, c2 = residuals.squared_errors(data, len(points), state, gradient), 9.0
+    data = scene.pack(camera, points, measured, np.zeros(2))
+    state = scene.state_of(motion)
+    squared, c2 = residuals.squared_errors(data, len(points), state), 9.0
     assert (squared > c2).any()
     assert (squared < c2).any()
-    truncated = residuals.truncated_cost(data, state, gradient, 3.0, np.inf)
+    truncated = residuals.truncated_cost(data, state, 3.0, np.inf)
     assert truncated == pytest.approx(np.minimum(squared, c2).sum())
     information, slope = np.empty((18, 18)), np.empty(18)
     tukey = c2 / 3 * (1 - (1 - np.minimum(squared / c2, 1)) ** 3)
     for softness, expected in ((0.0, truncated), (1.0, tukey.sum())):
         assert residuals.normal_equations(
-            data, state, gradient, 3.0, softness, 2, information, slope
+            data, state, 3.0, softness, 2, information, slope
         ) == pytest.approx(expected)
-    bounded = residuals.truncated_cost(data, state, gradient, 3.0, 0.1 * truncated)
+    bounded = residuals.truncated_cost(data, state, 3.0, 0.1 * truncated)
     assert 0.1 * truncated <= bounded < truncated
 
 
@@ -86,26 +80,26 @@ def test_points_behind_the_camera_are_outliers_and_disturb_nothing(scene):
     behind = points.copy()
     depth = (points @ motion.rotation.T + motion.translation)[:, 2]
     behind[0] = points[0] - 2 * depth[0] * motion.rotation[2]
-    state, gradient = scene.state_of(motion), camera.row_time_gradient
+    state = scene.state_of(motion)
     data = scene.pack(camera, behind, measured)
-    squared = residuals.squared_errors(data, len(points), state, gradient)
+    squared = residuals.squared_errors(data, len(points), state)
     assert np.isinf(squared[0])
     assert squared[1:].max() < 1e-6
     information, slope = np.empty((18, 18)), np.empty(18)
     without = np.empty((18, 18))
-    residuals.normal_equations(data, state, gradient, 3.0, 0.0, 2, information, slope)
+    residuals.normal_equations(data, state, 3.0, 0.0, 2, information, slope)
     residuals.normal_equations(
-        scene.pack(camera, points[1:], measured[1:]), state, gradient, 3.0, 0.0, 2, without, slope
+        scene.pack(camera, points[1:], measured[1:]), state, 3.0, 0.0, 2, without, slope
     )
     np.testing.assert_allclose(information, without, rtol=1e-9, atol=1e-6)
 
 
 def test_weights_choose_the_points(scene):
     camera, motion, points, _, measured = scene.frame(noise=1.0)
-    state, gradient = scene.state_of(motion), camera.row_time_gradient
+    state = scene.state_of(motion)
     data = scene.pack(camera, points, measured)
     data = observations.weighted(data, (np.arange(len(points)) < 13).astype(float))
     expected = residuals.truncated_cost(
-        scene.pack(camera, points[:13], measured[:13]), state, gradient, 1e3, np.inf
+        scene.pack(camera, points[:13], measured[:13]), state, 1e3, np.inf
     )
-    assert residuals.truncated_cost(data, state, gradient, 1e3, np.inf) == pytest.approx(expected)
+    assert residuals.truncated_cost(data, state, 1e3, np.inf) == pytest.approx(expected)

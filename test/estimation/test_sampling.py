@@ -51,7 +51,7 @@ def test_samples_spread_over_the_rows_where_they_can():
 
 
 def test_ranked_pools_begin_with_the_best_and_end_with_all():
-    pool = Pool(np.arange(200), ranked=True)
+    pool = Pool(np.arange(200), 1.0, ranked=True)
     sizes = pool.prefix_sizes(0, 1000, 6)
     assert sizes[0] < 40
     assert pool.prefix_sizes(200_000, 1, 6) == 200
@@ -64,5 +64,5 @@ def test_ranked_pools_begin_with_the_best_and_end_with_all():
 
 
 def test_unranked_and_tiny_pools_are_used_whole():
-    assert (Pool(np.arange(50)).prefix_sizes(0, 10, 6) == 50).all()
-    assert (Pool(np.arange(6), ranked=True).prefix_sizes(0, 10, 6) == 6).all()
+    assert (Pool(np.arange(50), 1.0).prefix_sizes(0, 10, 6) == 50).all()
+    assert (Pool(np.arange(6), 1.0, ranked=True).prefix_sizes(0, 10, 6) == 6).all()

@@ -34,23 +34,23 @@ def models_near(motion, count, rng):
 
 def test_the_best_models_are_those_of_a_full_sort(scene):
     camera, motion, points, _, measured = scene.frame(noise=1.0, count=50)
-    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    data = scene.pack(camera, points, measured)
     models, flat = models_near(motion, 40, np.random.default_rng(1))
-    states, costs = best_models(models, data, gradient, 8.0, 4, np.inf)
+    states, costs = best_models(models, data, 8.0, 4, np.inf)
     alive = [state_of_model(column) for column in flat.T if np.isfinite(column).all()]
-    expected = sorted(truncated_cost(data, s, gradient, 8.0, np.inf) for s in alive)[:4]
+    expected = sorted(truncated_cost(data, s, 8.0, np.inf) for s in alive)[:4]
     np.testing.assert_allclose(costs, expected, rtol=1e-12)
     for state, cost in zip(states, costs, strict=True):
-        assert truncated_cost(data, state, gradient, 8.0, np.inf) == cost
+        assert truncated_cost(data, state, 8.0, np.inf) == cost
 
 
 def test_places_without_a_model_stay_infinite(scene):
     camera, _, points, _, measured = scene.frame()
     data = scene.pack(camera, points, measured)
     nothing = np.full((1, 18, 3), np.nan)
-    states, costs = best_models(nothing, data, camera.row_time_gradient, 8.0, 2, np.inf)
+    states, costs = best_models(nothing, data, 8.0, 2, np.inf)
     assert np.isinf(costs).all()
-    _, cost = optimize(states, costs, data, camera.row_time_gradient, 16.0, 2.0, FREE, 1.0)
+    _, cost = optimize(states, costs, data, 16.0, 2.0, FREE, 1.0)
     assert np.isinf(cost)
 
 
@@ -59,11 +59,11 @@ def test_optimisation_reaches_all_inliers_from_a_poor_state(scene):
     rng = np.random.default_rng(2)
     outliers = np.arange(80) < 32
     measured[outliers] = rng.uniform([0, 0], [639, 479], (32, 2))
-    data, gradient = scene.pack(camera, points, measured), camera.row_time_gradient
+    data = scene.pack(camera, points, measured)
     start = scene.state_of(motion)
     start[9:18] += 0.02 * rng.normal(size=9)
-    before = truncated_cost(data, start, gradient, 2.0, np.inf)
-    state, cost = optimize(start[None], np.zeros(1), data, gradient, 32.0, 2.0, FREE, 1.0)
-    truth = truncated_cost(data, scene.state_of(motion), gradient, 2.0, np.inf)
-    assert cost == truncated_cost(data, state, gradient, 2.0, np.inf)
+    before = truncated_cost(data, start, 2.0, np.inf)
+    state, cost = optimize(start[None], np.zeros(1), data, 32.0, 2.0, FREE, 1.0)
+    truth = truncated_cost(data, scene.state_of(motion), 2.0, np.inf)
+    assert cost == truncated_cost(data, state, 2.0, np.inf)
     assert cost <= truth < before

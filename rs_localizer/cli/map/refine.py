@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from rs_localizer.cli import UsageError, refuse_existing
-from rs_localizer.cli.map import contradiction
+from rs_localizer.cli.map import colmap, contradiction
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.core.arrays import Array
 from rs_localizer.core.camera import Camera
@@ -38,12 +38,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "keypoint is observed when its own row was exposed."
     )
     parser.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="a bag of correspondences or keypoints"
+        "recording",
+        type=Path,
+        nargs="?",
+        metavar="RECORDING",
+        help="a bag of correspondences or keypoints",
     )
     parser.add_argument(
         "--map", type=Path, metavar="MAP", help="the map (default: the points of the recording)"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help=" or ".join(WRITERS))
+    parser.add_argument("--out", type=Path, metavar="OUT", help=" or ".join(WRITERS))
     parser.add_argument("--overwrite", action="store_true", help="replace OUT")
     parser.add_argument(
         "--shutter",
@@ -73,11 +77,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "readout_time, scan_direction, stamp_offset, matching.*; map_deviation: how well all "
         "landmarks are known",
     )
+    colmap.add_arguments(parser)
     topics = parser.add_argument_group("topics of the bag (default: found by name and type)")
     add_topics(topics, but=(IMU,))
 
 
 def run(args: argparse.Namespace) -> None:
+    if args.colmap is not None:
+        colmap.run(args)
+        return
+    if args.recording is None or args.out is None:
+        raise UsageError("give RECORDING and --out OUT, or --colmap IN OUT")
     if args.out.suffix not in WRITERS:
         raise UsageError(f"--out must end in {' or '.join(WRITERS)}, got {args.out}")
     config = given_settings(args)

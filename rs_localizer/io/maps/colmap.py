@@ -1,6 +1,7 @@
 # Copyright 2026 rs_localizer contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse models of COLMAP: points with who sees them, images, and descriptors from its database.
+"""Sparse models of COLMAP: cameras, images, points with who sees them, and descriptors from its
+database.
 
 A landmark's descriptor is the medoid of those of the images that see it: the one nearest to the
 others. pycolmap, which reads whole models, is no help here: it takes a count in a damaged file at
@@ -19,8 +20,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from rs_localizer.core.arrays import Array
+from rs_localizer.core.arrays import Array, IntArray
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.calibration import colmap_camera, colmap_line, colmap_parameters
 from rs_localizer.io.maps.landmarks import Map, MapError, make_map
 
 # Id, x, y, z, color, error, length of the track; then image and feature of each observation.
@@ -34,6 +38,7 @@ class Model:
 
     ids: NDArray[np.int64]  # (n,)
     points: Array  # (n,3)
+    colors: NDArray[np.uint8]  # (n,3)
     tracks: NDArray[np.void]  # (m,) observations, point by point
     starts: NDArray[np.int64]  # (n+1,) of each track
 
@@ -59,31 +64,36 @@ def _read_binary(data: bytes) -> Model:
     if 8 + count * _POINT.size > len(data):
         raise MapError(f"points3D.bin is truncated: {count} points, found {len(data)} bytes")
     ids = np.empty(count, np.uint64)
-    points = np.empty((count, 3))
+    points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
     starts = np.zeros(count + 1, np.int64)
     tracks: list[bytes] = []
     position = 8
     for row in range(count):
         end = position + _POINT.size
         if end <= len(data):
-            ids[row], *xyz, _, _, _, _, length = _POINT.unpack_from(data, position)
+            ids[row], *values, _, length = _POINT.unpack_from(data, position)
+            points[row], colors[row] = values[:3], values[3:]
             position, end = end, end + length * _OBSERVATION.itemsize
         if end > len(data):
             raise MapError(f"points3D.bin is truncated at point {row + 1} of {count}")
-        points[row] = xyz
         starts[row + 1] = starts[row] + length
         tracks.append(data[position:end])
         position = end
     if count and int(ids.max()) >= 2**63:
         raise MapError(f"points3D.bin has a point with the id {ids.max()}")
     return Model(
-        ids.astype(np.int64), points, np.frombuffer(b"".join(tracks), _OBSERVATION), starts
+        ids.astype(np.int64),
+        points,
+        colors,
+        np.frombuffer(b"".join(tracks), _OBSERVATION),
+        starts,
     )
 
 
 def _read_text(path: Path) -> Model:
     ids: list[int] = []
     points: list[tuple[float, float, float]] = []
+    colors: list[list[int]] = []
     tracks: list[NDArray[np.uint32]] = []
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
@@ -95,6 +105,7 @@ def _read_text(path: Path) -> Model:
                     raise ValueError
                 ids.append(int(words[0]))
                 points.append((float(words[1]), float(words[2]), float(words[3])))
+                colors.append([int(word) % 256 for word in words[4:7]])
                 track = np.array([int(word) for word in words[8:]], np.int64)
                 if not 0 <= ids[-1] < 2**63 or np.any((track < 0) | (track >= 2**32)):
                     raise ValueError
@@ -110,6 +121,7 @@ def _read_text(path: Path) -> Model:
     return Model(
         np.array(ids, np.int64),
         np.array(points, np.float64).reshape(-1, 3),
+        np.array(colors, np.uint8).reshape(-1, 3),
         np.ascontiguousarray(flat, "<u4").view(_OBSERVATION),
         starts,
     )
@@ -118,16 +130,20 @@ def _read_text(path: Path) -> Model:
 # Number, quaternion, translation, number of the camera; then the name, ended by a zero.
 _IMAGE = struct.Struct("<I7dI")
 _COUNT = struct.Struct("<Q")
-_FEATURE_BYTES = 24  # x, y and the number of the point
-_FEATURE_WORDS = 3
+_FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+_NO_POINT = -1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ModelImage:
-    """An image of a model."""
+    """An image of a model: where it was taken, and its keypoints as far as the model lists them."""
 
     number: int
-    features: int  # 0: the model does not list them
+    camera: int
+    rotation: Array  # (3,3) camera_from_world
+    translation: Array  # (3,)
+    pixels: Array  # (m,2), the corner of the first pixel at 0, 0
+    points: IntArray  # (m,) ids of the points that they show; -1: none
 
 
 def read_images(folder: Path) -> dict[str, ModelImage]:
@@ -154,17 +170,33 @@ def _read_binary_images(data: bytes) -> dict[str, ModelImage]:
         (count,) = _COUNT.unpack_from(data)
         position = _COUNT.size
         for _ in range(count):
-            number = _IMAGE.unpack_from(data, position)[0]
+            number, *pose, camera = _IMAGE.unpack_from(data, position)
             start = position + _IMAGE.size
             end = data.index(0, start)
             (features,) = _COUNT.unpack_from(data, end + 1)
-            images[data[start:end].decode("utf-8")] = ModelImage(number, features)
-            position = end + 1 + _COUNT.size + features * _FEATURE_BYTES
-    except (struct.error, ValueError, OverflowError):  # ValueError also where a name is no text
-        position = len(data) + 1
-    if position > len(data):
-        raise MapError("images.bin is truncated or damaged")
+            position = end + 1 + _COUNT.size
+            # Of a count that lies, NumPy says that the buffer is too small.
+            table = np.frombuffer(data, _FEATURE, features, position)
+            name = data[start:end].decode("utf-8")
+            images[name] = _model_image(number, camera, pose, table)
+            position += table.nbytes
+    except (struct.error, ValueError, OverflowError) as error:
+        raise MapError("images.bin is truncated or damaged") from error
     return images
+
+
+def _model_image(
+    number: int, camera: int, pose: list[float], features: NDArray[np.void]
+) -> ModelImage:
+    w, x, y, z = pose[:4]
+    return ModelImage(
+        number,
+        camera,
+        Rotation.from_quat([x, y, z, w]).as_matrix(),
+        np.array(pose[4:]),
+        np.column_stack([features["x"], features["y"]]),
+        features["point"].astype(np.int64),
+    )
 
 
 def _read_text_images(path: Path) -> dict[str, ModelImage]:
@@ -182,13 +214,101 @@ def _read_text_images(path: Path) -> dict[str, ModelImage]:
         try:
             if len(words) != 10:
                 raise ValueError
-            count = len(features.split()) // _FEATURE_WORDS
-            images[words[9]] = ModelImage(int(words[0]), count)
-        except ValueError:
+            triples = np.array(features.split(), np.float64).reshape(-1, 3)
+            table = np.empty(len(triples), _FEATURE)
+            table["x"], table["y"], table["point"] = triples.T
+            pose = [float(word) for word in words[1:8]]
+            images[words[9]] = _model_image(int(words[0]), int(words[8]), pose, table)
+        except (ValueError, OverflowError):
             raise MapError(
-                f"images.txt: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, found {line[:80]!r}"
+                f"images.txt: expected ID QW QX QY QZ TX TY TZ CAMERA NAME and a line of X Y POINT "
+                f"for each keypoint, found {line[:80]!r}"
             ) from None
     return images
+
+
+_CAMERA = struct.Struct("<IiQQ")  # number, model, width, height; then the parameters
+
+
+def read_camera(folder: Path) -> Camera:
+    """The one camera of a model.
+
+    Raises:
+        MapError: for several, for one that cannot be used, for anything that is no model.
+    """
+    binary, text = folder / "cameras.bin", folder / "cameras.txt"
+    try:
+        if binary.exists():
+            return colmap_camera(_binary_cameras(binary.read_bytes()), None)
+        return colmap_camera(text.read_text(encoding="utf-8"), None)
+    except (struct.error, ValueError) as error:
+        raise MapError(f"the cameras of the model in {folder}: {error}") from error
+
+
+def _binary_cameras(data: bytes) -> str:
+    """The same as text; of an unknown model, how many parameters it has is not known."""
+    (count,) = _COUNT.unpack_from(data)
+    if count != 1:
+        raise ValueError(f"one is needed, found {count}: images of one camera share their lens")
+    number, model, width, height = _CAMERA.unpack_from(data, _COUNT.size)
+    values = np.frombuffer(data, "<f8", offset=_COUNT.size + _CAMERA.size)
+    return colmap_line(number, model, width, height, values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """The points of a model that is written."""
+
+    ids: IntArray  # (n,)
+    points: Array  # (n,3)
+    colors: NDArray[np.uint8]  # (n,3)
+    errors: Array  # (n,) px, mean reprojection error
+
+
+def write_model(
+    folder: Path, camera: Camera, images: dict[str, ModelImage], points: Points
+) -> None:
+    """Write a model of one camera as text, into a folder that is there.
+
+    Args:
+        folder: where to.
+        camera: of all images, with the number 1.
+        images: by their names; each keypoint's point is one of ``points``, or -1.
+        points: with what is said of them.
+
+    Raises:
+        ValueError: for a lens that COLMAP has no name for.
+    """
+    lens = colmap_parameters(camera)
+    width, height = camera.size
+    tracks: dict[int, list[str]] = {point: [] for point in points.ids.tolist()}
+    rows = []
+    for name, image in images.items():
+        x, y, z, w = Rotation.from_matrix(image.rotation).as_quat(canonical=True)
+        rows.append(f"{image.number} {_line([w, x, y, z, *image.translation])} 1 {name}\n")
+        shown = list(zip(image.pixels.tolist(), image.points.tolist(), strict=True))
+        rows.append(" ".join(f"{u!r} {v!r} {point}" for (u, v), point in shown) + "\n")
+        for feature, (_, point) in enumerate(shown):
+            if point != _NO_POINT:
+                tracks[point].append(f" {image.number} {feature}")
+    described = zip(points.ids.tolist(), points.points, points.colors, points.errors, strict=True)
+    for file, text in (
+        ("cameras.txt", f"1 {lens['model']} {width} {height} {_line(lens['params'])}\n"),
+        ("images.txt", "".join(rows)),
+        (
+            "points3D.txt",
+            "".join(
+                f"{point} {_line(place)} {' '.join(map(str, color))} {float(error)!r}"
+                f"{''.join(tracks[point])}\n"
+                for point, place, color, error in described
+            ),
+        ),
+    ):
+        (folder / file).write_text(text, encoding="utf-8")
+
+
+def _line(values: Array | list[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
 
 
 DATABASE = "database.db"

@@ -1,0 +1,91 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras that are mounted to one moving body, each with a shutter and a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.independent.cameras import Camera
+from benchmarks.independent.motions import IntArray, Moving
+from benchmarks.independent.rotations import Array, BoolArray, exponential
+from benchmarks.independent.scenes import visible
+
+_DEPTHS = (1.5, 5.0)  # m
+_WALL_DISTANCE, _WALL_TILT = 2.5, math.radians(20.0)
+_MARGIN = 12.0  # px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounted:
+    """A camera on a body: ``X_camera = rotation X_body + translation``."""
+
+    camera: Camera
+    rotation: Array  # (3,3)
+    translation: Array  # (3,) m
+    start: float = 0.0  # s after the frame's beginning that its first row is exposed
+
+    def seen(self, motions: Moving, which: IntArray, begin: Array, points: Array) -> Array:
+        """Pixels (f,n,2) of points (f,n,3) in frames that begin at these times (f,)."""
+        each, shape = np.repeat(which, points.shape[1]), points.shape[:2]
+
+        def local_at(delay: Array) -> Array:
+            now = (begin + self.start)[:, None] + delay
+            rotation, position = motions.poses(each, now.ravel())
+            body = np.einsum("nji,nj->ni", rotation, points.reshape(-1, 3) - position)
+            local: Array = body @ self.rotation.T + self.translation
+            return local.reshape(points.shape)
+
+        return self.camera.project_rolling(local_at, shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """What one camera sees in f frames of n points."""
+
+    points: Array  # (f,n,3)
+    exact: Array  # (f,n,2)
+    visible: BoolArray  # (f,n)
+
+
+def middle_of(rig: Mapping[str, Mounted]) -> float:
+    """Middle of all exposures, s after a frame's beginning."""
+    ends = [mounted.start + mounted.camera.readout_time for mounted in rig.values()]
+    return 0.5 * (min(mounted.start for mounted in rig.values()) + max(ends))
+
+
+def views(
+    rig: Mapping[str, Mounted], motions: Moving, begin: Array, count: int, wall: bool,
+    rng: np.random.Generator,
+) -> dict[str, Views]:  # fmt: skip
+    """So many points before each camera, 1.5 to 5 m away or on a tilted wall 2.5 m before the body.
+
+    Args:
+        begin: (f,) time of each motion at which its frame begins.
+    """
+    which = np.arange(len(begin))
+    axis = np.column_stack([rng.normal(size=(len(begin), 2)), np.zeros(len(begin))])
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    normal = exponential(rng.uniform(0.0, _WALL_TILT, (len(begin), 1)) * axis)[:, :, 2]
+    rotation, position = motions.poses(which, begin + middle_of(rig))
+    result = {}
+    for name, mounted in rig.items():
+        size = np.array([mounted.camera.width, mounted.camera.height]) - 1.0
+        pixels = rng.uniform(_MARGIN, size - _MARGIN, (len(begin), count, 2))
+        ones = np.ones((*pixels.shape[:2], 1))
+        rays = np.concatenate([mounted.camera.bearings(pixels), ones], axis=-1) @ mounted.rotation
+        centre = -mounted.rotation.T @ mounted.translation
+        if wall:
+            depth = (_WALL_DISTANCE - normal @ centre)[:, None]
+            depth = depth / np.einsum("fi,fni->fn", normal, rays)
+        else:
+            depth = rng.uniform(*_DEPTHS, pixels.shape[:2])
+        body = centre + depth[..., None] * rays
+        points = position[:, None] + np.einsum("fij,fnj->fni", rotation, body)
+        exact = mounted.seen(motions, which, begin, points)
+        result[name] = Views(points, exact, visible(mounted.camera, exact))
+    return result

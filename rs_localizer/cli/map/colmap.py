@@ -1,0 +1,185 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``rs_localizer map refine --colmap``: a model of COLMAP as of a global shutter."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from rs_localizer.cli import UsageError, replaced
+from rs_localizer.cli.map import contradiction
+from rs_localizer.cli.settings_args import given_values, row_time
+from rs_localizer.io.atomic_files import atomic_directory
+from rs_localizer.io.calibration import read_calibration
+from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
+from rs_localizer.io.maps.landmarks import MapError
+from rs_localizer.mapping.global_shutter import GlobalShutterModel, KnownShutter, undo_shutter
+from rs_localizer.offline.image_sources import have_times
+from rs_localizer.offline.rectified import map_depths, motion_between, rectified
+from rs_localizer.process.arguments import number
+from rs_localizer.settings import build
+
+_LIST, _IMAGES = "images.txt", "images"
+_NUMBER = re.compile(r"\d+")
+# What a recording needs, and a model has itself or cannot have.
+_OF_RECORDINGS = ("recording", "out", "map", "hold")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of models."""
+    group = parser.add_argument_group(
+        "a model of COLMAP, for programs that know a global shutter only",
+        "Keypoints are moved to where a global shutter would have seen their points; poses are of "
+        "one row. All images are of one camera, and follow each other in time.",
+    )
+    group.add_argument(
+        "--colmap",
+        nargs=2,
+        type=Path,
+        metavar=("IN", "OUT"),
+        help="instead of RECORDING: folder of a sparse model, text or binary, and one to create",
+    )
+    group.add_argument(
+        "--rate",
+        type=number(0.0, above=True),
+        metavar="HZ",
+        help="images per second of the numbers in the images' names, which else are times in ns",
+    )
+    group.add_argument(
+        "--row",
+        type=row_time,
+        default=0.0,
+        metavar="ROW",
+        help="of the poses: first, middle (default), last, or a row time from -0.5 to 0.5",
+    )
+    group.add_argument(
+        "--images",
+        type=Path,
+        metavar="FOLDER",
+        help=f"of the model: also write them as of a global shutter, to OUT/{_IMAGES}",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Undo the shutter of a model."""
+    for name in _OF_RECORDINGS:
+        if getattr(args, name) is not None:
+            raise UsageError(f"--colmap goes without {'--' * (name != 'recording')}{name}")
+    if args.shutter == "global":
+        raise UsageError("a model of a global shutter needs no refinement")
+    folder, args.out = args.colmap
+    try:
+        model, images = read_model(folder), read_images(folder)
+        camera = read_camera(folder)
+    except MapError as error:
+        raise MapError(f"{folder}: {error}") from error
+    if args.calibration is not None:
+        camera = read_calibration(args.calibration)
+    stamps = image_stamps(list(images), args.rate)
+    if args.images is not None:
+        missing = [name for name in images if not (args.images / name).is_file()]
+        if missing:
+            raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
+    with atomic_directory(args.out, replaced(args, _LIST)) as out:
+        found = undo_shutter(camera, model, images, stamps, _known(args), args.row, _print_step)
+        contradiction.check(args, found.refined.readout_check, "see --shutter estimated")
+        out.mkdir()
+        write_model(out, found.camera, found.images, found.points)
+        share = None if args.images is None else _write_images(args, found, out / _IMAGES)
+    _tell(args, found, len(images), len(model.points))
+    if share is not None:
+        print(f"{args.out / _IMAGES}: {1 - share:.1%} of the pixels are left black: not known")
+
+
+def _print_step(step: str) -> None:
+    print(f"adjusted: {step}", flush=True)
+
+
+def _known(args: argparse.Namespace) -> KnownShutter:
+    values = given_values(args)
+    config = build(values)
+    readout = config.readout_time if args.shutter != "estimated" else 0.0
+    if args.shutter == "given" and not readout:
+        raise UsageError("--shutter given needs -p readout_time:=S or --params")
+    direction = str(config.scan_direction) if readout or "scan_direction" in values else None
+    return KnownShutter(readout or None, direction, args.intrinsics)
+
+
+def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:
+    """When images were taken, ns, by their names: times in ns, or numbers at a rate.
+
+    Raises:
+        UsageError: for names that are neither.
+    """
+    if rate is None:
+        if not have_times([Path(name) for name in names]):
+            raise UsageError(
+                f"the names of the images are not times in ns (such as {names[0]}): give --rate, "
+                "the images per second of the numbers in them"
+            )
+        return {name: int(Path(name).stem) for name in names}
+    stamps = {}
+    for name in names:
+        numbers = _NUMBER.findall(Path(name).stem)
+        if not numbers:
+            raise UsageError(f"the name {name} has no number for --rate")
+        stamps[name] = round(1e9 * int(numbers[-1]) / rate)
+    if len(set(stamps.values())) < len(stamps):
+        raise UsageError("images of the same number: --rate is for images of one video")
+    return stamps
+
+
+def _write_images(args: argparse.Namespace, found: GlobalShutterModel, folder: Path) -> float:
+    """The images of the model; the share of their pixels that is known."""
+    depths = map_depths(found.points.points)
+    shares = []
+    for name, ends in tqdm(found.ends.items(), unit="image", desc="rectify", disable=None):
+        image = cv2.imread(
+            str(args.images / name), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+        )
+        size = None if image is None else (image.shape[1], image.shape[0])
+        if image is None or image.dtype != np.uint8 or size != found.camera.size:
+            raise ValueError(
+                f"{args.images / name} is no image of 8 bits and of the model's "
+                f"{found.camera.size[0]}x{found.camera.size[1]} pixels"
+            )
+        pixels = np.asarray(image, np.uint8)
+        made, known = rectified(found.camera, pixels, motion_between(*ends), depths, args.row)
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(cv2.imencode(file.suffix, made)[1].tobytes())
+        shares.append(float(known.mean()))
+    return float(np.mean(shares))
+
+
+def _tell(args: argparse.Namespace, found: GlobalShutterModel, images: int, points: int) -> None:
+    kept = sum(len(image.points) for image in found.images.values())
+    shutter = found.camera
+    rows = [
+        ("images with a pose", f"{len(found.images)} of {images}"),
+        ("points", f"{len(found.points.ids)} of {points}"),
+        ("keypoints that fit", f"{kept} of {found.keypoints}"),
+        (
+            "error with a global shutter",
+            f"{found.before:.3f} px rms before, {found.after:.3f} after",
+        ),
+        ("noise of u and of v", f"{found.refined.deviation:.3f} px"),
+        ("readout time", f"{1e3 * shutter.readout_time:.3f} ms {shutter.scan_direction}"),
+    ]
+    for name, text in rows:
+        print(f"{name:28} {text}")
+    fit = found.shutter
+    if fit is not None and not fit.visible:
+        print(
+            f"warning: the images show no rolling shutter ({1e3 * fit.readout_time:.1f} +- "
+            f"{1e3 * fit.deviation:.1f} ms fits best): the model is that of a global one"
+        )
+    elif args.shutter != "given" and fit is None and not shutter.readout_time:
+        print("warning: too few images follow each other to show a rolling shutter: give it")
+    print(f"written: {args.out}")

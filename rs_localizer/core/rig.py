@@ -1,0 +1,288 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rigs: several cameras that move as one, each with a shutter and a clock of its own.
+
+A camera ``k`` of a rig sees, in a row that is exposed at ``t``, what lies at
+
+    X_camera = R_k (rig_from_map(t) X_map) + p_k
+
+so that the rig's turn carries each camera along by its lever arm. A camera alone is the rig of one
+with ``R = I`` and ``p = 0``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rs_localizer.core.arrays import Array, instance
+from rs_localizer.core.camera import Camera, numbers
+from rs_localizer.core.types import Estimate
+
+# Entries of R R^T - I beyond this are no rounding of a calibration file's digits.
+_ORTHONORMAL = 1e-3
+# s; clocks of one rig that are farther apart are not of one frame, and a motion that is smooth over
+# a frame is none over that.
+_LONGEST_SPAN = 2.0
+
+Extrinsics = tuple[Any, Any]
+"""Rotation (3,3) and translation (3,), ``X_camera = R X_rig + t``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """Cameras that are mounted to one body.
+
+    Args:
+        cameras: by their names, each with its shutter.
+        camera_from_rig: rotation (3,3) and translation (3,) m of each camera, with
+            ``X_camera = R X_rig + t``. The rig's origin belongs near the cameras: what is assumed
+            of its speed is assumed of that point.
+        time_offset: s to add to the stamps of a camera; absent: 0.
+
+    Raises:
+        ValueError: a name is unknown or missing, a rotation is none, a value is not finite, or one
+            of several cameras has no readout time.
+    """
+
+    cameras: Mapping[str, Camera]
+    camera_from_rig: Mapping[str, tuple[Array, Array]]
+    time_offset: Mapping[str, float] = field(default_factory=dict)
+
+    if TYPE_CHECKING:  # what may be given; the fields say what it becomes
+
+        def __init__(
+            self,
+            cameras: Mapping[str, Camera],
+            camera_from_rig: Mapping[str, Extrinsics],
+            time_offset: Mapping[str, float] = ...,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.cameras, Mapping) or not self.cameras:
+            raise ValueError(f"cameras must be {{name: camera}}, got {self.cameras!r}")
+        for name, camera in self.cameras.items():
+            if not isinstance(name, str):
+                raise ValueError(f"cameras have names, got {name!r}")
+            instance(f"cameras[{name!r}]", camera, Camera)
+            if len(self.cameras) > 1 and not camera.readout_time > 0.0:
+                raise ValueError(f"{name}: a camera of a rig needs its readout_time, which is 0")
+        for given, values in (
+            ("camera_from_rig", self.camera_from_rig), ("time_offset", self.time_offset),
+        ):  # fmt: skip
+            if not isinstance(values, Mapping):
+                raise ValueError(f"{given} must be a mapping by names, got {values!r}")
+            unknown = [name for name in values if name not in self.cameras]
+            if unknown:
+                raise ValueError(
+                    f"{given} has {', '.join(map(repr, unknown))}; the cameras are "
+                    f"{', '.join(map(repr, self.cameras))}"
+                )
+        missing = [name for name in self.cameras if name not in self.camera_from_rig]
+        if missing:
+            raise ValueError(f"camera_from_rig lacks {', '.join(map(repr, missing))}")
+        extrinsics = {name: _extrinsics(name, self.camera_from_rig[name]) for name in self.cameras}
+        offsets = {name: _seconds(name, self.time_offset.get(name, 0.0)) for name in self.cameras}
+        set_field = object.__setattr__
+        set_field(self, "cameras", MappingProxyType(dict(self.cameras)))
+        set_field(self, "camera_from_rig", MappingProxyType(extrinsics))
+        set_field(self, "time_offset", MappingProxyType(offsets))
+
+    @classmethod
+    def of(cls, camera: Camera) -> Rig:
+        """A camera alone, whose axes are those of the rig."""
+        return cls({"camera": camera}, {"camera": (np.eye(3), np.zeros(3))})
+
+    @property
+    def focal_length(self) -> float:
+        """Mean of the cameras' focal lengths, in their delivered pixels."""
+        return sum(camera.focal_length for camera in self.cameras.values()) / len(self.cameras)
+
+    def exposure(
+        self, names: Sequence[str] | None = None, stamps: Mapping[str, float] | None = None
+    ) -> Exposure:
+        """When and from where some of the cameras see a frame.
+
+        Args:
+            names: of the cameras that have a part in it; None: all.
+            stamps: s, exposure of their first delivered rows, relative to anything; None: all 0.
+
+        Raises:
+            ValueError: an unknown or missing name, a stamp that is not finite, or exposures that
+                are more than 2 s apart.
+        """
+        chosen = tuple(self.cameras if names is None else names)
+        given = dict.fromkeys(chosen, 0.0) if stamps is None else stamps
+        for name in chosen:
+            if name not in self.cameras:
+                raise ValueError(f"the rig has no camera {name!r}, but {', '.join(self.cameras)}")
+            if name not in given:
+                raise ValueError(f"stamps lack {name!r}")
+        cameras = tuple(self.cameras[name] for name in chosen)
+        readouts = np.array([camera.readout_time for camera in cameras])
+        starts = np.array([_seconds(name, given[name]) for name in chosen])
+        offsets = np.array([self.time_offset[name] for name in chosen])
+        rows = np.array([camera.first_row_time for camera in cameras])
+        # Relative to the first one: stamps of a clock since 1970 have no digits to lose.
+        middles = (starts - starts[0]) + offsets - rows * readouts
+        reference = middles[0]
+        middles -= reference
+        first, last = np.min(middles - 0.5 * readouts), np.max(middles + 0.5 * readouts)
+        span, middle = float(last - first), 0.5 * float(first + last)
+        if not span <= max(_LONGEST_SPAN, *readouts):
+            raise ValueError(
+                f"the exposures of a frame are {span:.3g} s apart: stamps are in seconds, of one "
+                "frame, and by one clock but for time_offset"
+            )
+        axes = np.array([self.camera_from_rig[name][0] for name in chosen])
+        moved = np.array([self.camera_from_rig[name][1] for name in chosen])
+        per_span = readouts / span if span > 0.0 else np.ones(len(chosen))
+        gradients = np.array([camera.row_time_gradient for camera in cameras]) * per_span[:, None]
+        return Exposure(
+            chosen,
+            cameras,
+            float(starts[0] + (reference + middle)),
+            span,
+            per_span,
+            (middles - middle) / span if span > 0.0 else np.zeros(len(chosen)),
+            Mounts(axes, -np.einsum("kji,kj->ki", axes, moved), gradients),
+        )
+
+
+def _extrinsics(name: str, given: Any) -> tuple[Array, Array]:
+    try:
+        rotation, translation = given
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"camera_from_rig[{name!r}] must be a rotation and a translation, got {given!r}"
+        ) from None
+    rotation = numbers(f"rotation of {name}", rotation)
+    translation = numbers(f"translation of {name}", translation)
+    if rotation.shape != (3, 3) or translation.shape != (3,):
+        raise ValueError(
+            f"camera_from_rig[{name!r}] must be of (3,3) and (3,), got {rotation.shape} and "
+            f"{translation.shape}"
+        )
+    if not (np.all(np.isfinite(rotation)) and np.all(np.isfinite(translation))):
+        raise ValueError(f"camera_from_rig[{name!r}] must be finite")
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if off > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
+        raise ValueError(
+            f"camera_from_rig[{name!r}] has no rotation: R R^T is off by {off:.2g}, det R is "
+            f"{np.linalg.det(rotation):.3g}"
+        )
+    if off > 0.0:  # the nearest rotation
+        left, _, right = np.linalg.svd(rotation)
+        rotation = left @ right
+    for array in (rotation, translation):
+        array.flags.writeable = False
+    return rotation, translation
+
+
+def _seconds(name: str, value: Any) -> float:
+    seconds = numbers(f"time of {name}", value)
+    if seconds.shape != () or not np.isfinite(seconds):
+        raise ValueError(f"times of {name} must be finite seconds, got {value!r}")
+    return float(seconds)
+
+
+class Mounts(NamedTuple):
+    """How the k cameras of a frame are mounted to the rig, and how their shutters run."""
+
+    axes: Array  # (k,3,3) camera_from_rig
+    centres: Array  # (k,3) m, of the cameras in the rig
+    gradients: Array  # (k,2) of the row time by the pixel
+
+    @classmethod
+    def one(cls, gradient: Array) -> Mounts:
+        """Of a camera alone."""
+        return cls(np.eye(3)[None], np.zeros((1, 3)), np.asarray(gradient, float)[None])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """When and from where the k cameras of one frame see it.
+
+    Row times of a frame are counted from the middle of all exposures, in the span from the first
+    exposed row of any camera to the last one: from -0.5 to 0.5.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    time: float  # s, middle of all exposures, by the clock of the stamps
+    span: float  # s; 0: the readout time of a camera alone is unknown
+    readouts: Array  # (k,) in spans
+    middles: Array  # (k,) row times of their middle rows
+    mounts: Mounts
+
+    @property
+    def alone(self) -> bool:
+        """Whether one camera sees the frame."""
+        return len(self.cameras) == 1
+
+    def row_time(self, place: int, pixels: Array) -> Array:
+        """Row times (n,) of raw pixels (n,2) of a camera."""
+        rows = self.cameras[place].row_time(pixels)
+        times: Array = rows * self.readouts[place] + self.middles[place]
+        return times
+
+    def by(self, camera: Camera) -> Exposure:
+        """The same through another lens of a camera alone."""
+        return replace(self, cameras=(camera,))
+
+
+class ByCamera(np.ndarray[Any, Any]):
+    """Values of all points of a frame, of one camera by its name: ``values["front"]``."""
+
+    _places: Mapping[str, slice]
+
+    @classmethod
+    def of(cls, values: Array, places: Mapping[str, slice]) -> ByCamera:
+        """Values (n,) of all cameras and where those of each are."""
+        split = np.asarray(values).view(cls)
+        split._places = places
+        return split
+
+    def __array_finalize__(self, source: Any) -> None:
+        self._places = getattr(source, "_places", {})
+
+    def __getitem__(self, key: Any) -> Any:
+        plain = self.view(np.ndarray)
+        return plain[self._places[key]] if isinstance(key, str) else plain[key]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RigEstimate(Estimate):
+    """An accepted pose and velocity of a rig; true in a condition.
+
+    As an :class:`Estimate`, of the rig in place of the camera: rig_from_map at ``time``, velocities
+    per ``span``. ``inliers`` and ``residuals`` hold the points of all cameras, one after the other;
+    those of one camera are ``inliers["front"]``.
+    """
+
+    time: float = 0.0  # s, middle of all exposures, by the clock of the stamps
+    names: tuple[str, ...] = ()  # of the cameras that had a part, in the order of the points
+
+    @classmethod
+    def of(cls, estimate: Estimate, exposure: Exposure, counts: Sequence[int]) -> RigEstimate:
+        """The estimate of a frame of a rig, of whose cameras each has so many points."""
+        ends = np.cumsum(counts).tolist()
+        places = {
+            name: slice(end - count, end)
+            for name, count, end in zip(exposure.names, counts, ends, strict=True)
+        }
+        values = {each.name: getattr(estimate, each.name) for each in fields(Estimate)}
+        for name in ("inliers", "residuals"):
+            values[name] = ByCamera.of(values[name], places)
+        return cls(**values, time=exposure.time, names=exposure.names)
+
+    def at_time(self, time: float) -> tuple[Array, Array]:
+        """Rotation (3,3) and translation (3,) rig_from_map at a time in s."""
+        if not (math.isfinite(time) and self.span > 0.0):
+            raise ValueError(f"time must be finite and the span known, got {time!r}, {self.span}")
+        return self.at((time - self.time) / self.span)

@@ -1,0 +1,227 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How cameras are mounted to each other, in files of other programs: Kalibr's camchain, COLMAP's
+``rig_config.json``.
+
+A camchain has a mapping for each camera, in their order. Its names are Kalibr's, ``cam0``, or any
+other; besides what Kalibr writes, each may have ``readout_time`` (s) and ``scan_direction``.
+
+=====================  =================================================================
+``T_cn_cnm1``          ``X_camera = T X_camera_before``, of all but the first
+``T_cam_imu``          ``X_camera = T X_imu``; if all have it, the rig's axes are the IMU's
+``timeshift_cam_imu``  s, ``t_imu = t_camera + shift``: what is to be added to its stamps
+=====================  =================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from rs_localizer.core import so3
+from rs_localizer.core.arrays import Array
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.calibration import (
+    CalibrationError,
+    colmap_parameters,
+    kalibr_camera,
+    kalibr_fields,
+)
+from rs_localizer.io.transforms import Transform, TransformError, from_numbers
+from rs_localizer.io.yaml_text import YamlError, load_yaml
+
+_CHAIN, _IMU, _SHIFT = "T_cn_cnm1", "T_cam_imu", "timeshift_cam_imu"
+_SHUTTER = ("readout_time", "scan_direction")
+# Entries of R R^T - I beyond this are no rounding of a file's digits.
+_ORTHONORMAL = 1e-3
+
+
+class RigParts(NamedTuple):
+    """What :class:`rs_localizer.Rig` is made of: ``Rig(*parts)``."""
+
+    cameras: dict[str, Camera]
+    camera_from_rig: dict[str, tuple[Array, Array]]  # (3,3) and (3,) m, X_camera = R X_rig + t
+    time_offset: dict[str, float]  # s, to add to a camera's stamps
+
+
+def read_camchain(path: Path | str) -> RigParts:
+    """The cameras of a camchain (see the module); without ``T_cam_imu`` the rig's axes are those of
+    the first camera.
+
+    Raises:
+        CalibrationError: for anything else, saying what was found.
+    """
+    parts: RigParts = _read(Path(path), _camchain)
+    return parts
+
+
+def write_camchain(path: Path, parts: RigParts) -> None:
+    """Write a camchain that :func:`read_camchain` reads as the same.
+
+    Raises:
+        ValueError: for a lens that Kalibr has no name for.
+    """
+    tree: dict[str, Any] = {}
+    poses = {name: _matrix(*pose) for name, pose in parts.camera_from_rig.items()}
+    offsets = {name: float(parts.time_offset.get(name, 0.0)) for name in parts.cameras}
+    first = next(iter(parts.cameras))
+    by_imu = bool(np.any(poses[first] != np.eye(4))) or any(offsets.values())
+    before = None
+    for name, camera in parts.cameras.items():
+        fields = kalibr_fields(camera)
+        if before is not None:
+            fields[_CHAIN] = (poses[name] @ np.linalg.inv(poses[before])).tolist()
+        if by_imu:
+            fields[_IMU], fields[_SHIFT] = poses[name].tolist(), offsets[name]
+        if camera.readout_time > 0.0:
+            fields |= {
+                "readout_time": camera.readout_time,
+                "scan_direction": str(camera.scan_direction),
+            }
+        tree[name], before = fields, name
+    path.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None), "utf-8")
+
+
+def read_rig_config(path: Path | str) -> dict[str, tuple[Array, Array]]:
+    """Rotation (3,3) and translation (3,) camera_from_rig of each camera of COLMAP's
+    ``rig_config.json``, by the last folder of its ``image_prefix``; the rig's axes are those of
+    ``ref_sensor``.
+
+    Raises:
+        CalibrationError: for anything else, or several rigs.
+    """
+    poses: dict[str, tuple[Array, Array]] = _read(Path(path), _rig_config)
+    return poses
+
+
+def write_rig_config(path: Path, parts: RigParts) -> None:
+    """Write COLMAP's ``rig_config.json``, whose reference is the first camera.
+
+    Raises:
+        ValueError: for a lens that COLMAP has no model for.
+    """
+    entries: list[dict[str, Any]] = []
+    reference: Transform | None = None
+    for name, camera in parts.cameras.items():
+        lens = colmap_parameters(camera)
+        entry = {
+            "image_prefix": f"{name}/",
+            "camera_model_name": lens["model"],
+            "camera_params": lens["params"],
+        }
+        pose = Transform(*parts.camera_from_rig[name])
+        if reference is None:
+            reference = pose
+            entry["ref_sensor"] = True
+        else:
+            relative = pose @ reference.inverse()
+            x, y, z, w = so3.quaternion(np.ascontiguousarray(relative.rotation)).tolist()
+            entry["cam_from_rig_rotation"] = [w, x, y, z]
+            entry["cam_from_rig_translation"] = relative.translation.tolist()
+        entries.append(entry)
+    path.write_text(json.dumps([{"cameras": entries}], indent=2) + "\n", "utf-8")
+
+
+def _read(path: Path, reader: Any) -> Any:
+    try:
+        return reader(load_yaml(path.read_text(encoding="utf-8")))  # JSON is YAML
+    except OSError as error:
+        raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
+    except (YamlError, UnicodeDecodeError) as error:
+        text = " ".join(str(error).split())
+        raise CalibrationError(f"{path} is not a YAML or JSON file: {text}") from error
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        fault = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise CalibrationError(f"{path} is no usable rig: {fault}") from error
+
+
+def _camchain(tree: Any) -> RigParts:
+    if not isinstance(tree, dict) or not tree:
+        raise ValueError("a camchain has a mapping for each camera")
+    cameras, poses, offsets = {}, {}, {}
+    by_imu = all(isinstance(item, dict) and _IMU in item for item in tree.values())
+    pose = np.eye(4)
+    for place, (name, item) in enumerate(tree.items()):
+        try:
+            cameras[str(name)] = _camera(item)
+            if by_imu:
+                pose = _rigid(_IMU, item[_IMU])
+            elif place > 0:
+                pose = _rigid(_CHAIN, item[_CHAIN]) @ pose
+            poses[str(name)] = pose[:3, :3].copy(), pose[:3, 3].copy()
+            # Without an IMU there is nothing that it could be the shift to.
+            offsets[str(name)] = float(item.get(_SHIFT, 0.0)) if by_imu else 0.0
+        except KeyError as error:
+            raise ValueError(f"{name} has no {error}") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name}: {error}") from error
+    return RigParts(cameras, poses, offsets)
+
+
+def _camera(item: Any) -> Camera:
+    if not isinstance(item, dict):
+        raise ValueError(f"expected a mapping, found {item!r}")
+    shutter = {name: item[name] for name in _SHUTTER if name in item}
+    return replace(kalibr_camera(item), **shutter)
+
+
+def _matrix(rotation: Array, translation: Array) -> Array:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def _rigid(name: str, values: Any) -> Array:
+    matrix = np.array(values, float)
+    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
+        raise ValueError(f"{name} must be a finite 4x4 matrix, found {values!r}")
+    rotation = matrix[:3, :3]
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if off > _ORTHONORMAL or np.linalg.det(rotation) < 0.0 or np.any(matrix[3] != (0, 0, 0, 1)):
+        raise ValueError(f"{name} is no rigid transform: {matrix.tolist()}")
+    return matrix
+
+
+def _rig_config(tree: Any) -> dict[str, tuple[Array, Array]]:
+    if not isinstance(tree, list) or len(tree) != 1:
+        count = f"{len(tree)} rigs" if isinstance(tree, list) else f"{type(tree).__name__}"
+        raise ValueError(f"expected a list of one rig with cameras, found {count}")
+    poses = dict(_sensors(tree[0]["cameras"]))
+    if len(poses) != len(tree[0]["cameras"]):
+        raise ValueError("two cameras have the same last folder of image_prefix")
+    return poses
+
+
+def _sensors(cameras: Any) -> Iterator[tuple[str, tuple[Array, Array]]]:
+    references = [bool(item.get("ref_sensor")) for item in cameras]
+    if sum(references) != 1:
+        raise ValueError(f"one camera must be the ref_sensor, found {sum(references)}")
+    for item, reference in zip(cameras, references, strict=True):
+        name = str(item["image_prefix"]).strip("/").split("/")[-1]
+        if reference:
+            yield name, (np.eye(3), np.zeros(3))
+            continue
+        w, x, y, z = map(float, item["cam_from_rig_rotation"])
+        tx, ty, tz = map(float, item["cam_from_rig_translation"])
+        try:
+            pose = from_numbers((tx, ty, tz), (x, y, z, w))
+        except TransformError as error:
+            raise ValueError(f"{name}: {error}") from error
+        yield name, (pose.rotation, pose.translation)
+
+
+def shutters(cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    """Readout times and scan directions of cameras as parameters of the node."""
+    return {
+        f"{name}.{field}": value
+        for name, camera in cameras.items()
+        for field, value in zip(
+            _SHUTTER, (camera.readout_time, str(camera.scan_direction)), strict=True
+        )
+    }

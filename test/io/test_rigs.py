@@ -1,0 +1,203 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rigs in files of other programs: signs and order by hand, and what is written comes back."""
+
+import json
+
+import numpy as np
+import pytest
+
+from rs_localizer.core.camera import Camera
+from rs_localizer.io.calibration import CalibrationError, read_calibration
+from rs_localizer.io.rigs import (
+    RigParts,
+    read_camchain,
+    read_rig_config,
+    write_camchain,
+    write_rig_config,
+)
+
+# cam1 stands 0.2 m to the right of cam0 and looks to the right (its z is the x of cam0); cam2 hangs
+# 0.1 m below cam1, turned upside down.
+CHAIN = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.1, -0.2, 0.001, 0.002]
+  distortion_model: radtan
+  intrinsics: [500.0, 510.0, 320.5, 240.5]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.0, 0.0, -1.0, 0.0]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [1.0, 0.0, 0.0, -0.2]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: ds
+  distortion_coeffs: []
+  distortion_model: none
+  intrinsics: [-0.2, 0.59, 300.0, 301.0, 310.0, 230.0]
+  resolution: [640, 480]
+  readout_time: 0.02
+cam2:
+  T_cn_cnm1:
+  - [-1.0, 0.0, 0.0, 0.0]
+  - [0.0, -1.0, 0.0, 0.1]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: eucm
+  distortion_coeffs: []
+  distortion_model: none
+  intrinsics: [0.6, 1.1, 280.0, 281.0, 311.0, 231.0]
+  resolution: [640, 480]
+  readout_time: 0.03
+  scan_direction: bottom_to_top
+"""
+# The IMU stands 0.3 m behind cam0; stamps of cam1 are late by 4 ms.
+IMU = """  T_cam_imu:
+  - [1.0, 0.0, 0.0, 0.0]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, -0.3]
+  - [0.0, 0.0, 0.0, 1.0]
+  timeshift_cam_imu: {}
+"""
+
+
+def seen(parts, name, point):
+    rotation, translation = parts.camera_from_rig[name]
+    return rotation @ point + translation
+
+
+def test_transforms_of_a_camchain_lead_from_one_camera_to_the_next(tmp_path):
+    (tmp_path / "chain.yaml").write_text(CHAIN)
+    parts = read_camchain(tmp_path / "chain.yaml")
+    assert list(parts.cameras) == ["cam0", "cam1", "cam2"]
+    assert parts.time_offset == dict.fromkeys(parts.cameras, 0.0)
+    # 2 m ahead of cam0, 1.2 m to its right: 1 m ahead of cam1, and 2 m to its left.
+    point = np.array([1.2, 0.0, 2.0])
+    np.testing.assert_allclose(seen(parts, "cam0", point), point)
+    np.testing.assert_allclose(seen(parts, "cam1", point), [-2.0, 0.0, 1.0])
+    # For cam2, upside down and below, that is to the right and below: its y points up.
+    np.testing.assert_allclose(seen(parts, "cam2", point), [2.0, 0.1, 1.0])
+    first, second, third = parts.cameras.values()
+    assert (str(first.distortion_model), first.readout_time) == ("plumb_bob", 0.0)
+    assert (str(second.distortion_model), second.readout_time) == ("ds", 0.02)
+    np.testing.assert_allclose(second.D, [-0.2, 0.59])
+    np.testing.assert_allclose(third.D, [0.6, 1.1])
+    np.testing.assert_allclose(third.K, [[280, 0, 311], [0, 281, 231], [0, 0, 1]])
+    assert third.scan_direction == "bottom_to_top"
+    np.testing.assert_array_equal(read_calibration(f"{tmp_path}/chain.yaml#cam2").D, third.D)
+
+
+def test_with_an_imu_the_rig_has_its_axes_and_its_clock(tmp_path):
+    first, second = CHAIN.split("cam1:\n")[0], CHAIN.split("cam1:\n")[1].split("cam2:\n")[0]
+    text = first + IMU.format(0.001) + "cam1:\n" + second + IMU.format(-0.004)
+    (tmp_path / "chain.yaml").write_text(text)
+    parts = read_camchain(tmp_path / "chain.yaml")
+    # What the IMU has 1 m ahead, its camera has 0.7 m ahead.
+    np.testing.assert_allclose(seen(parts, "cam0", np.array([0.0, 0.0, 1.0])), [0, 0, 0.7])
+    # t_imu = t_cam + shift: of cam1, 4 ms earlier than its stamps say.
+    assert parts.time_offset == {"cam0": 0.001, "cam1": -0.004}
+
+
+def rig():
+    rng = np.random.default_rng(2)
+    cameras, poses = {}, {}
+    K = np.array([[400.0, 0.0, 320.0], [0.0, 402.0, 241.0], [0.0, 0.0, 1.0]])
+    lenses = {
+        "front": ("equidistant", [0.01, -0.02, 0.003, 0.0]),
+        "left": ("eucm", [0.6, 1.1]),
+        "rear": ("ds", [-0.2, 0.6]),
+        "right": ("plumb_bob", [0.1, 0.02, 1e-3, -1e-3]),
+        "up": ("plumb_bob", []),
+    }
+    for name, (model, D) in lenses.items():
+        cameras[name] = Camera(640, 480, K, D, model, 0.03, "left_to_right")
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        poses[name] = turn * np.linalg.det(turn), rng.normal(size=3)
+    return RigParts(cameras, poses, {"front": 0.001, "rear": -0.02})
+
+
+def test_a_written_camchain_comes_back(tmp_path):
+    given = rig()
+    write_camchain(tmp_path / "chain.yaml", given)
+    parts = read_camchain(tmp_path / "chain.yaml")
+    for name, camera in given.cameras.items():
+        read = parts.cameras[name]
+        for field in ("width", "height", "distortion_model", "readout_time", "scan_direction"):
+            assert getattr(read, field) == getattr(camera, field)
+        np.testing.assert_array_equal(read.K, camera.K)
+        np.testing.assert_array_equal(read.D, camera.D)
+        for a, b in zip(parts.camera_from_rig[name], given.camera_from_rig[name], strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert parts.time_offset[name] == given.time_offset.get(name, 0.0)
+    # Kalibr itself reads the chain, and not what stands beside it.
+    text = (tmp_path / "chain.yaml").read_text().replace("T_cam_imu", "other")
+    (tmp_path / "chain.yaml").write_text(text)
+    chained = read_camchain(tmp_path / "chain.yaml")
+    point = np.array([0.3, -0.2, 1.5])
+    rotation, translation = given.camera_from_rig["front"]
+    for name in given.cameras:
+        of_front = rotation @ point + translation
+        np.testing.assert_allclose(
+            seen(chained, name, of_front), seen(given, name, point), atol=1e-12
+        )
+
+
+def test_rig_config_of_colmap(tmp_path):
+    # COLMAP's quaternions begin with w: a quarter about y, as in its documentation.
+    half = 0.7071067811865476
+    second = {
+        "image_prefix": "rig1/camera2/",
+        "cam_from_rig_rotation": [half, 0.0, half, 0.0],
+        "cam_from_rig_translation": [0.1, 0.2, 0.3],
+    }
+    tree = [{"cameras": [{"image_prefix": "rig1/camera1/", "ref_sensor": True}, second]}]
+    (tmp_path / "rig_config.json").write_text(json.dumps(tree))
+    poses = read_rig_config(tmp_path / "rig_config.json")
+    np.testing.assert_array_equal(poses["camera1"][0], np.eye(3))
+    rotation, translation = poses["camera2"]
+    # By a quarter about y, z becomes x.
+    np.testing.assert_allclose(rotation @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    np.testing.assert_array_equal(translation, [0.1, 0.2, 0.3])
+
+
+def test_a_written_rig_config_comes_back_relative_to_its_first_camera(tmp_path):
+    given = rig()
+    names = ("right", "front")
+    parts = RigParts({name: given.cameras[name] for name in names}, given.camera_from_rig, {})
+    write_rig_config(tmp_path / "rig_config.json", parts)
+    poses = read_rig_config(tmp_path / "rig_config.json")
+    point = np.array([0.4, 0.1, -2.0])
+    rotation, translation = poses["front"]
+    moved = rotation @ seen(given, "right", point) + translation
+    np.testing.assert_allclose(moved, seen(given, "front", point), atol=1e-12)
+    entry = json.loads((tmp_path / "rig_config.json").read_text())[0]["cameras"][0]
+    assert entry["ref_sensor"] is True
+    assert entry["camera_model_name"] == "OPENCV"
+    np.testing.assert_allclose(entry["camera_params"][:4], [400, 402, 320.5, 241.5])
+    other = given._replace(cameras={"left": given.cameras["left"]})
+    with pytest.raises(ValueError, match="COLMAP has no lens eucm"):
+        write_rig_config(tmp_path / "x.json", other)
+
+
+@pytest.mark.parametrize(
+    ("text", "reader", "expected"),
+    [
+        (CHAIN.replace("T_cn_cnm1", "T"), read_camchain, "no usable rig: cam1 has no 'T_cn_cnm1'"),
+        (CHAIN.replace("-0.2]", "-0.2, 1.0]"), read_camchain, "cam1: .*"),
+        (CHAIN.replace("[0.0, 1.0, 0.0, 0.0]", "[0.0, -1.0, 0.0, 0.0]"), read_camchain,
+         "cam1: T_cn_cnm1 is no rigid transform"),
+        (CHAIN.replace("-0.2, 0.59", "-2.0, 0.59"), read_camchain, "cam1: D of ds must lie within"),
+        (CHAIN.replace("camera_model: ds", "camera_model: omni"), read_camchain,
+         "cam1: camera_model must be pinhole, eucm or ds, found 'omni'"),
+        ("[1, 2]", read_camchain, "a camchain has a mapping for each camera"),
+        ("[]", read_rig_config, "expected a list of one rig with cameras, found 0 rigs"),
+        ('[{"cameras": [{"image_prefix": "a/"}]}]', read_rig_config, "the ref_sensor, found 0"),
+        ('[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}, {"image_prefix": "b/"}]}]',
+         read_rig_config, "no 'cam_from_rig_rotation'"),
+    ],
+)  # fmt: skip
+def test_faults_are_named(tmp_path, text, reader, expected):
+    (tmp_path / "rig").write_text(text)
+    with pytest.raises(CalibrationError, match=expected):
+        reader(tmp_path / "rig")

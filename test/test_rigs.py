@@ -1,0 +1,203 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses of rigs, against the independent simulator, which shares no line with the estimator."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+import rs_localizer as rsl
+from benchmarks.independent.cameras import Camera as TrueCamera
+from benchmarks.independent.cameras import Scan
+from benchmarks.independent.motions import hand, steady
+from benchmarks.independent.rigs import Mounted, middle_of, views
+from benchmarks.independent.rotations import exponential, logarithm
+from rs_localizer.core.types import Estimate
+from rs_localizer.inertial.settings import InertialSettings
+
+UPRIGHT, TURNED = np.eye(3), np.diag([-1.0, -1.0, 1.0])
+ASKEW = exponential(np.array([0.2, -2.5, 0.4]))
+BESIDE = np.array([-0.1, 0.02, 0.03])
+TRUE = TrueCamera()
+
+
+def pair(rotation=TURNED, translation=BESIDE, start=0.0, **camera):
+    """Two cameras, the second of which is turned and begins later."""
+    return {
+        "one": Mounted(TRUE, UPRIGHT, np.zeros(3)),
+        "other": Mounted(replace(TRUE, **camera), rotation, translation, start),
+    }
+
+
+def rig_of(mounted, **more):
+    cameras = {
+        name: rsl.Camera(
+            each.camera.width, each.camera.height, each.camera.matrix, each.camera.distortion,
+            readout_time=each.camera.readout_time, scan_direction=str(each.camera.scan),
+        )
+        for name, each in mounted.items()
+    }  # fmt: skip
+    places = {name: (each.rotation, each.translation) for name, each in mounted.items()}
+    return rsl.Rig(cameras, places, **more)
+
+
+def frames(mounted, make, count, points=40, noise=0.0, wall=False, seed=0, outliers=0.0):
+    """Frames of {name: (points, pixels)}, and motions with the times at which these begin."""
+    rng = np.random.default_rng(seed)
+    motions, begin = make(count, rng), np.zeros(count)
+    seen = views(mounted, motions, begin, points, wall, rng)
+    made = []
+    for frame in range(count):
+        parts = {}
+        for name, view in seen.items():
+            shown = view.visible[frame]
+            pixels = view.exact[frame, shown]
+            pixels = pixels + noise * rng.normal(size=pixels.shape)
+            wrong = rng.uniform(size=len(pixels)) < outliers
+            pixels[wrong] = rng.uniform([0, 0], [640, 480], (wrong.sum(), 2))
+            parts[name] = view.points[frame, shown], pixels
+        made.append(parts)
+    return made, motions
+
+
+def fast(count, rng):
+    return steady(count, rng, 1.5, 0.8)
+
+
+def faster(count, rng):
+    return steady(count, rng, 3.0, 2.0)
+
+
+def stamps_of(mounted):
+    return {name: 100.0 + each.start for name, each in mounted.items()}
+
+
+def errors(result, motions, frame, time):
+    """rad, m, rad/s and m/s."""
+    states = motions.states(np.array([frame]), np.array([time]))
+    turn = logarithm(result.rotation @ states.rotation[0])
+    return np.array([
+        np.linalg.norm(turn), np.linalg.norm(result.position - states.position[0]),
+        np.linalg.norm(result.angular_velocity / result.span - states.angular[0]),
+        np.linalg.norm(result.linear_velocity / result.span - states.linear[0]),
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("scan", Scan)
+def test_exact_points_of_askew_cameras_give_the_motion(scan):
+    """Any mounting, scan direction, readout and delay; the wrong sign of a lever arm does not."""
+    mounted = pair(ASKEW, BESIDE, 0.012, scan=scan, readout_time=0.02)
+    made, motions = frames(mounted, fast, 3)
+    rig, stamps = rig_of(mounted), stamps_of(mounted)
+    for frame, parts in enumerate(made):
+        result = rsl.Localizer(rig).localize(parts, stamps=stamps)
+        assert result, result
+        assert result.span == pytest.approx(0.032)
+        assert result.time == pytest.approx(100.0 + middle_of(mounted))
+        off = errors(result, motions, frame, middle_of(mounted))
+        assert np.all(off < [1e-4, 3e-4, 2e-2, 2e-2]), off
+        assert all(result.inliers[name].all() for name in parts)
+        # Also at other times than the middle one.
+        rotation, translation = result.at_time(100.0)
+        state = motions.states(np.array([frame]), np.zeros(1))
+        np.testing.assert_allclose(-rotation.T @ translation, state.position[0], atol=1e-3)
+        si = rsl.camera_state(result, rig)
+        np.testing.assert_allclose(si.angular_velocity * result.span, result.angular_velocity)
+    wrong = rig_of(pair(ASKEW, -BESIDE, 0.012, scan=scan, readout_time=0.02))
+    result = rsl.Localizer(wrong).localize(made[0], stamps=stamps)
+    assert not result or errors(result, motions, 0, middle_of(mounted))[1] > 0.01
+
+
+def test_a_camera_alone_is_a_rig_of_one():
+    """The same bytes, with and without outliers, scores, and before a wall."""
+    alone = {"one": Mounted(TRUE, UPRIGHT, np.zeros(3))}
+    rig = rig_of(alone)
+    camera = rig.cameras["one"]
+    for wall in (False, True):
+        made, _ = frames(alone, hand, 4, 80, 0.7, wall, outliers=0.3)
+        for parts in made:
+            points, pixels = parts["one"]
+            scores = np.arange(len(points), dtype=float)
+            plain = rsl.Localizer(camera).localize(points, pixels, scores)
+            result = rsl.Localizer(rig).localize({"one": (points, pixels, scores)})
+            assert bool(plain) == bool(result)
+            for each in fields(Estimate) if plain else ():
+                expected, got = getattr(plain, each.name), getattr(result, each.name)
+                if isinstance(expected, np.ndarray):
+                    assert np.asarray(got).tobytes() == expected.tobytes(), each.name
+
+
+def test_opposed_shutters_know_the_motion_before_a_wall():
+    """A single image of a plane does not determine it; nor do two that are mounted alike."""
+    off = {}
+    for name, rotation in (("opposed", TURNED), ("alike", UPRIGHT)):
+        mounted = pair(rotation)
+        made, motions = frames(mounted, faster, 12, 76, 1.0, wall=True, seed=3)
+        localizer = rsl.Localizer(rig_of(mounted))
+        results = [localizer.localize(parts) for parts in made]
+        off[name] = np.array([
+            errors(result, motions, frame, middle_of(mounted))
+            for frame, result in enumerate(results) if result
+        ])  # fmt: skip
+        if name == "opposed":
+            assert all(results), [str(result) for result in results if not result]
+    middle = np.median(off["opposed"], axis=0)
+    # The bound of 152 points at 1 px, without a prior: 0.09 deg, 4.3 mm, 9.7 deg/s, 0.48 m/s.
+    assert np.all(middle < [np.radians(0.12), 6e-3, np.radians(13.0), 0.65]), middle
+    assert np.all(np.median(off["alike"], axis=0)[:2] > 4.0 * middle[:2])
+
+
+def test_what_a_localizer_of_a_rig_takes():
+    mounted = pair()
+    localizer = rsl.Localizer(rig_of(mounted))
+    (parts,), _ = frames(mounted, hand, 1)
+    with pytest.raises(ValueError, match="one, other"):
+        localizer.localize(*parts["one"])
+    with pytest.raises(ValueError, match="no camera 'third'"):
+        localizer.localize({"third": parts["one"]})
+    with pytest.raises(ValueError, match="no image"):
+        localizer.localize({})
+    with pytest.raises(ValueError, match="other: points must be"):
+        localizer.localize({**parts, "other": (np.zeros((3, 2)), np.zeros((3, 2)))})
+    with pytest.raises(ValueError, match="several cameras: one, other"):
+        _ = localizer.camera
+    with pytest.raises(ValueError, match="Rig"):
+        rsl.Localizer(localizer.rig.cameras["one"]).localize(parts)
+    # A camera that is late or dead is left out.
+    alone = localizer.localize({"other": parts["other"]}, stamps={"other": 5.0})
+    assert alone, alone
+    assert alone.names == ("other",)
+    assert alone.span == TRUE.readout_time
+
+
+def test_tracking_carries_a_rig_from_frame_to_frame():
+    """Frames whose cameras are now in step and now not, so that velocities are per other spans; the
+    motion of one predicts the next, and before a wall makes it better.
+    """
+    rng = np.random.default_rng(5)
+    motions = fast(1, rng)
+    alone, tracked = [], []
+    rig = rig_of(pair(UPRIGHT))
+    localizer = rsl.Localizer(rig)
+    tracker = rsl.Tracker(localizer)
+    for frame in range(12):
+        mounted = pair(UPRIGHT, start=0.01 * (frame % 3))
+        begin = frame / 30.0
+        seen = views(mounted, motions, np.array([begin]), 40, True, rng)
+        parts = {
+            name: (view.points[0], view.exact[0] + 0.5 * rng.normal(size=view.exact[0].shape))
+            for name, view in seen.items()
+        }
+        stamps = {name: each.start for name, each in mounted.items()}
+        single = localizer.localize(parts, stamps=stamps)
+        result = tracker.localize(round(1e9 * begin) + 10**12, parts, stamps=stamps)
+        assert result, result
+        assert result.time == pytest.approx(middle_of(mounted))
+        for each, found in ((single, alone), (result, tracked)):
+            if each and frame > 2:
+                found.append(errors(each, motions, 0, begin + middle_of(mounted)))
+        assert result.tracked == (frame > 0)
+    assert np.all(np.mean(tracked, axis=0)[:2] < 0.7 * np.mean(alone, axis=0)[:2])
+    with pytest.raises(ValueError, match="several cameras"):
+        rsl.Tracker(localizer, InertialSettings(1e-3, 1e-4, False))
