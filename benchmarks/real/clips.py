@@ -28,6 +28,7 @@ INDEX = "index.csv"
 _PHONE = 0.015
 # Images that OpenCV's calibration takes, evenly: more only take time.
 _CALIBRATION_IMAGES = 50
+_FEWEST = 20  # images that two halves of the bootstrap's blocks need
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +53,17 @@ def clips_of(folder: Path, cache: Path, most: int, only: list[str]) -> list[Clip
     cache.mkdir(parents=True, exist_ok=True)
     with (folder / INDEX).open(encoding="utf-8") as file:
         rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    found = []
+    clips = []
     for name, corners, square in rows:
         if only and Path(name).stem not in only:
             continue
         columns, lines = (int(word) for word in corners.split("x"))
-        found.append(_clip(folder / name, Chessboard(columns, lines, float(square)), cache, most))
-    return found
+        clip = _clip(folder / name, Chessboard(columns, lines, float(square)), cache, most)
+        if len(clip.images) < _FEWEST:
+            print(f"{name}: {len(clip.images)} images show a board of {corners} corners: left out")
+        else:
+            clips.append(clip)
+    return clips
 
 
 def _clip(path: Path, board: Chessboard, cache: Path, most: int) -> Clip:
