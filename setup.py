@@ -83,6 +83,7 @@ setup(
         # There is no wheel for 3.13, and a build needs Rust.
         "video": ["telemetry-parser; python_version < '3.13'"],
         "view": ["rerun-sdk"],
+        "zarr": ["fsspec", "pyarrow", "zarr>=3"],
         "test": [
             "build",
             "catkin_pkg",

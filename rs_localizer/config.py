@@ -282,6 +282,15 @@ class OrientationCovariance(StrEnum):
     ROLL_PITCH_YAW = "roll_pitch_yaw"
 
 
+class ShutterDepth(StrEnum):
+    """By which depth the shutter is taken out of images."""
+
+    NONE = "none"  # there are no such images
+    FAR = "far"
+    PLANE = "plane"
+    MAP = "map"
+
+
 class Px4Odometry(StrEnum):
     """Axes of the world in which PX4 gets its external vision, if it does."""
 
@@ -472,6 +481,14 @@ class NodeConfig(LocalizerConfig):
         "External vision of PX4 on ~/vehicle_odometry; frd: the map has z up; ned: it has x east, "
         "y north, z up; needs px4_msgs and base_frame",
         choices=tuple(choice.value for choice in Px4Odometry),
+        fixed=True,
+    )
+    image_rect_shutter: str = setting(
+        ShutterDepth.NONE.value,
+        "Images as a global shutter would have taken them on ~/image_rect_shutter, from image or "
+        "image/compressed; far: the turn is undone; plane: by the plane of the frame's inliers; "
+        "map: by what lies between them",
+        choices=tuple(choice.value for choice in ShutterDepth),
         fixed=True,
     )
     transform_tolerance: float = setting(

@@ -25,7 +25,16 @@ from rs_localizer.cli.batch import (
     run_batch,
 )
 from rs_localizer.cli.calibrate_imu import imu_lines, imu_parameters
-from rs_localizer.cli.image_input import clock_of, of_bag, of_files, tell_times
+from rs_localizer.cli.image_input import (
+    add_telemetry,
+    clock_of,
+    of_bag,
+    of_files,
+    telemetry_of,
+    tell_telemetry,
+    tell_times,
+    video_imu,
+)
 from rs_localizer.cli.marker_map import add_board_arguments, find_map
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
 from rs_localizer.config import DetectorConfig, NodeConfig
@@ -88,8 +97,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         const="",
         metavar="TOPIC",
         help="find how the IMU of a bag goes with the camera: offset of its stamps, rotation, bias "
-        "(default: the only topic of its type)",
+        "(default: the only topic of its type); of a video, that inside it or in a log beside it",
     )
+    add_telemetry(parser)
     parser.add_argument(
         "--rate", type=above, metavar="HZ", help="images per second of a video or of files"
     )
@@ -160,6 +170,10 @@ def calibrate_one(args: argparse.Namespace) -> Calibration:
             own_stamps=source.own_stamps, done=bar.update,
         )  # fmt: skip
     _tell(found, args.rate)
+    tell_telemetry(
+        argparse.Namespace(images=args.recording, no_telemetry=args.no_telemetry),
+        verdict.readout_time(found),
+    )
     if intrinsics:
         _tell_lens(found)
     for line in imu_lines(found, source.imu, config):
@@ -200,14 +214,13 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
     if not path.exists():
         raise ValueError(f"{path} does not exist")
     if not is_bag(path):
-        if args.imu is not None:
-            raise UsageError("--imu is for bags: a video or files have no IMU")
+        imu = _imu_of_video(args, path)
         known = args.calibration is not None
         camera = read_calibration(args.calibration) if known else _unknown((2, 2))
         source = of_files(path, camera, clock_of(path, args.rate))
         found = _detected(args, source.shots)
         tell_times(source.clock)
-        return replace(found, own_stamps=path.is_dir() and args.rate is None)
+        return replace(found, own_stamps=path.is_dir() and args.rate is None, imu=imu)
     with open_bag(path) as bag:
         imu = None
         if args.imu is not None:
@@ -216,6 +229,19 @@ def _read(args: argparse.Namespace, config: NodeConfig) -> _Source:
             return replace(_correspondences(args, bag, config), imu=imu)
         given = None if args.calibration is None else read_calibration(args.calibration)
         return replace(_detected(args, of_bag(bag, given, args).shots), imu=imu)
+
+
+def _imu_of_video(args: argparse.Namespace, path: Path) -> ImuRecording | None:
+    """What went along with a video, if it is asked for."""
+    if args.imu is None:
+        return None
+    telemetry = telemetry_of(path, args)
+    if args.imu or telemetry is None or args.rate is not None:
+        raise UsageError(
+            "--imu TOPIC is for bags, and --imu for videos with a gyroscope of their own clock "
+            "(without --rate): this one has none that is known"
+        )
+    return video_imu(telemetry)
 
 
 def _correspondences(args: argparse.Namespace, bag: BagReader, config: NodeConfig) -> _Source:

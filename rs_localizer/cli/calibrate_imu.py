@@ -14,6 +14,8 @@ from rs_localizer.trajectory.imu import ImuRecording, MountFound
 
 # A rotation that TF has otherwise by more than this (degrees), and more than chance, is doubted.
 _MOST_TURN, _SIGMAS = 1.0, 4.0
+# Who says how the IMU hangs on the camera.
+_GIVEN = "TF, or the axes of a video,"
 # A scale of the gyroscope that is worth a word.
 _LEAST_SCALE = 0.005
 
@@ -73,9 +75,9 @@ def _remarks(found: MountFound, imu: ImuRecording) -> list[str]:
         off = np.degrees(found.turned_from(imu.camera_from_imu))
         error = float(np.degrees(np.linalg.norm(found.rotation_deviations)))
         if off > max(_MOST_TURN, _SIGMAS * error):
-            said.append(f"imu: TF has another rotation, {off:.1f} deg off: is it right?")
+            said.append(f"imu: {_GIVEN} has another rotation, {off:.1f} deg off: is it right?")
         else:
-            said.append(f"imu: TF agrees with the rotation to {off:.2f} deg")
+            said.append(f"imu: {_GIVEN} agrees with the rotation to {off:.2f} deg")
     scales, errors = found.mount.shape[:3], found.shape_deviations[:3]
     if np.any(np.abs(scales) > np.maximum(_LEAST_SCALE, _SIGMAS * errors)):
         percent = " ".join(f"{100.0 * scale:+.1f}" for scale in scales)

@@ -80,8 +80,11 @@ def run(args: argparse.Namespace) -> Figures | None:
     if not is_batch(args):
         alone = argparse.Namespace(**vars(args), images=args.recordings[0])
         if args.features is None:
-            return _figures(detect_one(alone))
-        _detect_features(alone)
+            recorded = detect_one(alone)
+            tell_next(alone)
+            return _figures(recorded)
+        detect_features(alone)
+        tell_next(alone, " --map MAP")
         return None
     if args.features is not None:
         raise UsageError("--features takes one recording")
@@ -106,7 +109,6 @@ def detect_one(args: argparse.Namespace) -> Recorded:
     _tell(args, recorded, notices)
     for fault in (*recorded.faults, *time_faults(args, source.clock, recorded.period)):
         print(f"warning: {fault}")
-    tell_next(args)
     if args.timing:
         _tell_times(recorded.images, *detector.seconds)
     return recorded
@@ -155,7 +157,7 @@ def _options(args: argparse.Namespace) -> Options:
 
 
 def _add_feature_arguments(parser: argparse._ActionsContainer) -> None:
-    """For :func:`_detect_features`."""
+    """For :func:`detect_features`."""
     parser.add_argument(
         "--features",
         choices=[kind.value for kind in FeatureKind],
@@ -170,7 +172,7 @@ def _add_feature_arguments(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def _detect_features(args: argparse.Namespace) -> None:
+def detect_features(args: argparse.Namespace) -> None:
     """Find the keypoints of all images."""
     for name in _OF_MARKERS:
         if getattr(args, name) is not None:
@@ -190,7 +192,6 @@ def _detect_features(args: argparse.Namespace) -> None:
     _tell_features(args, extraction)
     for fault in time_faults(args, source.clock, extraction.period):
         print(f"warning: {fault}")
-    tell_next(args, " --map MAP")
     if args.timing:
         milliseconds = 1e3 * extractor.seconds / len(extraction.stamps_ns)
         print(f"time per image: {milliseconds:.1f} ms, {1e3 / milliseconds:.0f} images/s")

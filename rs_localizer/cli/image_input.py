@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rs_localizer.cli import UsageError
 from rs_localizer.cli.settings_args import add_settings, given_values
 from rs_localizer.core.camera import Camera
@@ -20,6 +22,7 @@ from rs_localizer.core.scanning import ScanDirection
 from rs_localizer.io.bags import BagReader, is_bag, open_bag
 from rs_localizer.io.calibration import CALIBRATION_KINDS, read_calibration
 from rs_localizer.io.image_clock import DEFAULT_START_NS, ImageClock, readout_fault
+from rs_localizer.io.phone_logs import read_log
 from rs_localizer.io.recording import PARAMETERS
 from rs_localizer.io.telemetry import Telemetry, has_telemetry, read_telemetry
 from rs_localizer.io.video import has_times
@@ -38,6 +41,7 @@ from rs_localizer.offline.image_sources import (
 )
 from rs_localizer.process.arguments import number
 from rs_localizer.settings import build, settings, write_parameters
+from rs_localizer.trajectory.imu import ImuRecording
 
 # Readout times that differ by less are called the same: what a file says counts rows its own way.
 _SAME_READOUT = 0.05
@@ -57,11 +61,7 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
         f"as of calibrate; they go to {PARAMETERS} beside the data, for replay --params (default: "
         f"those in {PARAMETERS} of the bag)",
     )
-    camera.add_argument(
-        "--no-telemetry",
-        action="store_true",
-        help="ignore the gyroscope and the readout time inside a video",
-    )
+    add_telemetry(camera)
     longest = settings()["readout_time"].maximum or 0.0
     camera.add_argument(
         "--readout-time",
@@ -112,33 +112,54 @@ def shutter_values(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def telemetry_of(path: Path, args: argparse.Namespace) -> Telemetry | None:
-    """What a video says of its camera; None: nothing, or it is not to be used.
+    """What a video, or a log of a phone beside it, says of its camera; None: nothing, or it is not
+    to be used.
 
     Raises:
         ValueError: for telemetry that cannot be read.
     """
-    if getattr(args, "no_telemetry", True) or not _may_tell(path):
-        return None
-    if importlib.util.find_spec("telemetry_parser") is None:
-        return None
-    found = read_telemetry(path)
+    found = None if getattr(args, "no_telemetry", True) else _telemetry(path)
     return None if found is None or found.stabilizer else found
 
 
-def _may_tell(path: Path) -> bool:
-    return path.is_file() and not is_bag(path) and has_telemetry(path)
+def _telemetry(path: Path) -> Telemetry | None:
+    if not path.is_file() or is_bag(path):
+        return None
+    if has_telemetry(path) and importlib.util.find_spec("telemetry_parser") is not None:
+        return read_telemetry(path)
+    return read_log(path)
 
 
-def tell_telemetry(args: argparse.Namespace) -> None:
-    """Say what a video knows of its camera, and what is not used of it."""
+def video_imu(telemetry: Telemetry, start_ns: int = DEFAULT_START_NS) -> ImuRecording:
+    """The readings of a video whose first image has this stamp."""
+    stamps = start_ns + np.round(1e9 * telemetry.times).astype(np.int64)
+    return ImuRecording(stamps, telemetry.rates, np.eye(3), telemetry.forces)
+
+
+def add_telemetry(parser: argparse._ActionsContainer) -> None:
+    """For :func:`telemetry_of`."""
+    parser.add_argument(
+        "--no-telemetry",
+        action="store_true",
+        help="ignore the gyroscope and the readout time inside a video, or in a log beside it",
+    )
+
+
+def tell_telemetry(args: argparse.Namespace, used: float | None = None) -> None:
+    """Say what a video knows of its camera, and what is not used of it.
+
+    Args:
+        args: with ``images`` and ``no_telemetry``.
+        used: the readout time that was measured, s; None: that of the settings is used.
+    """
     path = args.images
-    if args.no_telemetry or not _may_tell(path):
+    if args.no_telemetry:
         return
-    if importlib.util.find_spec("telemetry_parser") is None:
-        print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
-        return
-    found = read_telemetry(path)
+    found = _telemetry(path)
     if found is None:
+        missing = importlib.util.find_spec("telemetry_parser") is None
+        if missing and path.is_file() and not is_bag(path) and has_telemetry(path):
+            print("note: the video has a gyroscope; to use it: pip install 'rs_localizer[video]'")
         return
     if found.stabilizer:
         print(
@@ -150,11 +171,14 @@ def tell_telemetry(args: argparse.Namespace) -> None:
     said = [f"gyroscope at {found.rate:.0f} Hz"]
     if found.readout_time is not None:
         said.append(f"readout time {1e3 * found.readout_time:.2f} ms")
-        used = build(shutter_values(args)).readout_time
+        how = "given" if used is None else "measured"
+        used = build(shutter_values(args)).readout_time if used is None else used
         if abs(used / found.readout_time - 1.0) > _SAME_READOUT:
-            said[-1] += f" (not used: {1e3 * used:.2f} ms was given)"
+            said[-1] += f" (not used: {1e3 * used:.2f} ms was {how})"
     if found.exposure is not None:
         said.append(f"exposure {1e3 * found.exposure:.2f} ms (median)")
+    if found.lens:
+        said.append(found.lens)
     print(f"{found.camera}: {', '.join(said)}; --no-telemetry ignores them")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
@@ -19,12 +20,12 @@ from rs_localizer.core.arrays import Array
 from rs_localizer.core.shutter import Motion
 from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.camera_info import read_camera_info
-from rs_localizer.io.images import Image
+from rs_localizer.io.images import Image, in_color
 from rs_localizer.io.maps.files import read_map_file
 from rs_localizer.io.trajectories import Trajectory, read_tum
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.offline.fleet.task import Figures
-from rs_localizer.offline.image_sources import Carried
+from rs_localizer.offline.image_sources import Carried, Shot
 from rs_localizer.offline.rectified import (
     Depths,
     map_depths,
@@ -94,7 +95,7 @@ def run(args: argparse.Namespace) -> Figures:
             camera = read_camera_info(shot.camera_info).camera(
                 config.readout_time, config.scan_direction
             )
-            image, known = rectified(camera, _pixels(shot.compressed, shot.image), motion, depths)
+            image, known = rectified(camera, _pixels(shot), motion, depths)
             name = f"{shot.image.stamp_ns}.png"
             (out / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
             shares[name] = float(known.mean())
@@ -142,10 +143,7 @@ def _poses(trajectory: Trajectory) -> Sequence[tuple[Array, Array]]:
     return list(zip(rotations, trajectory.positions, strict=True))
 
 
-def _pixels(compressed: object, image: Image) -> np.ndarray:
+def _pixels(shot: Shot) -> NDArray[np.uint8]:
     """In colour, where the image has any."""
-    data = getattr(compressed, "data", None)
-    if data is None:
-        return image.pixels
-    found = cv2.imdecode(np.frombuffer(bytes(data), np.uint8), cv2.IMREAD_UNCHANGED)
-    return image.pixels if found is None or found.dtype != np.uint8 else found
+    assert isinstance(shot.image, Image)
+    return shot.image.pixels if shot.compressed is None else in_color(shot.compressed, shot.image)

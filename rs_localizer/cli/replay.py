@@ -10,15 +10,18 @@ import importlib.util
 import json
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, NoReturn
 
+import numpy as np
 from tqdm import tqdm
 
-from rs_localizer.cli import UsageError, import_ros
+from rs_localizer.cli import UsageError, detect, import_ros
 from rs_localizer.cli.batch import Plan, add_batch_arguments, inputs, is_batch, run_batch
+from rs_localizer.cli.image_input import add_telemetry
 from rs_localizer.cli.replay_result import (
     BRIDGED,
     POSES,
@@ -35,12 +38,16 @@ from rs_localizer.cli.replay_result import (
     write_frame,
 )
 from rs_localizer.cli.settings_args import add_settings, add_topics, given_settings, given_topics
-from rs_localizer.config import ImuUse, NodeConfig
+from rs_localizer.config import FeatureKind, ImuUse, NodeConfig
 from rs_localizer.io.bags import STORAGES, BagError, BagReader, BagWriter, is_bag, open_bag
+from rs_localizer.io.maps.files import read_map_file
+from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import stamp_ns
 from rs_localizer.io.outputs import Localized
+from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.remote import Location, is_url, location, url_name
 from rs_localizer.io.topics import IMU
+from rs_localizer.markers.formats.files import is_marker_file
 from rs_localizer.offline.fleet.task import Figures, Kind
 from rs_localizer.offline.image_sources import INFO_TYPE, holds_images, image_topics
 from rs_localizer.offline.replay import (
@@ -56,13 +63,23 @@ from rs_localizer.offline.replay import (
     tf_topics,
 )
 from rs_localizer.offline.smoothed import smooth_frames
-from rs_localizer.offline.table import FrameTable, read_parquet, schema, write_parquet
+from rs_localizer.offline.table import (
+    FrameTable,
+    read_parquet,
+    schema,
+    write_parquet,
+    write_zarr,
+)
 from rs_localizer.offline.viewing.stream import check_screen, write_view
 from rs_localizer.pipeline.frames import FrameLocalizer
 from rs_localizer.settings import NODE_NAME
 from rs_localizer.trajectory.warm_up import warm_up
 
+if TYPE_CHECKING:  # an extra
+    from pyarrow import Table
+
 _SUFFIX = ".rrd"
+_ORB_BYTES = 32  # of a descriptor; AKAZE's has 61
 # The table of one recording of many, in its folder.
 TABLE = "frames.parquet"
 # Known by being this very object: a user's view.rrd is in the current directory, as any other name.
@@ -76,7 +93,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="RECORDING",
         help="rosbag2 (MCAP, sqlite3) or ROS 1 bag, or its URL (s3://, gs://, ...; needs "
-        "'rs_localizer[table]'); several: see many recordings",
+        "'rs_localizer[table]'); with --map, a video, a folder or a bag of images; several: see "
+        "many recordings",
     )
     topics = parser.add_argument_group("topics of the recording (default: found by name and type)")
     add_topics(topics)
@@ -99,8 +117,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--map",
         type=location,
         metavar="FILE",
-        help="the map of the keypoints: as -p map_file:=FILE",
+        help="the map of the keypoints: as -p map_file:=FILE; of images, also markers or the "
+        "result of map build, which brings the lens and the shutter",
     )
+    offline.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="of images: the lens, as for detect"
+    )
+    add_telemetry(offline)
     offline.add_argument(
         "--smooth",
         action="store_true",
@@ -163,29 +186,98 @@ def _name(recording: Location) -> str:
 
 
 def _refuse_images(recording: Location) -> None:
-    if is_url(recording):
-        return
-    recording = Path(recording)
-    if not is_bag(recording) and (pictures := holds_images(recording)):
+    if pictures := _pictures(recording):
         raise ValueError(f"{recording} {pictures}, not matches: first {_detect_command(recording)}")
+
+
+def _pictures(recording: Location) -> str:
+    """What a recording holds instead of matches, as ``is a video``; empty: nothing of the kind."""
+    if is_url(recording):
+        return ""
+    recording = Path(recording)
+    if not is_bag(recording):
+        return holds_images(recording)
+    with open_bag(recording) as bag:
+        return "holds images" if image_topics(bag) and not has_frames(bag) else ""
 
 
 def _replay_one(
     args: argparse.Namespace, recording: Location, out: Path, timed: bool = True
 ) -> Tally:
     """Replay a recording into ``out``, and say what came of it (``timed``: how fast, too)."""
-    _refuse_images(recording)
+    if args.map is None or not _pictures(recording):
+        _refuse_images(recording)
+        return _replay_matches(args, recording, recording, out, timed)
+    with TemporaryDirectory() as place:
+        matches = Path(place) / "matches"
+        parser = argparse.ArgumentParser()
+        detect.add_arguments(parser)
+        of_images = parser.parse_args(_detection(args, Path(recording), matches))
+        of_images.images = Path(recording)
+        by_markers = of_images.features is None
+        (detect.detect_one if by_markers else detect.detect_features)(of_images)
+        # What was given is in the file beside the matches now, with what the video says.
+        own = matches / PARAMETERS
+        alone = argparse.Namespace(**vars(args))
+        alone.params, alone.assignments = own if own.exists() else None, []
+        alone.map = None if by_markers else _map_file(Path(args.map))
+        return _replay_matches(alone, matches, recording, out, timed)
+
+
+def _map_file(place: Path) -> Path:
+    """The landmarks of the result of map build, or of a file."""
+    return place / MAP if (place / MAP).is_file() else place
+
+
+def _detection(args: argparse.Namespace, recording: Path, out: Path) -> list[str]:
+    """The arguments of detect that find the matches of images."""
+    if is_url(args.map):
+        raise ValueError(f"the map of images has to be a file of this machine, got {args.map}")
+    place = Path(args.map)
+    if is_marker_file(place):
+        words = ["--map", str(place)]
+    else:
+        words = ["--features", _features_of(read_map_file(_map_file(place), MAP_FRAME))]
+    calibration, params = args.calibration, args.params
+    built = place / MAP
+    if built.is_file():  # a result of map build
+        params = params or place / PARAMETERS
+        lens = place / CAMERA
+        calibration = calibration or (lens if lens.is_file() and not is_bag(recording) else None)
+    for name, value in (("--calibration", calibration), ("--params", params)):
+        words += [] if value is None else [name, str(value)]
+    words += [word for item in args.assignments for word in ("-p", item)]
+    words += ["--no-telemetry"] if args.no_telemetry else []
+    exported = (args.nerfstudio, args.gsplat, args.ncore, args.rerun, args.view)
+    words += ["--images"] if any(exported) else []
+    return [str(recording), *words, "--out", str(out)]
+
+
+def _features_of(landmarks: Map) -> str:
+    """The kind of the descriptors of a map.
+
+    Raises:
+        ValueError: when it has none.
+    """
+    if landmarks.descriptors is None:
+        raise ValueError("the map has no descriptors: keypoints of images cannot be matched to it")
+    if landmarks.descriptors.dtype == np.float32:
+        return FeatureKind.SIFT.value
+    orb = landmarks.descriptors.shape[1] == _ORB_BYTES
+    return (FeatureKind.ORB if orb else FeatureKind.AKAZE).value
+
+
+def _replay_matches(
+    args: argparse.Namespace, path: Location, recording: Location, out: Path, timed: bool
+) -> Tally:
+    """Replay the bag ``path``, whose images or matches are those of ``recording``."""
     config = _replayed(args)
     notices: dict[str, tuple[int, str]] = {}
 
     def notice(name: str, text: str) -> None:
         notices[name] = notices.get(name, (0, ""))[0] + 1, text
 
-    with open_bag(recording) as bag:
-        if image_topics(bag) and not has_frames(bag):
-            raise ValueError(
-                f"{recording} holds images, not matches: first {_detect_command(recording)}"
-            )
+    with open_bag(path) as bag:
         topics, localizer = prepare(bag, config, given_topics(args), notice)
         unused = IMU not in topics.of and config.imu.use != ImuUse.NONE
         if unused and (several := imu_topics(bag)):
@@ -193,26 +285,37 @@ def _replay_one(
         if args.smooth and config.readout_time == 0.0:
             raise ValueError("--smooth needs the readout time: -p readout_time:=SECONDS")
         localizer.warm_up()
-        table = None if args.parquet is None else FrameTable(recording)
+        wanted = args.parquet is not None or args.zarr is not None
+        table = FrameTable(recording) if wanted else None
         tally = Tally(bag.count([topics.frames]), notices, table)
         with fresh(out, args.overwrite) as built:
-            _hint(recording, args.params)
+            _hint(path, args.params)
             frames = _replay(bag, topics, localizer, tally, built, args)
             view = _write_view(args, bag, topics, localizer, frames, built)
         if view is not None:
             print(f"to look at: rerun {out / view.name if view.parent == built else view}")
         _tell(tally, config, out, timed)
         if table is not None:
-            rows = write_parquet([table.table()], args.parquet)
-            print(f"written to {args.parquet}: {rows} rows, one a frame")
+            _write_table(args, [table.table()])
         # The result is there, whether the viewer starts or not.
         if args.view and frames:
             write_view(bag, topics, localizer, frames, None)
         if not tally.localized:
             raise ValueError(
-                f"no frame of {bag.path} was localized; of the last one, {tally.last_refusal}"
+                f"no frame of {recording} was localized; of the last one, {tally.last_refusal}"
             )
     return tally
+
+
+def _write_table(args: argparse.Namespace, tables: Iterable[Table]) -> None:
+    """The tables of one recording or of many, as ``--parquet`` and ``--zarr`` ask for them."""
+    tables = list(tables)
+    if args.parquet is not None:
+        rows = write_parquet(tables, args.parquet)
+        print(f"written to {args.parquet}: {rows} rows, one a frame")
+    if args.zarr is not None:
+        frames = write_zarr(tables, args.zarr)
+        print(f"written to {args.zarr}: {frames} frames of {len(tables)} episodes")
 
 
 def _detect_command(path: Location) -> str:
@@ -256,11 +359,12 @@ def _check_usage(args: argparse.Namespace) -> None:
     if is_batch(args):
         raise UsageError("--ros plays one recording, and needs no workers")
     offline = (args.out, args.params, args.assignments, args.map, args.overwrite, args.smooth)
-    if any((*offline, args.rows, args.nerfstudio, args.gsplat, args.ncore, args.parquet)):
+    exports = (args.nerfstudio, args.gsplat, args.ncore, args.parquet, args.zarr)
+    if any((*offline, args.rows, *exports)):
         raise UsageError(
             "--out, --overwrite, --params, --map, --row, --nerfstudio, --gsplat, --ncore, "
-            "--parquet, --smooth, -p are for offline replay; with --ros the node has the settings "
-            "and publishes the result"
+            "--parquet, --zarr, --smooth, -p are for offline replay; with --ros the node has the "
+            "settings and publishes the result"
         )
 
 
@@ -476,18 +580,17 @@ def _replay_batch(args: argparse.Namespace, config: NodeConfig) -> None:
     kernels = f"replay {config.solver}{' smooth' if args.smooth else ''}"
     if config.map_file:  # where it is from here, whatever directory a worker is in
         args = argparse.Namespace(**vars(args) | {"map": location(config.map_file)})
-    files = inputs(args.params, args.map)
+    files = inputs(args.params, args.map, args.calibration)
     kind = Kind("replay", _replay_of_many, kernels, _replay_warm)
-    place = args.parquet
-    if place is not None:
+    wanted = args.parquet is not None or args.zarr is not None
+    if wanted:
         schema()  # what is not installed is said before hours of work
-    args = argparse.Namespace(**vars(args) | {"parquet": place is not None})
+    own = argparse.Namespace(**vars(args) | {"parquet": wanted, "zarr": None})
 
     def gather(folders: Sequence[Path]) -> None:
-        rows = write_parquet((read_parquet(folder / TABLE) for folder in folders), place)
-        print(f"written to {place}: {rows} rows, one a frame")
+        _write_table(args, (read_parquet(folder / TABLE) for folder in folders))
 
-    run_batch(args, Plan(kind, lambda _: files, args.overwrite, gather if place else None))
+    run_batch(own, Plan(kind, lambda _: files, args.overwrite, gather if wanted else None))
 
 
 def _replay_warm(args: argparse.Namespace) -> None:

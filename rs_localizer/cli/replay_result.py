@@ -99,6 +99,13 @@ def add_export_arguments(parser: argparse._ActionsContainer) -> None:
         help="also write one table, a row a frame, of all recordings: poses, twists, covariances, "
         "why frames were refused; a path or a URL (pip install 'rs_localizer[table]')",
     )
+    parser.add_argument(
+        "--zarr",
+        type=Path,
+        metavar="DIR",
+        help="also write the localized frames as a replay buffer of robot learning, an episode a "
+        "recording: poses, velocities, covariances (pip install 'rs_localizer[zarr]')",
+    )
 
 
 def written_names(out: Path) -> list[Path]:

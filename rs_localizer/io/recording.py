@@ -23,8 +23,9 @@ CORRESPONDENCES_TOPIC = f"/{topics.CORRESPONDENCES}"
 KEYPOINTS_TOPIC = f"/{topics.KEYPOINTS}"
 IMAGE_TOPIC = f"/{topics.COMPRESSED_IMAGE}"
 RAW_IMAGE_TOPIC = "/image_raw/compressed"
-# A params file and maps in the directory of a recording.
+# A params file, a lens and maps in the directory of a recording, or of a map that was built.
 PARAMETERS = "parameters.yaml"
+CAMERA = "camera_info.yaml"
 MARKER_MAP = "marker_map.yaml"
 MAP = "map.npz"
 

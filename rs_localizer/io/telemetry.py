@@ -20,7 +20,7 @@ import numpy as np
 from rs_localizer.core.arrays import Array
 
 # Optical axes (x right, y down, z forward) from telemetry-parser's.
-_CAMERA_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+CAMERA_FROM_SENSOR = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # What announces telemetry in the first or the last bytes of a file: GoPro, DJI, Sony, Insta360.
 _MARKS = (b"gpmd", b"djmd", b"rtmd", b"8db42d694ccc418790edff439fe026bf")
 _LOOKED_AT = 2**18  # bytes
@@ -28,6 +28,7 @@ _LOOKED_AT = 2**18  # bytes
 _READOUT_NAMES = ("0x53524f54", "FrameReadoutTime", "frame_readout_time")
 _STABILIZED, _STABILIZER = "0x45495345", "0x45495341"  # GoPro: EISE, whether, and EISA, how
 _OFF = ("", "N", "N/A", "OFF")
+_FIELD, _DIAGONAL = "0x56464f56", "0x5a464f56"  # GoPro: VFOV, its letter, and ZFOV, degrees
 
 
 class TelemetryError(ValueError):
@@ -44,7 +45,8 @@ class Telemetry:
     forces: Array  # (n,3) m/s^2, specific force in these axes; NaN where it is not measured
     readout_time: float | None  # s
     exposure: float | None  # s, median
-    stabilizer: str  # what has changed the images; empty: nothing that is known
+    stabilizer: str = ""  # what has changed the images; empty: nothing that is known
+    lens: str = ""  # its setting
 
     @property
     def rate(self) -> float:
@@ -98,12 +100,21 @@ def read_telemetry(path: Path) -> Telemetry | None:
     return Telemetry(
         " ".join(dict.fromkeys(f"{parser.camera} {parser.model or ''}".split())),
         times,
-        rates @ _CAMERA_FROM_SENSOR.T,
-        _spread(forces, times) @ _CAMERA_FROM_SENSOR.T,
+        rates @ CAMERA_FROM_SENSOR.T,
+        _spread(forces, times) @ CAMERA_FROM_SENSOR.T,
         None if readout is None or not float(readout) > 0.0 else 1e-3 * float(readout),
         float(np.median(exposures)) if exposures else None,
         stabilizer,
+        _lens(found),
     )
+
+
+def _lens(values: dict[str, Any]) -> str:
+    """The setting of a GoPro's lens: each needs a calibration of its own."""
+    letter, degrees = values.get(_FIELD), values.get(_DIAGONAL)
+    if letter is None:
+        return ""
+    return f"field of view {letter}" + ("" if degrees is None else f" ({float(degrees):.0f} deg)")
 
 
 def _spread(forces: Array, times: Array) -> Array:

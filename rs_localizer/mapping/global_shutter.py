@@ -40,12 +40,13 @@ Pose = tuple[Array, Array]
 
 
 @dataclass(frozen=True, slots=True)
-class KnownShutter:
-    """What is known of the camera's shutter, and whether its lens is adjusted."""
+class Shutter:
+    """What is known of the camera's shutter, and what is wanted."""
 
     readout_time: float | None = None  # s; None: estimated
     scan_direction: str | None = None  # None: unknown
-    lens: bool = False
+    lens: bool = False  # whether the lens is adjusted
+    tau: float = 0.0  # row time of the global shutter: 0 the middle row, -0.5 first, 0.5 last
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,8 +69,7 @@ def undo_shutter(
     model: Model,
     images: Mapping[str, ModelImage],
     stamps_ns: Mapping[str, int],
-    known: KnownShutter,
-    tau: float = 0.0,
+    known: Shutter,
     done: Callable[[str], object] = lambda text: None,
 ) -> GlobalShutterModel:
     """The model that a global shutter would have given.
@@ -80,7 +80,6 @@ def undo_shutter(
         images: by their names.
         stamps_ns: of the images, by their names; no two are the same.
         known: of the shutter.
-        tau: row time of the global shutter: 0 the middle row, -0.5 the first, 0.5 the last.
         done: called with each part of the work that is done.
 
     Raises:
@@ -103,7 +102,7 @@ def undo_shutter(
     fits &= (np.bincount(rows[fits], minlength=len(points)) > 1)[rows]
     at, rows, pixels = at[fits], rows[fits], pixels[fits]
     ends = _poses(refined, -0.5), _poses(refined, 0.5)
-    wanted = _poses(refined, tau)
+    wanted = _poses(refined, known.tau)
     place = np.searchsorted(used, at)
     wanted = np.swapaxes(wanted[0], 1, 2), wanted[1]
     views = wanted[0], -np.einsum("nij,nj->ni", wanted[0], wanted[1])
@@ -193,7 +192,7 @@ class _Given:
 
 
 def _refined(
-    given: _Given, camera: Camera, stamps: IntArray, known: KnownShutter,
+    given: _Given, camera: Camera, stamps: IntArray, known: Shutter,
     done: Callable[[str], object],
 ) -> tuple[RefinedMap, ShutterFit | None, IntArray]:  # fmt: skip
     """Motion and shutter, and which images (g,) have a pose."""

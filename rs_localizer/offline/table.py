@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from rs_localizer.config import NodeConfig
 from rs_localizer.core import so3
+from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.bags import open_bag
 from rs_localizer.io.outputs import Localized
 from rs_localizer.io.remote import Location, is_url, local_copy, placed
@@ -156,6 +158,72 @@ def read_parquet(file: Path) -> Table:
     import pyarrow.parquet as pq
 
     return pq.read_table(file)
+
+
+# Of a Zarr group: columns of the table, and how many numbers each frame has.
+_ARRAYS: dict[str, tuple[tuple[str, ...], tuple[int, ...]]] = {
+    "stamp_ns": (("stamp_ns",), ()),
+    "position": (("x", "y", "z"), (3,)),
+    "quaternion": (("qx", "qy", "qz", "qw"), (4,)),
+    "pose_covariance": (("pose_covariance",), (6, 6)),
+    "linear_velocity": (("vx", "vy", "vz"), (3,)),
+    "angular_velocity": (("wx", "wy", "wz"), (3,)),
+    "twist_covariance": (("twist_covariance",), (6, 6)),
+}
+_ZARR_MARK = ".zgroup"
+
+
+def write_zarr(tables: Iterable[Table], place: Path) -> int:
+    """Write the localized frames of tables, an episode each, as a group of Zarr; how many.
+
+    As replay buffers of robot learning: the group ``data`` has an array for all frames, one episode
+    after the other, ``meta/episode_ends`` where each ends (a table without a frame has none), and
+    ``meta`` the attribute ``recordings``. Format 2, which all versions of Zarr read.
+
+    Args:
+        tables: one a recording.
+        place: directory to write; an earlier group is replaced.
+
+    Raises:
+        ValueError: when it cannot be written.
+        ImportError: without Zarr.
+    """
+    import zarr
+
+    parts: dict[str, list[Any]] = {name: [] for name in _ARRAYS}
+    ends, names = [0], []
+    for table in tables:
+        rows = [row for row in table.to_pylist() if row["state"] == LOCALIZED]
+        if not rows:
+            continue
+        ends.append(ends[-1] + len(rows))
+        names.append(rows[0]["recording"])
+        for name, (columns, shape) in _ARRAYS.items():
+            kind = np.int64 if name == "stamp_ns" else np.float64
+            values = [[_numbers(row[column], shape) for column in columns] for row in rows]
+            parts[name].append(np.array(values, kind).reshape(len(rows), *shape))
+    earlier = (place / _ZARR_MARK).is_file()
+    with atomic_directory(place, _clear if earlier else None) as part:
+        root = zarr.open_group(str(part), mode="w", zarr_format=2)
+        data, meta = root.create_group("data"), root.create_group("meta")
+        for name, (_, shape) in _ARRAYS.items():
+            empty = np.zeros((0, *shape), np.int64 if name == "stamp_ns" else np.float64)
+            data.create_array(name, data=np.concatenate([empty, *parts[name]]))
+        meta.create_array("episode_ends", data=np.array(ends[1:], np.int64))
+        meta.attrs["recordings"] = names
+    return ends[-1]
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> Any:
+    """A value of a table; what is not known is NaN."""
+    return value if value is not None else np.full(36, np.nan) if len(shape) > 1 else np.nan
+
+
+def _clear(directory: Path) -> None:
+    for item in ("data", "meta"):
+        shutil.rmtree(directory / item, ignore_errors=True)
+    for file in (_ZARR_MARK, ".zattrs", ".zmetadata"):
+        (directory / file).unlink(missing_ok=True)
 
 
 def localize_recording(

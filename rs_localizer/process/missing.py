@@ -25,6 +25,7 @@ _EXTRAS = {
     "pycolmap": "mapping",
     "rerun": "view",
     "telemetry_parser": "video",
+    "zarr": "zarr",
 }
 _PIP = {
     "PIL": "Pillow",

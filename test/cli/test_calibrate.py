@@ -92,7 +92,7 @@ def test_an_imu(inertial_flight, flight, tmp_path, capsys):
     (line,) = [row for row in out.read_text().splitlines() if "imu.time_offset" in row]
     assert float(line.partition(": ")[2]) == pytest.approx(5e-3, abs=1e-3)  # 3 s of slow motion
     said = capsys.readouterr().out
-    assert "imu: TF has another rotation" in said
+    assert "imu: TF, or the axes of a video, has another rotation" in said
     assert "gyroscope bias" in said
     assert main(["calibrate", str(inertial_flight), "--imu", "/nothing"]) == 1
     assert "has no topic /nothing" in capsys.readouterr().err

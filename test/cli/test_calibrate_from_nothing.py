@@ -4,6 +4,7 @@
 that is the test's own (rays through a distorted lens, four by four in a pixel, row by row).
 """
 
+import json
 import shlex
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rs_localizer.cli.main import main
 from rs_localizer.io.calibration import read_calibration
+from rs_localizer.io.telemetry import CAMERA_FROM_SENSOR
 from rs_localizer.io.trajectories import read_tum
 from rs_localizer.markers.map_files import read_marker_map
 from rs_localizer.settings import load_params_file
@@ -114,3 +116,43 @@ def test_a_film_gives_lens_readout_time_and_direction(film, tmp_path, capsys):
     smaller = ["--board", f"{COLUMNS - 2}x{ROWS}", "--square", str(SQUARE)]
     main(["calibrate", str(film), *smaller])
     assert f"a chessboard of {COLUMNS}x{ROWS} inner corners" in capsys.readouterr().err
+
+
+def test_a_video_with_the_log_of_a_phone(film, tmp_path, capsys):
+    """Its gyroscope agrees with the images, its readout time does not."""
+    path = tmp_path / "movie.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE, (WIDTH, HEIGHT))
+    for file in sorted(film.iterdir()):
+        writer.write(cv2.imread(str(file)))
+    writer.release()
+    (tmp_path / "lens.json").write_text(
+        json.dumps({
+            "K": [[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]],
+            "D": [K1, K2, 0, 0], "width": WIDTH, "height": HEIGHT,
+        })
+    )  # fmt: skip
+    times, late = np.arange(0.0, SECONDS, 0.005), 0.003
+    before, after = (Rotation.from_matrix(pose(times - late + d)[0]) for d in (-1e-4, 1e-4))
+    device = (before.inv() * after).as_rotvec() / 2e-4 @ CAMERA_FROM_SENSOR
+    heading = "Timestamp[nanosec],gx[rad/s],gy[rad/s],gz[rad/s],ax[m/s^2],ay[m/s^2],az[m/s^2]\n"
+    rows = [
+        f"{1e9 * (5.0 + t):.0f},{x!r},{y!r},{z!r},0,0,9.8\n"
+        for t, (x, y, z) in zip(times, device.tolist(), strict=True)
+    ]
+    (tmp_path / "gyro_accel.csv").write_text(heading + "".join(rows))
+    frames = [f"{1e9 * (5.0 + k / RATE):.0f},0,16000000\n" for k in range(len(rows) // 7)]
+    heading = "Timestamp[nanosec],Exposure time[nanosec],Frame readout time[nanosec]\n"
+    (tmp_path / "movie_metadata.csv").write_text(heading + "".join(frames))
+    words = ["calibrate", str(path), "--board", f"{COLUMNS}x{ROWS}", "--square", str(SQUARE)]
+    out = tmp_path / "shutter.yaml"
+    lens = ["--calibration", str(tmp_path / "lens.json")]
+    assert main([*words, *lens, "--imu", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    values = load_params_file(out)
+    assert values["readout_time"] == pytest.approx(READOUT, abs=3e-4)
+    measured = f"{1e3 * values['readout_time']:.2f} ms was measured"
+    assert f"readout time 16.00 ms (not used: {measured})" in said
+    assert values["imu.time_offset"] == pytest.approx(-late, abs=1e-3)
+    assert "TF, or the axes of a video, agrees with the rotation to 0." in said
+    assert main([*words, *lens, "--imu", "--no-telemetry"]) == 2
+    assert "this one has none that is known" in capsys.readouterr().err

@@ -23,6 +23,7 @@ from rs_localizer.cli.image_input import (
     tell_left_out,
     tell_telemetry,
     time_faults,
+    video_imu,
 )
 from rs_localizer.cli.marker_map import read_checked_map
 from rs_localizer.config import FeatureConfig
@@ -36,8 +37,7 @@ from rs_localizer.io.image_clock import DEFAULT_START_NS
 from rs_localizer.io.images import Image
 from rs_localizer.io.imu import read_imu_csv
 from rs_localizer.io.maps.npz import write_npz
-from rs_localizer.io.recording import MAP, MAP_FRAME, PARAMETERS
-from rs_localizer.io.telemetry import Telemetry
+from rs_localizer.io.recording import CAMERA, MAP, MAP_FRAME, PARAMETERS
 from rs_localizer.io.topics import IMU
 from rs_localizer.io.trajectories import Trajectory, write_tum
 from rs_localizer.mapping.anchors import Anchors, Distance, PointSight
@@ -182,19 +182,13 @@ def imu_of(args: argparse.Namespace) -> GivenImu | None:
     if not args.imu:
         telemetry = telemetry_of(args.images, args)
         if telemetry is not None and args.rate is None:
-            return _of_video(telemetry, args)
+            start_ns = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
+            return GivenImu(video_imu(telemetry, start_ns), asked=args.imu is not None)
         if args.imu is None:
             return None
         raise UsageError("this video or folder has no IMU of its own: give --imu FILE.csv")
     stamps, rates, forces = read_imu_csv(Path(args.imu))
     return GivenImu(ImuRecording(stamps, rates, specific_forces=forces), asked=True)
-
-
-def _of_video(telemetry: Telemetry, args: argparse.Namespace) -> GivenImu:
-    start_ns = DEFAULT_START_NS if args.start is None else round(1e9 * args.start)
-    stamps = start_ns + np.round(1e9 * telemetry.times).astype(np.int64)
-    recording = ImuRecording(stamps, telemetry.rates, np.eye(3), telemetry.forces)
-    return GivenImu(recording, asked=args.imu is not None)
 
 
 def _of_bag(args: argparse.Namespace) -> GivenImu | None:
@@ -217,7 +211,7 @@ def _of_bag(args: argparse.Namespace) -> GivenImu | None:
             return None
 
 
-CAMERA, COLMAP, POSES, REPORT = "camera_info.yaml", "colmap", "poses.txt", "report.md"
+COLMAP, POSES, REPORT = "colmap", "poses.txt", "report.md"
 # A hand's motion is held by so many images a second.
 _IMAGES_PER_SECOND = 15.0
 

@@ -19,7 +19,7 @@ from rs_localizer.io.atomic_files import atomic_directory
 from rs_localizer.io.calibration import read_calibration
 from rs_localizer.io.maps.colmap import read_camera, read_images, read_model, write_model
 from rs_localizer.io.maps.landmarks import MapError
-from rs_localizer.mapping.global_shutter import GlobalShutterModel, KnownShutter, undo_shutter
+from rs_localizer.mapping.global_shutter import GlobalShutterModel, Shutter, undo_shutter
 from rs_localizer.offline.image_sources import have_times
 from rs_localizer.offline.rectified import map_depths, motion_between, rectified
 from rs_localizer.process.arguments import number
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> None:
         if missing:
             raise ValueError(f"{args.images} has no {missing[0]}, an image of the model")
     with atomic_directory(args.out, replaced(args, _LIST)) as out:
-        found = undo_shutter(camera, model, images, stamps, _known(args), args.row, _print_step)
+        found = undo_shutter(camera, model, images, stamps, _known(args), _print_step)
         contradiction.check(args, found.refined.readout_check, "see --shutter estimated")
         out.mkdir()
         write_model(out, found.camera, found.images, found.points)
@@ -101,14 +101,14 @@ def _print_step(step: str) -> None:
     print(f"adjusted: {step}", flush=True)
 
 
-def _known(args: argparse.Namespace) -> KnownShutter:
+def _known(args: argparse.Namespace) -> Shutter:
     values = given_values(args)
     config = build(values)
     readout = config.readout_time if args.shutter != "estimated" else 0.0
     if args.shutter == "given" and not readout:
         raise UsageError("--shutter given needs -p readout_time:=S or --params")
     direction = str(config.scan_direction) if readout or "scan_direction" in values else None
-    return KnownShutter(readout or None, direction, args.intrinsics)
+    return Shutter(readout or None, direction, args.intrinsics, args.row)
 
 
 def image_stamps(names: list[str], rate: float | None) -> dict[str, int]:

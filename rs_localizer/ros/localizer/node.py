@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from std_srvs.srv import Trigger
 
-from rs_localizer.config import ImuUse, NodeConfig, Px4Odometry
+from rs_localizer.config import ImuUse, NodeConfig, Px4Odometry, ShutterDepth
 from rs_localizer.core.reasons import Notice
 from rs_localizer.io.maps.landmarks import Map
 from rs_localizer.io.messages import MessageError, stamp_ns
@@ -33,6 +33,7 @@ from rs_localizer.ros.localizer.health import (
     of_interest,
     tell,
 )
+from rs_localizer.ros.localizer.shutter import ShutterOutput
 from rs_localizer.ros.localizer.transforms import Broadcaster
 from rs_localizer.ros.node.conversion import create_output, installed, make_message, message_class
 from rs_localizer.ros.node.health import Health
@@ -255,6 +256,7 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._feed: Feed | None = None
         self._outputs: Outputs | None = None
         self._px4: px4.Px4Output | None = None
+        self._shutter: ShutterOutput | None = None
         self._reset_service: Service | None = None
         super().__init__(NODE_NAME, NodeConfig, tell, **options)
         self._broadcaster = Broadcaster(self, self.refusals)
@@ -292,6 +294,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         self._broadcaster.configure(config)
         if config.px4_odometry != Px4Odometry.NONE:
             self._px4 = px4.Px4Output(self, frames)
+        if config.image_rect_shutter != ShutterDepth.NONE:
+            self._shutter = ShutterOutput(self, frames)
         self._outputs = Outputs(self, afterwards=lambda frame: self._send_on(frame, frames.config))
         self._localizer = frames
         worker = self.employ(frames, self._outputs.publish)
@@ -302,6 +306,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
     def _send_on(self, frame: Localized, config: NodeConfig) -> None:
         if self._px4 is not None:
             self._px4.publish(frame)
+        if self._shutter is not None:
+            self._shutter.add(frame)
         self._broadcaster.publish(frame, config)
 
     def close(self) -> None:
@@ -310,6 +316,9 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         if self._px4 is not None:
             self._px4.close()
             self._px4 = None
+        if self._shutter is not None:
+            self._shutter.close()
+            self._shutter = None
         if self._outputs is not None:
             self._outputs.close()
             self._outputs = None
@@ -319,7 +328,8 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
 
     def begin(self, config: NodeConfig) -> None:
         assert self._feed is not None
-        topics = self.listen(self._feed.topics())
+        images = {} if self._shutter is None else self._shutter.topics()
+        topics = self.listen(self._feed.topics() | images)
         if config.readout_time == 0.0:
             until = " until it is estimated" if config.estimate_readout_time else ""
             self.warn(
@@ -343,11 +353,12 @@ class LocalizerNode(ManagedNode[NodeConfig, FrameLocalizer, Localized, Answer]):
         missing = () if frames is None else frames.missing
         watch = None if frames is None else frames.readout_watch
         imu = None if frames is None else frames.imu.state
+        inputs = {name: item for name, item in self.silence.items() if name in INPUTS}
         condition = Condition(
             life_cycle=self.state,
             changing=self._feed is not None and self._feed.changing,
             missing=missing,
-            silence=of_interest(self.silence, missing),
+            silence=of_interest(inputs, missing),
             oddities=self.refusals.recent(_ODD, WINDOW)
             | self._broadcaster.fault()
             | imu_oddity(imu)
