@@ -25,7 +25,7 @@ from scipy.stats import chi2
 import rs_localizer as rsl
 from benchmarks.independent.cameras import Camera
 from benchmarks.independent.motions import IntArray, Moving, hand, steady
-from benchmarks.independent.rigs import Mounted, Views, middle_of, views
+from benchmarks.independent.rigs import Mounted, Scene, Views, middle_of, views
 from benchmarks.independent.rotations import Array, exponential, logarithm
 
 _CAMERA = Camera(focal=450.0)
@@ -146,13 +146,13 @@ def _rig(mounted: Mapping[str, Mounted]) -> rsl.Rig:
 
 
 def run(
-    name: str, wall: bool, noise: float, outliers: float, motion: str, frames: int, seed: int
+    name: str, scene: Scene, noise: float, outliers: float, motion: str, frames: int, seed: int
 ) -> str:
     """A line of the table."""
     mounted, rng = RIGS[name], np.random.default_rng(seed)
     motions = hand(frames, rng) if motion == "hand" else steady(frames, rng, 1.2, 0.5)
     each = _POINTS // len(mounted)
-    seen = views(mounted, motions, np.zeros(frames), each, wall, rng)
+    seen = views(mounted, motions, np.zeros(frames), each, scene, rng)
     info = information(mounted, motions, seen, noise, 1.0 - outliers)
     plain = _spreads(np.asarray(np.linalg.pinv(info[:, :12, :12], rcond=1e-14, hermitian=True)))
     bound = _spreads(np.asarray(np.linalg.inv(info + _prior())))
@@ -194,7 +194,7 @@ def run(
     prior = " ".join(f"{value:.3g}" for value in np.median(bound, axis=0) * _UNITS)
     refused = ", ".join(f"{count} {reason}" for reason, count in reasons.items()) or "0"
     return (
-        f"| {name} | {'wall' if wall else 'rich'} | {motion} | {noise:g} | {outliers:.0%} | "
+        f"| {name} | {scene} | {motion} | {noise:g} | {outliers:.0%} | "
         f"{figures} | {prior} | {' '.join(f'{ratio:.2f}' for ratio in rms)} | "
         f"{held[0]:.0f}, {held[1]:.0f} | {refused} | {1e3 * seconds / frames:.1f} |"
     )
@@ -209,6 +209,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, nargs="+", default=[0.3, 1.0], metavar="PX")
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.0, 0.2, 0.4])
     parser.add_argument("--motion", nargs="+", default=["steady"], choices=["steady", "hand"])
+    parser.add_argument("--scene", nargs="+", default=["rich", "wall"], choices=[*Scene])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--save", type=Path, metavar="FILE", help="the table, too")
     options = parser.parse_args(arguments)
@@ -219,11 +220,11 @@ def main(arguments: list[str] | None = None) -> None:
     )
     lines = [head, "|---|---|---|---|---|---|---|---|---|---|---|"]
     print("\n".join(lines), flush=True)
-    cases = product(options.motion, options.noise, options.outliers, (False, True), RIGS)
-    for motion, noise, outliers, wall, name in cases:
-        if wall and name not in _BEFORE_WALLS:
+    cases = product(options.motion, options.noise, options.outliers, options.scene, RIGS)
+    for motion, noise, outliers, scene, name in cases:
+        if scene != Scene.RICH and name not in _BEFORE_WALLS:
             continue
-        lines.append(run(name, wall, noise, outliers, motion, options.frames, options.seed))
+        lines.append(run(name, Scene(scene), noise, outliers, motion, options.frames, options.seed))
         print(lines[-1], flush=True)
     if options.save is not None:
         options.save.write_text("\n".join(lines) + "\n", encoding="utf-8")

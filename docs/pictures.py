@@ -227,6 +227,45 @@ def vibration() -> str:
     return sheet.svg()
 
 
+def rigs() -> str:
+    """A wall through rolling shutters that rise, and a wall before a camera at rest that fits."""
+    sheet = Drawing(820, 300)
+    sheet.text(20, 28, "a wall seen while rising (blue), and a leaning one at rest (red)", size=15)
+
+    def wall(x: float, y: float, wide: float, high: float, colour: str, dash: str) -> None:
+        for k in range(5):
+            part = k / 2 - 1.0
+            sheet.line(
+                x - wide, y + part * high, x + wide, y + part * high, colour=colour, dash=dash
+            )
+            sheet.line(
+                x + part * wide, y - high, x + part * wide, y + high, colour=colour, dash=dash
+            )
+
+    # Rows read downwards follow the wall as it sinks in the image and stretch it; rows read upwards
+    # meet it and squeeze it. A wall that leans to the side, and nearer, is stretched in both.
+    cases = (
+        ("one camera", (1.25,), "fits: no motion told"),
+        ("two mounted alike", (1.25, 1.25), "fits both: no motion told"),
+        ("two opposed", (1.25, 0.8), "fits one only: motion told"),
+    )
+    x = 90.0
+    for name, stretches, verdict in cases:
+        sheet.text(x - 50, 62, name)
+        for stretch in stretches:
+            y, down = 160.0, stretch > 1.0
+            sheet.box(x - 60, y - 80, 120, 160, "#f5f5f5", GREY)
+            wall(x, y, 40, 40 * stretch, "#0d47a1", "")
+            wall(x, y, 40, 50, RED, "5 4")
+            ends = (y - 70, y + 70) if down else (y + 70, y - 70)
+            sheet.arrow(x + 52, ends[0], x + 52, ends[1], colour=GREY)
+            x += 140
+        sheet.text(x - 140 * len(stretches) - 50, 266, verdict, colour=GREY)
+        x += 40
+    sheet.text(20, 292, "arrows: the shutter", colour=GREY)
+    return sheet.svg()
+
+
 def coverage() -> str:
     """How many truths lie inside their 95 % regions, by benchmarks.md."""
     page = Path(__file__).with_name("benchmarks.md").read_text(encoding="utf-8")
@@ -263,6 +302,7 @@ PICTURES: dict[str, Callable[[], str]] = {
     "scan_directions.svg": scan_directions,
     "frames.svg": frames,
     "vibration.svg": vibration,
+    "rigs.svg": rigs,
 }
 OF_FIGURES = {"coverage.svg": coverage}  # of a table that changes with each measurement
 

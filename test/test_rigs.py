@@ -11,7 +11,7 @@ import rs_localizer as rsl
 from benchmarks.independent.cameras import Camera as TrueCamera
 from benchmarks.independent.cameras import Scan
 from benchmarks.independent.motions import hand, steady
-from benchmarks.independent.rigs import Mounted, middle_of, views
+from benchmarks.independent.rigs import Mounted, Scene, middle_of, views
 from benchmarks.independent.rotations import exponential, logarithm
 from rs_localizer.core.types import Estimate
 from rs_localizer.inertial.settings import InertialSettings
@@ -42,11 +42,11 @@ def rig_of(mounted, **more):
     return rsl.Rig(cameras, places, **more)
 
 
-def frames(mounted, make, count, points=40, noise=0.0, wall=False, seed=0, outliers=0.0):
+def frames(mounted, make, count, points=40, noise=0.0, scene=Scene.RICH, seed=0, outliers=0.0):
     """Frames of {name: (points, pixels)}, and motions with the times at which these begin."""
     rng = np.random.default_rng(seed)
     motions, begin = make(count, rng), np.zeros(count)
-    seen = views(mounted, motions, begin, points, wall, rng)
+    seen = views(mounted, motions, begin, points, scene, rng)
     made = []
     for frame in range(count):
         parts = {}
@@ -114,8 +114,8 @@ def test_a_camera_alone_is_a_rig_of_one():
     alone = {"one": Mounted(TRUE, UPRIGHT, np.zeros(3))}
     rig = rig_of(alone)
     camera = rig.cameras["one"]
-    for wall in (False, True):
-        made, _ = frames(alone, hand, 4, 80, 0.7, wall, outliers=0.3)
+    for scene in (Scene.RICH, Scene.WALL):
+        made, _ = frames(alone, hand, 4, 80, 0.7, scene, outliers=0.3)
         for parts in made:
             points, pixels = parts["one"]
             scores = np.arange(len(points), dtype=float)
@@ -133,7 +133,7 @@ def test_opposed_shutters_know_the_motion_before_a_wall():
     off = {}
     for name, rotation in (("opposed", TURNED), ("alike", UPRIGHT)):
         mounted = pair(rotation)
-        made, motions = frames(mounted, faster, 12, 76, 1.0, wall=True, seed=3)
+        made, motions = frames(mounted, faster, 12, 76, 1.0, Scene.WALL, seed=3)
         localizer = rsl.Localizer(rig_of(mounted))
         results = [localizer.localize(parts) for parts in made]
         off[name] = np.array([
@@ -184,7 +184,7 @@ def test_tracking_carries_a_rig_from_frame_to_frame():
     for frame in range(12):
         mounted = pair(UPRIGHT, start=0.01 * (frame % 3))
         begin = frame / 30.0
-        seen = views(mounted, motions, np.array([begin]), 40, True, rng)
+        seen = views(mounted, motions, np.array([begin]), 40, Scene.WALL, rng)
         parts = {
             name: (view.points[0], view.exact[0] + 0.5 * rng.normal(size=view.exact[0].shape))
             for name, view in seen.items()

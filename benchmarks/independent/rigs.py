@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -16,8 +17,17 @@ from benchmarks.independent.rotations import Array, BoolArray, exponential
 from benchmarks.independent.scenes import visible
 
 _DEPTHS = (1.5, 5.0)  # m
-_WALL_DISTANCE, _WALL_TILT = 2.5, math.radians(20.0)
+_WALL_DISTANCE, _TILT = 2.5, math.radians(20.0)
+_BOARD_DISTANCE, _BOARD_SIZE = 1.0, 0.5  # m
 _MARGIN = 12.0  # px
+
+
+class Scene(StrEnum):
+    """What a rig sees."""
+
+    RICH = "rich"  # points 1.5 to 5 m before each camera
+    WALL = "wall"  # 2.5 m before the body, tilted
+    BOARD = "board"  # 0.5 m wide, 1 m before the body, tilted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,10 +69,10 @@ def middle_of(rig: Mapping[str, Mounted]) -> float:
 
 
 def views(
-    rig: Mapping[str, Mounted], motions: Moving, begin: Array, count: int, wall: bool,
+    rig: Mapping[str, Mounted], motions: Moving, begin: Array, count: int, scene: Scene,
     rng: np.random.Generator,
 ) -> dict[str, Views]:  # fmt: skip
-    """So many points before each camera, 1.5 to 5 m away or on a tilted wall 2.5 m before the body.
+    """So many points before each camera, other ones for each.
 
     Args:
         begin: (f,) time of each motion at which its frame begins.
@@ -70,7 +80,7 @@ def views(
     which = np.arange(len(begin))
     axis = np.column_stack([rng.normal(size=(len(begin), 2)), np.zeros(len(begin))])
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    normal = exponential(rng.uniform(0.0, _WALL_TILT, (len(begin), 1)) * axis)[:, :, 2]
+    tilt = exponential(rng.uniform(0.0, _TILT, (len(begin), 1)) * axis)
     rotation, position = motions.poses(which, begin + middle_of(rig))
     result = {}
     for name, mounted in rig.items():
@@ -79,12 +89,16 @@ def views(
         ones = np.ones((*pixels.shape[:2], 1))
         rays = np.concatenate([mounted.camera.bearings(pixels), ones], axis=-1) @ mounted.rotation
         centre = -mounted.rotation.T @ mounted.translation
-        if wall:
-            depth = (_WALL_DISTANCE - normal @ centre)[:, None]
-            depth = depth / np.einsum("fi,fni->fn", normal, rays)
+        if scene is Scene.WALL:
+            depth = (_WALL_DISTANCE - tilt[:, :, 2] @ centre)[:, None]
+            depth = depth / np.einsum("fi,fni->fn", tilt[:, :, 2], rays)
         else:
             depth = rng.uniform(*_DEPTHS, pixels.shape[:2])
         body = centre + depth[..., None] * rays
+        if scene is Scene.BOARD:
+            flat = _BOARD_SIZE * (pixels / size - 0.5)
+            body = np.einsum("fij,fnj->fni", tilt[:, :, :2], flat)
+            body[..., 2] += _BOARD_DISTANCE
         points = position[:, None] + np.einsum("fij,fnj->fni", rotation, body)
         exact = mounted.seen(motions, which, begin, points)
         result[name] = Views(points, exact, visible(mounted.camera, exact))

@@ -11,6 +11,9 @@ import pages
 import pytest
 
 import rs_localizer as rsl
+from benchmarks.independent.cameras import Camera as TrueCamera
+from benchmarks.independent.motions import steady
+from benchmarks.independent.rigs import Mounted, Scene, views
 from rs_localizer import data
 from rs_localizer.core.arrays import Array
 from rs_localizer.io.trajectories import read_tum
@@ -37,6 +40,22 @@ def images() -> list[tuple[int, Array, Array]]:
     return [(frame.middle_ns, frame.points, frame.pixels) for frame in frames]
 
 
+def opposed() -> dict[str, Any]:
+    """A camera, and what the rig of docs/rigs.md sees: the second one upside down, 5 ms later."""
+    true, rng = TrueCamera(), np.random.default_rng(0)
+    places = {"up": (np.eye(3), np.zeros(3), 0.0)}
+    places["down"] = np.diag([-1.0, -1.0, 1.0]), np.array([0.1, 0.0, 0.0]), 0.005
+    rig = {name: Mounted(true, *place) for name, place in places.items()}
+    made = views(rig, steady(1, rng, 1.0, 0.5), np.zeros(1), 60, Scene.WALL, rng)
+    seen = {
+        name: (view.points[0, view.visible[0]], view.exact[0, view.visible[0]])
+        for name, view in made.items()
+    }
+    lens = np.array(true.distortion)
+    camera = rsl.Camera(true.width, true.height, true.matrix, lens, readout_time=true.readout_time)
+    return {"camera": camera, "seen": seen}
+
+
 @pytest.mark.parametrize("page", WITH_EXAMPLES)
 def test_examples_run(page, images):
     _, points, pixels = images[0]
@@ -44,6 +63,8 @@ def test_examples_run(page, images):
         "K": K, "D": np.zeros(5), "points": points, "pixels": pixels, "camera": CAMERA,
         "images": images,
     }  # fmt: skip
+    if page == "docs/rigs.md":
+        reader |= opposed()
     for example in pages.fenced(page, "python"):
         exec(compile(example, page, "exec"), reader)
     for check in CHECKS.get(page, []):
@@ -57,6 +78,11 @@ CHECKS: dict[str, list[Callable[[Any], None]]] = {
         lambda it: _true(len(it.path) == len(it.images)),
         lambda it: _true(isinstance(it.result, rsl.Estimate)),
         lambda it: _near(it.straight.shape, (60, 2), 0),
+    ],
+    "docs/rigs.md": [
+        lambda it: _near(it.result.residuals, 0.0, 1e-3),
+        lambda it: _near([it.result.time, it.result.span], [0.0175, 0.035], 1e-12),
+        lambda it: _near(np.linalg.norm(it.state.angular_velocity), 1.0, 0.02),
     ],
     "docs/calibration.md": [lambda it: _near(it.found.readout_time, 0.03, 2e-3)],
 }
