@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses of rigs, against the independent simulator, which shares no line with the estimator."""
 
+import copy
+import pickle
 from dataclasses import fields, replace
 
 import numpy as np
@@ -98,6 +100,9 @@ def test_exact_points_of_askew_cameras_give_the_motion(scan):
         off = errors(result, motions, frame, middle_of(mounted))
         assert np.all(off < [1e-4, 3e-4, 2e-2, 2e-2]), off
         assert all(result.inliers[name].all() for name in parts)
+        for copied in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
+            for name in parts:
+                np.testing.assert_array_equal(copied.residuals[name], result.residuals[name])
         # Also at other times than the middle one.
         rotation, translation = result.at_time(100.0)
         state = motions.states(np.array([frame]), np.zeros(1))

@@ -251,6 +251,12 @@ class ByCamera(np.ndarray[Any, Any]):
     def __array_finalize__(self, source: Any) -> None:
         self._places = getattr(source, "_places", {})
 
+    def __reduce__(self) -> tuple[Any, ...]:  # pickling an array forgets what it has besides
+        return ByCamera.of, (np.array(self), self._places)
+
+    def __deepcopy__(self, memo: object) -> ByCamera:
+        return self.copy()
+
     def __getitem__(self, key: Any) -> Any:
         plain = self.view(np.ndarray)
         return plain[self._places[key]] if isinstance(key, str) else plain[key]
