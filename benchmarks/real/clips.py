@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from rs_localizer.core.arrays import IntArray
-from rs_localizer.core.camera import Camera
+from rs_localizer.core.camera import Camera, DistortionModel
 from rs_localizer.io.video import read_video
 from rs_localizer.markers.boards import find_chessboard
 from rs_localizer.markers.prints import Chessboard
@@ -28,6 +28,7 @@ INDEX = "index.csv"
 _PHONE = 0.015
 # Images that OpenCV's calibration takes, evenly: more only take time.
 _CALIBRATION_IMAGES = 50
+_FEWEST = 20  # images that two halves of the bootstrap's blocks need
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +53,17 @@ def clips_of(folder: Path, cache: Path, most: int, only: list[str]) -> list[Clip
     cache.mkdir(parents=True, exist_ok=True)
     with (folder / INDEX).open(encoding="utf-8") as file:
         rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    found = []
+    clips = []
     for name, corners, square in rows:
         if only and Path(name).stem not in only:
             continue
         columns, lines = (int(word) for word in corners.split("x"))
-        found.append(_clip(folder / name, Chessboard(columns, lines, float(square)), cache, most))
-    return found
+        clip = _clip(folder / name, Chessboard(columns, lines, float(square)), cache, most)
+        if len(clip.images) < _FEWEST:
+            print(f"{name}: {len(clip.images)} images show a board of {corners} corners: left out")
+        else:
+            clips.append(clip)
+    return clips
 
 
 def _clip(path: Path, board: Chessboard, cache: Path, most: int) -> Clip:
@@ -119,7 +124,12 @@ def shutter_of(clip: Clip, cache: Path) -> Shutter:
     if not file.exists():
         file.write_text(json.dumps(_calibrated(clip, clip.images)), encoding="utf-8")
     found = json.loads(file.read_text(encoding="utf-8"))
-    lens = found["K"] and Camera(*clip.size, K=np.array(found["K"]), D=np.array(found["D"]))
+    lens = found["K"] and Camera(
+        *clip.size,
+        K=np.array(found["K"]),
+        D=np.array(found["D"]),
+        distortion_model=DistortionModel(found["distortion_model"]),
+    )
     known = found["readout_time"] > 1e-3
     return Shutter(
         found["readout_time"] if known else _PHONE,
@@ -143,6 +153,7 @@ def _calibrated(clip: Clip, images: list[Observed]) -> dict[str, object]:
         "verdict": f"refused, {value}" if refusal else value,
         "K": camera.K.tolist(),
         "D": camera.D.tolist(),
+        "distortion_model": str(camera.distortion_model),
     }
 
 

@@ -24,6 +24,8 @@ _STANDARD_GRAVITY = 9.80665  # m/s^2 in a g
 # Readings of an accelerometer below this (median) are in g, as those of Core Motion.
 _MOST_G = 3.0
 _LEAST_READINGS = 2
+# Columns: three numbers and a time, or a time and twice three.
+_SEPARATE, _TOGETHER = 4, 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +49,14 @@ def read_log(video: Path) -> Telemetry | None:
     log = _find(video)
     if log is None:
         return None
-    readings, frames = _Table.read(log.readings), _Table.read(log.frames)
+    columns = _SEPARATE if log.forces is not None else _TOGETHER
+    readings, frames = _Table.read(log.readings, columns), _Table.read(log.frames, 1)
     starts = frames.column("timestamp", 0) * frames.second
     exposure = _median(frames.named("exposure time"), frames.second)
     readout = _median(frames.named("frame readout time"), frames.second)
     if log.forces is not None:  # x, y, z, time
         times, rates = readings.values[:, 3] * 1e-9, readings.values[:, :3]
-        other = _Table.read(log.forces).values
+        other = _Table.read(log.forces, _SEPARATE).values
         forces = np.stack([np.interp(times, other[:, 3] * 1e-9, other[:, k]) for k in range(3)], 1)
     elif readings.has("a_x"):
         times, forces, rates = np.split(readings.values[:, :7], [1, 4], axis=1)
@@ -100,7 +103,7 @@ class _Table:
     values: Array  # (n,m); NaN for what is no number
 
     @staticmethod
-    def read(path: Path) -> _Table:
+    def read(path: Path, columns: int) -> _Table:
         try:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
@@ -112,9 +115,14 @@ class _Table:
             names = [word.strip().lower() for word in rows.pop(0)]
         width = len(rows[0]) if rows else 0
         values = [[_number(word) for word in row] for row in rows if len(row) == width]
-        if len(values) < _LEAST_READINGS or not np.isfinite(np.array(values)[:, 0]).all():
-            raise TelemetryError(f"{path} has no readings: {len(values)} lines of {width} numbers")
-        return _Table(path, names, np.array(values))
+        table = np.array(values).reshape(-1, max(width, 1))
+        usable = len(values) >= _LEAST_READINGS and width >= columns
+        if not usable or not np.isfinite(table[:, :columns]).all():
+            raise TelemetryError(
+                f"{path} has no readings: {len(values)} lines of {width} numbers, {columns} or "
+                "more are needed"
+            )
+        return _Table(path, names, table)
 
     @property
     def second(self) -> float:

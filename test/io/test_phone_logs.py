@@ -98,3 +98,6 @@ def test_a_log_that_is_broken_is_named(tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n")
     with pytest.raises(TelemetryError, match=r"imu\.csv has no readings"):
         read_log(tmp_path / "rgb.mp4")
+    csv(tmp_path / "imu.csv", "timestamp, a_x, a_y\n", [[k, 0.0, 9.8] for k in range(5)])
+    with pytest.raises(TelemetryError, match="5 lines of 3 numbers, 7 or more are needed"):
+        read_log(tmp_path / "rgb.mp4")

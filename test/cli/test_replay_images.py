@@ -1,0 +1,81 @@
+# Copyright 2026 rs_localizer contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``rs_localizer replay`` of images: the same as detect, then replay of what it wrote."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rs_localizer.cli.main import main
+from rs_localizer.io.bags import open_bag
+from rs_localizer.io.camera_info import read_camera_info
+from rs_localizer.io.images import decode
+
+READOUT = 0.02
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of images, and beside it the same as a video with its calibration."""
+    path = tmp_path_factory.mktemp("images") / "walls"
+    words = ["--images", "--duration", "0.4", "--format", "png", "--readout-time", str(READOUT)]
+    assert main(["simulate", str(path), *words, "--trajectory", "tum_vi_room5"]) == 0
+    with open_bag(path) as bag:
+        (topic,) = (t for t, kind in bag.topics.items() if kind.endswith("Image"))
+        images = [decode(bytes(m.data), m.format) for _, _, m in bag.messages([topic])]
+        (info,) = (t for t, kind in bag.topics.items() if kind.endswith("CameraInfo"))
+        camera = read_camera_info(next(m for _, _, m in bag.messages([info]))).camera(
+            0.0, "top_to_bottom"
+        )
+    size = images[0].shape[::-1]
+    codec = cv2.VideoWriter_fourcc(*"mp4v")
+    writer = cv2.VideoWriter(str(path.parent / "walls.mp4"), codec, 30.0, size)
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    lens = {"K": camera.K.tolist(), "D": camera.D.tolist(), "width": size[0], "height": size[1]}
+    (path.parent / "camera.json").write_text(json.dumps(lens))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["bag", "video"])
+def test_poses_are_those_of_detect_and_replay(kind: str, walls: Path, tmp_path: Path) -> None:
+    folder = walls.parent
+    source = [str(walls)]
+    if kind == "video":
+        source = [str(folder / "walls.mp4"), "--calibration", str(folder / "camera.json")]
+    given = [*source, "--map", str(walls / "marker_map.yaml"), "-p", f"readout_time:={READOUT}"]
+    more = ["-p", "inlier_threshold:=2.5", "--smooth"]
+    seen, steps, once = tmp_path / "seen", tmp_path / "steps", tmp_path / "once"
+    assert main(["detect", *given, "--images", "--out", str(seen)]) == 0
+    shutter = ["--params", str(seen / "parameters.yaml"), *more]
+    assert main(["replay", str(seen), *shutter, "--out", str(steps)]) == 0
+    splat = tmp_path / "splat"
+    assert main(["replay", *given, *more, "--out", str(once), "--gsplat", str(splat)]) == 0
+    for name in ("poses.txt", "twists.txt"):
+        rows = [np.loadtxt(place / name) for place in (steps, once)]
+        assert len(rows[0]) > 5
+        np.testing.assert_array_equal(*rows)
+    names = (splat / "names.txt").read_text().split()
+    assert len(names) > 5
+    assert all((splat / name).is_file() for name in names)
+
+
+def test_what_is_missing_is_said(walls: Path, tmp_path: Path, capsys: Any) -> None:
+    video, markers = str(walls.parent / "walls.mp4"), str(walls / "marker_map.yaml")
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["replay", video, *out]) == 1
+    assert "walls.mp4 is a video, not matches: first run: rs_localizer detect" in (
+        capsys.readouterr().err
+    )
+    assert main(["replay", video, "--map", markers, *out]) == 2
+    assert "a video or folder has no camera_info: give --calibration" in capsys.readouterr().err
+    assert main(["replay", video, "--map", "s3://bucket/map.npz", *out]) == 1
+    assert "the map of images has to be a file of this machine" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
