@@ -120,9 +120,7 @@ class Localizer:
         return next(iter(self.rig.cameras.values()))
 
     def warm_up(self) -> None:
-        """Compile every kernel that :meth:`localize`, or tracking, may need, or load it from the
-        cache.
-        """
+        """Compile every kernel of :meth:`localize` and of tracking, or load it from the cache."""
         if not self._alone:
             Localizer(next(iter(self.rig.cameras.values())), self.config).warm_up()
             return
@@ -154,9 +152,8 @@ class Localizer:
         # And beside the turn that a gyroscope knows, of which the delay is in doubt.
         tau = np.linspace(-0.7, 0.7, 29)
         rates = 0.1 * np.column_stack([np.sin(20.0 * tau)] * 3)
-        self.localize(
-            points, pixels, turn=GyroRotation.of(tau, rates, 1e-4 * np.eye(6), delay=0.01)
-        )
+        turn = GyroRotation.of(tau, rates, 1e-4 * np.eye(6), delay=0.01)
+        self.localize(points, pixels, turn=turn)
 
     def localize(
         self,
